@@ -1,0 +1,234 @@
+"""Cameras: world → camera matrix, intrinsics, near and far; one function per lens.
+
+OpenCV axes: x right, y down, z forward; pixel centres at + 0.5. A batch of cameras
+has a leading axis on every array. A lens is a `CameraModel`: how a point in camera
+coordinates falls onto the image, and where that may be linearised. The EWA Jacobian
+is the derivative of that function, so a new lens touches nothing else.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.errors import InputError
+
+Array = jax.Array
+Point = tuple[Array, Array, Array]
+
+
+class CameraModel(NamedTuple):
+    """A lens, as functions over components of any one shape.
+
+    Attributes:
+      name: what files and messages call it.
+      project_point: (K, (x, y, z)) → (u, v) in pixels; K is [3, 3].
+      linearisation_point: (K, width, height, (x, y, z)) → the point at which the
+        EWA Jacobian is taken, kept away from where the linearisation is wild.
+    """
+
+    name: str
+    project_point: Callable[[Array, Point], tuple[Array, Array]]
+    linearisation_point: Callable[[Array, int, int, Point], Point]
+
+
+def _pinhole_project(K: Array, point: Point) -> tuple[Array, Array]:
+    x, y, z = point
+    return K[0, 0] * (x / z) + K[0, 2], K[1, 1] * (y / z) + K[1, 2]
+
+
+def _pinhole_linearise(K: Array, width: int, height: int, point: Point) -> Point:
+    # Limits of gsplat: 30 % of half the field of view beyond each *side* of the
+    # image, so that a principal point off the centre is treated evenly.
+    x, y, z = point
+
+    def limit(ratio, focal, centre, size):
+        margin = 0.3 * 0.5 * size / focal
+        low = -(centre / focal + margin)
+        high = (size - centre) / focal + margin
+        # `where` rather than `clip`: a tie has the derivative of the inside.
+        return jnp.where(ratio < low, low, jnp.where(ratio > high, high, ratio))
+
+    return (
+        z * limit(x / z, K[0, 0], K[0, 2], width),
+        z * limit(y / z, K[1, 1], K[1, 2], height),
+        z,
+    )
+
+
+def _orthographic_project(K: Array, point: Point) -> tuple[Array, Array]:
+    x, y, _ = point
+    return K[0, 0] * x + K[0, 2], K[1, 1] * y + K[1, 2]
+
+
+def _linear_everywhere(K: Array, width: int, height: int, point: Point) -> Point:
+    del K, width, height
+    return point
+
+
+PINHOLE = CameraModel("pinhole", _pinhole_project, _pinhole_linearise)
+ORTHOGRAPHIC = CameraModel("orthographic", _orthographic_project, _linear_everywhere)
+CAMERA_MODELS = {model.name: model for model in (PINHOLE, ORTHOGRAPHIC)}
+
+
+# Not a chex dataclass: those have no static fields, and sizes must be static.
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("viewmat", "K", "near", "far"),
+    meta_fields=("width", "height", "model"),
+)
+@dataclass(frozen=True)
+class Camera:
+    """One camera, or a batch with a leading axis B on every array.
+
+    Attributes:
+      viewmat: [4, 4] or [B, 4, 4], world → camera.
+      K: [3, 3] or [B, 3, 3] intrinsics in pixels (skew is not used).
+      near, far: [] or [B], range of camera z that is drawn, in world units.
+      width, height: image size in pixels, static.
+      model: the lens, static.
+    """
+
+    viewmat: Array
+    K: Array
+    near: Array
+    far: Array
+    width: int
+    height: int
+    model: CameraModel = PINHOLE
+
+    @property
+    def batched(self) -> bool:
+        """Whether the arrays have a leading camera axis."""
+        return self.viewmat.ndim == 3
+
+
+def make_camera(
+    *,
+    viewmat,
+    K,
+    width: int,
+    height: int,
+    near=0.01,
+    far=1e10,
+    model: str | CameraModel = PINHOLE,
+) -> Camera:
+    """A camera (or batch) from arrays; traceable in ``viewmat``, ``K``, near and far.
+
+    Args:
+      viewmat: [4, 4] or [B, 4, 4] world → camera, OpenCV axes (see
+        `gsjax.scene.transforms` for files in OpenGL axes).
+      K: [3, 3] (shared) or [B, 3, 3] intrinsics in pixels.
+      width, height: image size in pixels, at least 1.
+      near, far: range of z that is drawn, scalars or [B]; near > 0.
+      model: "pinhole", "orthographic", or a `CameraModel`.
+
+    Raises:
+      InputError: on wrong shapes or sizes, an unknown model, values that are not
+        finite, a focal length of zero or below, or a last row other than 0 0 0 1.
+    """
+    if isinstance(model, str):
+        if model not in CAMERA_MODELS:
+            raise InputError(
+                f"unknown camera model {model!r}; known: {sorted(CAMERA_MODELS)}"
+            )
+        model = CAMERA_MODELS[model]
+    if int(width) != width or int(height) != height or min(width, height) < 1:
+        raise InputError(
+            f"image size {width} × {height}: width and height must be whole and ≥ 1"
+        )
+    dtype = jnp.result_type(float)
+    viewmat, K = jnp.asarray(viewmat, dtype), jnp.asarray(K, dtype)
+    near, far = jnp.asarray(near, dtype), jnp.asarray(far, dtype)
+    if viewmat.ndim not in (2, 3) or viewmat.shape[-2:] != (4, 4):
+        raise InputError(f"viewmat has shape {viewmat.shape}; [4, 4] or [B, 4, 4]")
+    batch = viewmat.shape[:-2]
+    if K.shape[-2:] != (3, 3) or K.shape[:-2] not in ((), batch):
+        raise InputError(f"K has shape {K.shape}; [3, 3] or {(*batch, 3, 3)} is wanted")
+    for name, value in (("near", near), ("far", far)):
+        if value.shape not in ((), batch):
+            raise InputError(f"{name} has shape {value.shape}; () or {batch} is wanted")
+    _check_values(viewmat, K, near, far)
+    return Camera(
+        viewmat=viewmat,
+        K=jnp.broadcast_to(K, (*batch, 3, 3)),
+        near=jnp.broadcast_to(near, batch),
+        far=jnp.broadcast_to(far, batch),
+        width=int(width),
+        height=int(height),
+        model=model,
+    )
+
+
+def _check_values(viewmat, K, near, far) -> None:
+    """Host-side checks; tracers pass (their values are not known yet)."""
+    values = {"viewmat": viewmat, "K": K, "near": near, "far": far}
+    if any(isinstance(v, jax.core.Tracer) for v in values.values()):
+        return
+    host = {name: np.asarray(value) for name, value in values.items()}
+    for name in ("viewmat", "K", "near"):
+        if not np.isfinite(host[name]).all():
+            raise InputError(f"{name} has a value that is not finite: {host[name]}")
+    if not (host["K"][..., (0, 1), (0, 1)] > 0).all():
+        raise InputError("K[0, 0] and K[1, 1], the focal lengths, must be above 0")
+    if not ((host["near"] > 0) & (host["far"] > host["near"])).all():
+        raise InputError(
+            f"near {host['near']} and far {host['far']}: 0 < near < far is wanted"
+        )
+    if not (host["viewmat"][..., 3, :] == (0, 0, 0, 1)).all():
+        raise InputError(
+            "the last row of viewmat must be 0 0 0 1 (is it transposed?): "
+            f"{host['viewmat'][..., 3, :]}"
+        )
+
+
+def camera_centre(viewmat: Array) -> Array:
+    """World position [..., 3] of cameras [..., 4, 4] with a rigid rotation part."""
+    rotation, translation = viewmat[..., :3, :3], viewmat[..., :3, 3]
+    return -jnp.sum(rotation * translation[..., :, None], axis=-2)
+
+
+def resize_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The same view at another resolution: intrinsics scale with the pixels."""
+    sx, sy = width / camera.width, height / camera.height
+    scale = jnp.asarray([[sx, 1, sx], [1, sy, sy], [1, 1, 1]], camera.K.dtype)
+    return replace(camera, K=camera.K * scale, width=width, height=height)
+
+
+def stack_cameras(cameras: list[Camera]) -> Camera:
+    """A batch from single cameras of one size and model.
+
+    Raises:
+      InputError: if there are none, or their sizes or models differ.
+    """
+    kinds = {(c.width, c.height, c.model) for c in cameras}
+    if len(kinds) != 1:
+        raise InputError(
+            f"a batch needs one image size and model; found {len(kinds)} of them: "
+            f"{sorted((w, h, m.name) for w, h, m in kinds)}"
+        )
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+
+
+def look_at(eye, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
+    """World → camera [4, 4] (float64, on the host) of a camera at ``eye``.
+
+    Args:
+      eye, target: world positions (3,); they must differ.
+      up: world direction that points to the top of the image.
+    """
+    eye, target, up = (np.asarray(v, np.float64) for v in (eye, target, up))
+    forward = target - eye
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-9:
+        right = np.cross(forward, np.roll(up, 1) + (0.1, 0.2, 0.3))
+    right = right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    return viewmat

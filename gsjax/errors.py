@@ -1,0 +1,25 @@
+"""Typed errors: what is wrong, where, what was found, and what to do about it."""
+
+
+class GsjaxError(Exception):
+    """Base of the errors that the command line reports without a traceback."""
+
+    exit_code = 1
+
+
+class InputError(GsjaxError, ValueError):
+    """Bad or missing input: names the file or argument, the field and the remedy."""
+
+    exit_code = 3
+
+
+class CapacityError(GsjaxError, RuntimeError):
+    """A fixed-size stage wanted more than it may have; says how much it wanted."""
+
+    exit_code = 3
+
+
+class MissingExtraError(GsjaxError, ImportError):
+    """An optional package is absent; carries the line that installs it."""
+
+    exit_code = 6

@@ -1,0 +1,229 @@
+"""The scene as a pytree: fixed-capacity float arrays with an active mask beside them.
+
+Axis legend: N capacity (slots), K spherical-harmonic bases.
+
+The floats (`GaussianParams`) are exactly what is differentiated; the mask lives
+beside them because `jax.grad` refuses a pytree with a boolean leaf. What stands in
+an inactive slot never matters, whatever it is: NaN included.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax import sh as sh_lib
+from gsjax.errors import InputError
+from gsjax.numerics import exp_log_scale
+
+Array = jax.Array
+
+
+@chex.dataclass(frozen=True, mappable_dataclass=False)
+class GaussianParams:
+    """The 14 + 3 (K - 1) numbers of each Gaussian (59 at degree 3), as stored.
+
+    Attributes:
+      means: [N, 3] world position.
+      quats: [N, 4] rotation, wxyz, any norm above zero.
+      log_scales: [N, 3] natural logarithm of the standard deviations.
+      logit_opacities: [N] logit of the opacity.
+      sh: [N, K, 3] spherical-harmonic coefficients, K = (degree + 1)².
+    """
+
+    means: Array
+    quats: Array
+    log_scales: Array
+    logit_opacities: Array
+    sh: Array
+
+
+@chex.dataclass(frozen=True, mappable_dataclass=False)
+class Gaussians:
+    """Parameters and the mask [N] of the slots that hold a Gaussian."""
+
+    params: GaussianParams
+    active: Array
+
+    @property
+    def capacity(self) -> int:
+        """Number of slots N, active or not."""
+        return self.active.shape[-1]
+
+    @property
+    def sh_degree(self) -> int:
+        """Static degree of the spherical harmonics."""
+        return sh_lib.degree_of(self.params.sh.shape[-2])
+
+
+# Contents of an unused slot: a unit quaternion, and an opacity of e^-20.
+_EMPTY = {"quats": (1.0, 0.0, 0.0, 0.0), "logit_opacities": -20.0}
+
+
+def make_gaussians(
+    *, means, quats, log_scales, logit_opacities, sh, capacity: int | None = None
+) -> Gaussians:
+    """Gaussians from arrays; traceable, so that `jax.grad` may go through it.
+
+    Args:
+      means: [N, 3] positions in the world.
+      quats: [N, 4] rotations, wxyz, any norm above zero.
+      log_scales: [N, 3] natural logarithms of the standard deviations.
+      logit_opacities: [N] or [N, 1].
+      sh: [N, K, 3] coefficients with K = 1, 4, 9, 16 or 25.
+      capacity: number of slots, at least N (and 1); default max(N, 1). See
+        `capacity_bucket` for sizes that make growing recompile rarely.
+
+    Raises:
+      InputError: if a shape is not as above or the capacity is below N.
+    """
+    arrays = {
+        "means": means,
+        "quats": quats,
+        "log_scales": log_scales,
+        "logit_opacities": logit_opacities,
+        "sh": sh,
+    }
+    arrays = {name: _as_float(name, value) for name, value in arrays.items()}
+    opacities = arrays["logit_opacities"]
+    if opacities.ndim == 2 and opacities.shape[-1] == 1:
+        arrays["logit_opacities"] = opacities[:, 0]
+    count = arrays["means"].shape[0] if arrays["means"].ndim else 0
+    bases = arrays["sh"].shape[1] if arrays["sh"].ndim == 3 else "K"
+    wanted = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "log_scales": (count, 3),
+        "logit_opacities": (count,),
+        "sh": (count, bases, 3),
+    }
+    for name, shape in wanted.items():
+        if arrays[name].shape != shape:
+            raise InputError(
+                f"{name} has shape {arrays[name].shape}; {shape} is wanted (the first "
+                "axis of means sets the number of Gaussians)"
+            )
+    sh_lib.degree_of(arrays["sh"].shape[1])
+    params = GaussianParams(**arrays)
+    gaussians = Gaussians(params=params, active=jnp.ones(count, bool))
+    capacity = max(count, 1) if capacity is None else capacity
+    if capacity < max(count, 1):
+        raise InputError(
+            f"capacity {capacity} cannot hold {count} Gaussians; pass at least "
+            f"{max(count, 1)}, or None"
+        )
+    return grow(gaussians, capacity)
+
+
+def _as_float(name: str, value) -> Array:
+    array = jnp.asarray(value)
+    if jnp.issubdtype(array.dtype, jnp.complexfloating):
+        raise InputError(f"{name} is complex; pass real numbers")
+    return array.astype(jnp.result_type(float))
+
+
+def capacity_bucket(count: int, minimum: int = 1024) -> int:
+    """Smallest of the sizes 2^k and 1.5 · 2^k that holds ``count``.
+
+    Growing through buckets recompiles once for every factor of 1.33 to 1.5.
+    """
+    size = minimum
+    while size < count:
+        size = size * 3 // 2 if size & (size - 1) == 0 else size // 3 * 4
+    return size
+
+
+def activate(params: GaussianParams) -> dict[str, Array]:
+    """Values as used: scales [N, 3], opacities [N], quats [N, 4] as stored."""
+    return {
+        "scales": exp_log_scale(params.log_scales),
+        "opacities": jax.nn.sigmoid(params.logit_opacities),
+        "quats": params.quats,
+    }
+
+
+def num_active(gaussians: Gaussians) -> Array:
+    """Count of active slots, int32."""
+    return jnp.sum(gaussians.active, dtype=jnp.int32)
+
+
+def grow(gaussians: Gaussians, capacity: int) -> Gaussians:
+    """The same Gaussians in more slots; the new ones are inactive.
+
+    Raises:
+      InputError: if ``capacity`` is below the present one (see `compact`).
+    """
+    extra = capacity - gaussians.capacity
+    if extra < 0:
+        raise InputError(
+            f"capacity {capacity} is below the present {gaussians.capacity}; use "
+            "compact(gaussians, capacity) to shrink"
+        )
+    if extra == 0:
+        return gaussians
+    return concatenate(gaussians, empty_like(gaussians, extra))
+
+
+def empty_like(gaussians: Gaussians, capacity: int) -> Gaussians:
+    """``capacity`` inactive slots with the SH degree and dtype of ``gaussians``."""
+    params = {
+        name: jnp.broadcast_to(
+            jnp.asarray(_EMPTY.get(name, 0.0), array.dtype),
+            (capacity, *array.shape[1:]),
+        )
+        for name, array in gaussians.params.__dict__.items()
+    }
+    return Gaussians(
+        params=GaussianParams(**params), active=jnp.zeros(capacity, bool)
+    )
+
+
+def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
+    """All slots of both, in order.
+
+    Raises:
+      InputError: if the SH degrees differ.
+    """
+    if first.sh_degree != second.sh_degree:
+        raise InputError(
+            f"SH degrees {first.sh_degree} and {second.sh_degree} differ; pad or cut "
+            "one with with_sh_degree"
+        )
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
+
+
+def select(gaussians: Gaussians, keep: Array) -> Gaussians:
+    """The same slots with only those active that were and that ``keep`` [N] marks."""
+    return gaussians.replace(active=gaussians.active & keep)  # pyright: ignore
+
+
+def compact(gaussians: Gaussians, capacity: int | None = None) -> Gaussians:
+    """Active Gaussians first, in their order; ``capacity`` slots (default: same).
+
+    Under jit an active Gaussian that does not fit would be lost: compare
+    `num_active` with ``capacity``. Outside jit that raises.
+
+    Raises:
+      InputError: outside jit, if more are active than ``capacity``.
+    """
+    capacity = gaussians.capacity if capacity is None else capacity
+    active = gaussians.active
+    if not isinstance(active, jax.core.Tracer):
+        count = int(np.sum(np.asarray(active)))
+        if count > capacity:
+            raise InputError(
+                f"{count} Gaussians are active, capacity {capacity} cannot hold them"
+            )
+    order = jnp.argsort(~active, stable=True)[:capacity]
+    packed = jax.tree.map(lambda a: a[order], gaussians)
+    return packed if capacity <= gaussians.capacity else grow(packed, capacity)
+
+
+def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """The same Gaussians at another degree: bands are cut, or added as zeros."""
+    sh = gaussians.params.sh
+    bases = sh_lib.num_bases(degree)
+    extra = max(0, bases - sh.shape[1])
+    sh = jnp.pad(sh[:, :bases], ((0, 0), (0, extra), (0, 0)))
+    params = gaussians.params.replace(sh=sh)  # pyright: ignore
+    return gaussians.replace(params=params)  # pyright: ignore

@@ -1,0 +1,64 @@
+"""Guarded elementary functions: every singularity of the library lives here.
+
+Each function is finite, with finite derivatives, for every input it documents; the
+input as well as the output is guarded (double ``where``), because a ``where`` on
+the output alone still multiplies an infinite derivative by zero.
+"""
+
+import jax
+import jax.numpy as jnp
+
+Array = jax.Array
+
+# Range of log scales that the projection can square in float32 without overflow
+# (e^20 = 4.9e8) or loss to denormals (e^-40, squared 1.8e-35). Values beyond are
+# clipped, not culled: a finite Gaussian stays visible.
+LOG_SCALE_RANGE = (-40.0, 20.0)
+
+
+def safe_divide(numerator: Array, denominator: Array, where: Array) -> Array:
+    """``numerator / denominator`` where ``where``, else 0, with finite derivatives."""
+    return jnp.where(where, numerator / jnp.where(where, denominator, 1), 0)
+
+
+def safe_sqrt(x: Array) -> Array:
+    """Square root with value and derivative 0 at and below 0."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+
+
+def safe_normalize(components: tuple[Array, ...], fallback: tuple[float, ...]):
+    """Unit vector of ``components`` (a tuple of equally shaped arrays).
+
+    Prescaled by the largest magnitude, so that neither 1e-23 nor 1e20 leaves the
+    range of float32 when squared. A vector that is zero, denormal or not finite
+    becomes ``fallback`` with zero derivative.
+
+    Returns:
+      The components of the unit vector, and a mask of where it was well defined.
+    """
+    size = jax.lax.stop_gradient(
+        jnp.max(jnp.stack([jnp.abs(c) for c in components]), axis=0)
+    )
+    # A NaN fails both comparisons: guards are phrased positively.
+    good = (size >= jnp.finfo(size.dtype).tiny) & (size < jnp.inf)
+    scale = jnp.where(good, size, 1)
+    scaled = tuple(
+        jnp.where(good, c, f) / scale for c, f in zip(components, fallback)
+    )
+    norm = jnp.sqrt(sum(c * c for c in scaled))
+    return tuple(c / norm for c in scaled), good
+
+
+def logit(probability: Array) -> Array:
+    """Inverse of the sigmoid; probabilities are clamped to [2^-24, 1 - 2^-24]."""
+    tiny = 2.0**-24
+    p = jnp.clip(probability, tiny, 1 - tiny)
+    return jnp.log(p) - jnp.log1p(-p)
+
+
+def exp_log_scale(log_scale: Array) -> Array:
+    """``exp`` clipped to `LOG_SCALE_RANGE` in the log domain; zero slope beyond."""
+    low, high = LOG_SCALE_RANGE
+    inside = (log_scale >= low) & (log_scale <= high)
+    return jnp.exp(jnp.where(inside, log_scale, jnp.clip(log_scale, low, high)))

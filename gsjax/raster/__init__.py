@@ -1,0 +1,1 @@
+"""The rasteriser: project, bin, composite. Its door is `gsjax.raster.render`."""

@@ -1,0 +1,305 @@
+"""Which Gaussian meets which tile, in which order, and the list of work that follows.
+
+The way of the counts: Gaussians → (Gaussian, row of tiles) items, whose span of tiles
+along the row follows exactly from the ellipse → (tile, rank) pairs → sorted lists,
+one a tile → steps. A step is one chunk of K Gaussians for each of G tiles. Tiles are
+taken in order of list length, so the G tiles of a block need nearly the same number
+of steps and no tile waits for the longest. No derivative is taken here.
+
+Axis legend: R ranks (front to back), T tiles, P pairs, S steps, G tiles of a step,
+K Gaussians of a chunk.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from gsjax.numerics import safe_sqrt
+from gsjax.raster.sorting import argsort_descending, sort_pairs
+from gsjax.raster.types import Array, Projected, RasterConfig
+
+# A total above this is reported as 2^31 - 1: int32 sums must not wrap.
+COUNT_LIMIT = 2**30
+
+
+class Grid(NamedTuple):
+    """The tiles one device works on: every ``stride``-th row of tiles of each camera.
+
+    Attributes:
+      width, height: image size in pixels.
+      tile: side of a tile in pixels.
+      cols: tiles along a row.
+      rows: rows of tiles of one camera on this device.
+      cameras: number of cameras B.
+      stride: number of devices that share the rows.
+    """
+
+    width: int
+    height: int
+    tile: int
+    cols: int
+    rows: int
+    cameras: int
+    stride: int
+
+    @property
+    def tiles(self) -> int:
+        """Tiles on this device, of all cameras."""
+        return self.cameras * self.rows * self.cols
+
+
+def make_grid(width: int, height: int, tile: int, cameras: int, stride: int) -> Grid:
+    """Tiles that cover the image, the rows dealt out to ``stride`` devices."""
+    rows = -(-height // tile)
+    return Grid(
+        width, height, tile, -(-width // tile), -(-rows // stride), cameras, stride
+    )
+
+
+def tile_origins(grid: Grid, tile: Array, device: Array) -> tuple[Array, Array]:
+    """Pixel coordinates (x, y) of the upper left corners of local tiles."""
+    row, col = tile // grid.cols % grid.rows, tile % grid.cols
+    return col * grid.tile, (row * grid.stride + device) * grid.tile
+
+
+class Spans(NamedTuple):
+    """Boxes of tiles: local rows ``first`` … of which ``count``, each ``cols`` wide."""
+
+    first: Array
+    count: Array
+    cols: Array
+
+
+class Lists(NamedTuple):
+    """Sorted lists of one device.
+
+    Attributes:
+      ranks: [P] ranks sorted by (tile, rank); what follows the last is never read.
+      length: [T] entries of each tile.
+      items: [] (Gaussian, row) items wanted; pairs: [] pairs wanted. Where the items
+        did not fit, the pairs could not be counted, and are 0.
+    """
+
+    ranks: Array
+    length: Array
+    items: Array
+    pairs: Array
+
+
+class Schedule(NamedTuple):
+    """Blocks of G tiles of like length, each taking ``levels`` steps.
+
+    Attributes:
+      tiles: [blocks, G]; places past the last tile hold T, whose list is empty.
+      levels: [blocks] steps of each block.
+      steps: [] their sum.
+    """
+
+    tiles: Array
+    levels: Array
+    steps: Array
+
+
+class Work(NamedTuple):
+    """The steps: ``ranks`` [S, G, K] (R where there is none), ``block`` and ``live``
+    [S]. Steps of a block follow one another, front to back.
+    """
+
+    ranks: Array
+    block: Array
+    live: Array
+
+
+def tiles_per_step(config: RasterConfig, grid: Grid, platform: str) -> int:
+    """G: small keeps a CPU's caches, large keeps launches on accelerators rare."""
+    chosen = config.tiles_per_step
+    if chosen is None:
+        chosen = 16 if platform == "cpu" else 2048
+    return max(1, min(chosen, grid.tiles))
+
+
+def row_spans(projected: Projected, camera: Array, grid: Grid, device: Array) -> Spans:
+    """Local rows of tiles that the box of each rank meets.
+
+    Args:
+      projected: [R].
+      camera: [R] int32 index of the camera each rank belongs to.
+      grid, device: the rows of this device are device, device + stride, ….
+    """
+    var_x = 1 / (projected.inv_sx * projected.inv_sx)
+    left, right = _pixel_range(
+        projected.u, _extent(projected.reach * var_x), grid.width
+    )
+    top, bottom = _pixel_range(
+        projected.v, _extent(projected.reach * projected.var_y), grid.height
+    )
+    seen = (projected.reach > 0) & (left <= right) & (top <= bottom)
+    # Global rows of tiles g0 … g1 hold the local rows j with g0 ≤ j·stride + d ≤ g1.
+    first = -((device - top // grid.tile) // grid.stride)
+    last = (bottom // grid.tile - device) // grid.stride
+    count = jnp.where(seen, jnp.maximum(last - first + 1, 0), 0)
+    cols = right // grid.tile - left // grid.tile + 1
+    return Spans(first=camera * grid.rows + first, count=count, cols=cols)
+
+
+def _extent(squared: Array) -> Array:
+    """Half-width √squared plus room for the rounding of whoever evaluates α."""
+    return safe_sqrt(squared) * (1 + 1e-4) + 1e-2
+
+
+def _pixel_range(centre: Array, extent: Array, size: int) -> tuple[Array, Array]:
+    """First and last pixel whose centre lies in centre ± extent, within the image.
+
+    Clipped as floats: a cast of wild values would saturate and then wrap.
+    """
+    first = jnp.clip(jnp.ceil(centre - extent - 0.5), 0, size)
+    last = jnp.clip(jnp.floor(centre + extent - 0.5), -1, size - 1)
+    return first.astype(jnp.int32), last.astype(jnp.int32)
+
+
+def total_count(counts: Array) -> tuple[Array, Array]:
+    """Sum of int32 counts, saturating: (total, whether it is below `COUNT_LIMIT`)."""
+    safe = jnp.sum(counts.astype(jnp.float32)) < COUNT_LIMIT
+    total = jnp.sum(jnp.where(safe, counts, 0), dtype=jnp.int32)
+    return jnp.where(safe, total, 2**31 - 1), safe
+
+
+def expand(counts: Array, capacity: int) -> tuple[Array, Array]:
+    """Unroll ``counts`` [n] into ``capacity`` items: (owner, place within owner).
+
+    Items past the total have owner n. The counts must sum to less than 2^31.
+    """
+    ends = jnp.cumsum(counts)
+    passed = jnp.zeros(capacity, jnp.int32).at[ends].add(1, mode="drop")
+    owner = jnp.cumsum(passed)
+    starts = (ends - counts).at[owner].get(mode="fill", fill_value=0)
+    return owner, lax.iota(jnp.int32, capacity) - starts
+
+
+def _take(values: Array, index: Array) -> Array:
+    return values.at[index].get(mode="fill", fill_value=0)
+
+
+def _column_spans(
+    projected: Projected, rank: Array, row: Array, grid: Grid, device: Array
+) -> tuple[Array, Array]:
+    """First tile and number of tiles that the ellipse meets along one row of tiles.
+
+    The extreme x of Q ≤ reach within the strip dy ∈ [low, high] lies at the ellipse's
+    own extreme if that is in the strip, else on the strip's nearer edge (the region
+    is convex). The strip spans pixel *centres*: what falls between them is unseen.
+    """
+    u, v, slope, var_y, det, reach = (
+        _take(value, rank)
+        for value in (
+            projected.u,
+            projected.v,
+            projected.slope,
+            projected.var_y,
+            projected.det,
+            projected.reach,
+        )
+    )
+    var_x = 1 / jnp.square(_take(projected.inv_sx, rank))
+    _, top = tile_origins(grid, row * grid.cols, device)
+    low = top.astype(u.dtype) + 0.5 - v
+    high = jnp.minimum(low + (grid.tile - 1), grid.height - 0.5 - v)
+    safe_c = jnp.where(var_y > 0, var_y, 1)
+    extreme_x = safe_sqrt(reach * var_x)
+
+    def reach_towards(sign):
+        dy = jnp.clip(sign * slope * extreme_x, low, high)
+        width = safe_sqrt((reach - dy * dy / safe_c) * (det / safe_c))
+        return sign * (slope * var_x / safe_c * dy) + width
+
+    left = _extent(0 * u) + reach_towards(-1.0) * (1 + 1e-4)
+    right = _extent(0 * u) + reach_towards(1.0) * (1 + 1e-4)
+    first = jnp.clip(jnp.ceil(u - left - 0.5), 0, grid.width).astype(jnp.int32)
+    last = jnp.clip(jnp.floor(u + right - 0.5), -1, grid.width - 1).astype(jnp.int32)
+    first_tile, last_tile = first // grid.tile, last // grid.tile
+    count = jnp.where((reach > 0) & (first <= last), last_tile - first_tile + 1, 0)
+    return first_tile, count
+
+
+def make_lists(
+    projected: Projected,
+    spans: Spans,
+    grid: Grid,
+    device: Array,
+    capacity: int,
+) -> Lists:
+    """Expand to items, to pairs, and sort; room for ``capacity`` of each.
+
+    If either does not fit the lists come out empty, and the counts say what was
+    wanted.
+    """
+    ranks = projected.u.shape[0]
+    items, safe = total_count(spans.count)
+    counts = jnp.where(safe & (items <= capacity), spans.count, 0)
+    rank, place = expand(counts, capacity)
+    row = _take(spans.first, rank) + place
+    first_tile, tile_count = _column_spans(projected, rank, row, grid, device)
+    tile_count = jnp.where(rank < ranks, tile_count, 0)
+    pairs, safe = total_count(tile_count)
+    tile_count = jnp.where(safe & (pairs <= capacity), tile_count, 0)
+
+    item, place = expand(tile_count, capacity)
+    live = item < capacity
+    tile = jnp.where(
+        live, _take(row * grid.cols + first_tile, item) + place, grid.tiles
+    )
+    pair_rank = jnp.where(live, _take(rank, item), ranks)
+    return Lists(
+        ranks=sort_pairs(tile, pair_rank, grid.tiles + 1, ranks + 1),
+        length=jnp.zeros(grid.tiles, jnp.int32).at[tile].add(1, mode="drop"),
+        items=items,
+        pairs=pairs,
+    )
+
+
+def make_schedule(length: Array, grid: Grid, group: int, chunk: int) -> Schedule:
+    """Tiles by falling length, in blocks of ``group``, ``chunk`` Gaussians a step."""
+    blocks = -(-grid.tiles // group)
+    order = argsort_descending(length)
+    padding = jnp.full(blocks * group - grid.tiles, grid.tiles, jnp.int32)
+    tiles = jnp.concatenate([order, padding]).reshape(blocks, group)
+    levels = -(-_take(length, tiles[:, 0]) // chunk)
+    return Schedule(tiles, levels, jnp.sum(levels, dtype=jnp.int32))
+
+
+def step_capacity(capacity: int, grid: Grid, group: int, chunk: int) -> int:
+    """Room for steps that goes with a pair capacity: half as much again as if every
+    chunk were full, and one more for each block.
+    """
+    return -(-grid.tiles // group) + -(-3 * capacity // (2 * group * chunk))
+
+
+def pairs_for_steps(steps: Array, grid: Grid, group: int, chunk: int) -> Array:
+    """Pair capacity whose `step_capacity` holds ``steps``; saturating int32."""
+    blocks = -(-grid.tiles // group)
+    extra = jnp.maximum(steps - blocks, 0).astype(jnp.float32)
+    wanted = jnp.ceil(extra * (2 * group * chunk / 3) * (1 + 1e-6))
+    huge = wanted >= COUNT_LIMIT
+    return jnp.where(huge, 2**31 - 1, jnp.where(huge, 0, wanted).astype(jnp.int32))
+
+
+def make_work(
+    lists: Lists, schedule: Schedule, chunk: int, ranks: int, room: int
+) -> Work:
+    """Unroll the schedule into ``room`` steps; none are live if they do not fit."""
+    blocks = schedule.levels.shape[0]
+    fits = schedule.steps <= room
+    block, level = expand(jnp.where(fits, schedule.levels, 0), room)
+    live = block < blocks
+    block = jnp.where(live, block, 0)
+    start = jnp.cumsum(lists.length) - lists.length
+    tile = schedule.tiles[block]
+    offset = level[:, None, None] * chunk + lax.iota(jnp.int32, chunk)
+    inside = live[:, None, None] & (offset < _take(lists.length, tile)[..., None])
+    position = _take(start, tile)[..., None] + offset
+    return Work(
+        ranks=jnp.where(inside, _take(lists.ranks, position), ranks),
+        block=block,
+        live=live,
+    )

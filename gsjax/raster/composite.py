@@ -1,0 +1,245 @@
+"""Front-to-back compositing of sorted tile lists, chunk by chunk.
+
+    C = Σ_k c_k α_k T_k,   T_k = Π_{j<k} (1 − α_j)
+
+Axis legend: S steps, G tiles of a step, K Gaussians of a chunk, P pixels of a tile,
+C channels (colour, then depth where asked for, then ones, whose sum is alpha).
+
+How it is laid out, and why (measured on two cores, in ns for each evaluation of a
+Gaussian at a pixel): the exponent Q = y1² + y2² has y1, y2 linear in the pixel, so
+they are a matrix product [P, 3] × [3, K], and so is the sum over colours; the
+transposes of both are then matrix products too, and what is left is one elementwise
+kernel and the running product. Chunks are recomputed in the backward pass instead
+of kept. A chunk behind pixels that have all stopped is skipped, in both directions,
+by `lax.cond`.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from gsjax.raster.bins import Grid, Schedule, Work, tile_origins
+from gsjax.raster.types import Array, Projected, RasterConfig
+
+_einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
+
+
+def _running_product(alpha: Array) -> tuple[Array, Array]:
+    """(Π over all K, Π over those before k [G, K, P]) of 1 − alpha [G, K, P]."""
+
+    def step(product, a):
+        return product * (1 - a), product
+
+    ones = jnp.ones_like(alpha[:, 0])
+    total, before = lax.scan(step, ones, jnp.moveaxis(alpha, 1, 0))
+    return total, jnp.moveaxis(before, 0, 1)
+
+
+@jax.custom_jvp
+def transmittance(alpha: Array) -> tuple[Array, Array]:
+    """As `_running_product`, for alpha < 1, with its derivative as a running *sum*.
+
+    dT_k = −T_k Σ_{j<k} dα_j / (1 − α_j). The transpose of a sum costs half of what
+    that of a product does; tested against plain differentiation. The division is
+    safe because α is capped below 1.
+    """
+    return _running_product(alpha)
+
+
+@transmittance.defjvp
+def _transmittance_jvp(primals, tangents):
+    (alpha,), (d_alpha,) = primals, tangents
+    total, before = transmittance(alpha)
+
+    def step(running, d):
+        return running + d, running
+
+    rate = d_alpha / (1 - alpha)
+    summed, sums = lax.scan(
+        step, jnp.zeros_like(rate[:, 0]), jnp.moveaxis(rate, 1, 0)
+    )
+    return (total, before), (-total * summed, -before * jnp.moveaxis(sums, 0, 1))
+
+
+@jax.custom_vjp
+def _collect_absolute(y1, y2, factors, probe):
+    """(y1, y2) unchanged; ``probe`` receives Σ over pixels of |∂L/∂mean|."""
+    del factors, probe
+    return y1, y2
+
+
+def _collect_forward(y1, y2, factors, probe):
+    return (y1, y2), (factors, probe)
+
+
+def _collect_backward(residuals, cotangents):
+    (inv_sx, slope, inv_sy), _ = residuals
+    ct1, ct2 = cotangents
+    wide = [f[..., None] for f in (inv_sx, slope, inv_sy)]
+    by_u = -wide[0] * ct1 + wide[2] * wide[1] * ct2
+    by_v = -wide[2] * ct2
+    absolute = jnp.stack([jnp.sum(jnp.abs(g), -1) for g in (by_u, by_v)])
+    zeros = tuple(jnp.zeros_like(f) for f in (inv_sx, slope, inv_sy))
+    return ct1, ct2, zeros, absolute
+
+
+_collect_absolute.defvjp(_collect_forward, _collect_backward)
+
+
+def _alphas(chunk: dict[str, Array], pixels: Array, config: RasterConfig) -> Array:
+    """α [G, K, P] of a chunk of Gaussians at the pixels [P, 3] = (x, y, 1)."""
+    inv_sx, inv_sy, slope = chunk["inv_sx"], chunk["inv_sy"], chunk["slope"]
+    x, y = chunk["x"], chunk["y"]  # mean relative to the tile's corner
+    zero = jnp.zeros_like(x)
+    rows = [
+        jnp.stack([inv_sx, zero, -inv_sx * x], -1),
+        jnp.stack([-inv_sy * slope, inv_sy, -inv_sy * (y - slope * x)], -1),
+    ]
+    y1, y2 = (_einsum("gkf,pf->gkp", row, pixels) for row in rows)
+    if config.absgrad and "probe" in chunk:
+        factors = (inv_sx, slope, inv_sy)
+        y1, y2 = _collect_absolute(y1, y2, factors, chunk["probe"])
+    raw = chunk["opacity"][..., None] * jnp.exp(-0.5 * (y1 * y1 + y2 * y2))
+    # At the tie, and above, the derivative is that of the cap: zero.
+    capped = jnp.where(raw < config.alpha_cap, raw, config.alpha_cap)
+    return jnp.where(capped >= config.alpha_cut, capped, 0)
+
+
+def _composite_chunk(
+    carried: Array, chunk: dict[str, Array], pixels: Array, config: RasterConfig
+) -> tuple[Array, dict[str, Array]]:
+    """Blend one chunk behind the transmittance ``carried`` [G, P].
+
+    Returns:
+      The transmittance behind the chunk *as if nothing stopped* (what has fallen to
+      the limit never rises again, so it still tells who has stopped), and the sums
+      to add: "sums" [G, C, P], "median" [G, P] where asked for.
+    """
+    alpha = _alphas(chunk, pixels, config)
+    # A cap of 1 needs the rule that does not divide.
+    product = transmittance if config.alpha_cap < 1 else _running_product
+    total, before = product(alpha)
+    reached = carried[:, None] * before
+    if config.stop_rule == "before":
+        blended = lax.stop_gradient(reached * (1 - alpha)) > config.stop
+    else:
+        blended = lax.stop_gradient(reached) > config.stop
+    weight = jnp.where(blended, alpha * reached, 0)
+    out = {"sums": _einsum("gkp,gkc->gcp", weight, chunk["channels"])}
+    if "median_depth" in config.outputs:
+        half = lax.stop_gradient(
+            (reached > 0.5) & (reached * (1 - alpha) <= 0.5) & blended
+        )
+        out["median"] = jnp.sum(jnp.where(half, chunk["depth"][..., None], 0), axis=1)
+    return carried * total, out
+
+
+def _gather(
+    projected: Projected, work: Work, tiles: Array, grid: Grid, device: Array, config
+) -> dict[str, Array]:
+    """Parameters of every chunk, [S, G, K] each, ahead of the loop.
+
+    So that the transpose is one scatter-add and not one a step. Null ranks read
+    zeros: opacity 0, and a position at their tile's corner.
+    """
+
+    def take(values):
+        return values.at[work.ranks].get(mode="fill", fill_value=0)
+
+    corner_x, corner_y = tile_origins(grid, tiles[work.block], device)
+    real = work.ranks < projected.u.shape[0]
+    dtype = projected.u.dtype
+
+    def relative(values, corner):
+        return jnp.where(real, take(values) - corner.astype(dtype)[..., None], 0)
+
+    chunks = {
+        "x": relative(projected.u, corner_x),
+        "y": relative(projected.v, corner_y),
+        "inv_sx": take(projected.inv_sx),
+        "slope": take(projected.slope),
+        "inv_sy": take(projected.inv_sy),
+        "opacity": take(projected.opacity),
+    }
+    channels = [take(c) for c in projected.colors] if "rgb" in config.outputs else []
+    if {"depth", "median_depth"} & set(config.outputs):
+        depth = take(projected.depth)
+        if "depth" in config.outputs:
+            channels.append(depth)
+        if "median_depth" in config.outputs:
+            chunks["depth"] = depth
+    channels.append(jnp.ones_like(chunks["opacity"]))
+    chunks["channels"] = jnp.stack(channels, -1)
+    if projected.probe is not None:
+        chunks["probe"] = jnp.stack([take(p) for p in projected.probe], 1)
+    return chunks
+
+
+def composite(
+    projected: Projected,
+    work: Work,
+    schedule: Schedule,
+    grid: Grid,
+    device: Array,
+    config: RasterConfig,
+) -> dict[str, Array]:
+    """Images of one device's tiles, before the background.
+
+    Returns:
+      "sums" [T, C, P]: colour, depth where asked for, alpha; "median" [T, P] where
+      asked for. T in the grid's order.
+    """
+    blocks, group = schedule.tiles.shape
+    pixels = _pixel_matrix(grid.tile, projected.u.dtype)
+    count = pixels.shape[0]
+    chunks = _gather(projected, work, schedule.tiles, grid, device, config)
+
+    @jax.checkpoint
+    def advance(go, carried, chunk):
+        def blend():
+            return _composite_chunk(carried, chunk, pixels, config)
+
+        def skip():
+            shapes = jax.eval_shape(blend)[1]
+            return carried, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+
+        return lax.cond(go, blend, skip)
+
+    def step(canvas, inputs):
+        block, live, chunk = inputs
+        carried = canvas["transmittance"][block]
+        go = live & jnp.any(lax.stop_gradient(carried) > config.stop)
+        carried, added = advance(go, carried, chunk)
+        new = {"transmittance": canvas["transmittance"].at[block].set(carried)}
+        for name, value in added.items():
+            new[name] = canvas[name].at[block].add(value)
+        return new, None
+
+    channels = chunks["channels"].shape[-1]
+    dtype = projected.u.dtype
+    canvas = {
+        "transmittance": jnp.ones((blocks, group, count), dtype),
+        "sums": jnp.zeros((blocks, group, channels, count), dtype),
+    }
+    if "median_depth" in config.outputs:
+        canvas["median"] = jnp.zeros((blocks, group, count), dtype)
+    canvas, _ = lax.scan(step, canvas, (work.block, work.live, chunks))
+    place = (
+        jnp.zeros(grid.tiles, jnp.int32)
+        .at[schedule.tiles.reshape(-1)]
+        .set(lax.iota(jnp.int32, blocks * group), mode="drop")
+    )
+    return {
+        name: value.reshape(blocks * group, *value.shape[2:])[place]
+        for name, value in canvas.items()
+        if name != "transmittance"
+    }
+
+
+def _pixel_matrix(tile: int, dtype) -> Array:
+    """[P, 3] rows (x, y, 1): pixel centres relative to the tile's corner."""
+    centre = jnp.arange(tile, dtype=dtype) + 0.5
+    y, x = jnp.meshgrid(centre, centre, indexing="ij")
+    return jnp.stack([x.ravel(), y.ravel(), jnp.ones(tile * tile, dtype)], -1)

@@ -1,0 +1,234 @@
+"""EWA projection (Zwicker et al. 2001): Gaussians and a camera → `Projected`.
+
+In two passes. `depth_order` looks at every slot, takes no derivative, and finds what
+can be seen and in which order. `project` then works on those alone, front to back.
+All arithmetic is on components (structure of arrays); no matrix product is used, so
+no accelerator can lower its precision.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from gsjax import rotations
+from gsjax import sh as sh_lib
+from gsjax.cameras import Camera, camera_centre
+from gsjax.gaussians import Gaussians
+from gsjax.numerics import exp_log_scale, safe_normalize, safe_sqrt
+from gsjax.raster.sorting import argsort_float
+from gsjax.raster.types import Array, Projected, RasterConfig
+
+
+def transform_point(viewmat: Array, point):
+    """Camera coordinates of world ``point``, as components; viewmat is [4, 4]."""
+    return tuple(
+        sum(viewmat[i, j] * point[j] for j in range(3)) + viewmat[i, 3]
+        for i in range(3)
+    )
+
+
+def ewa_jacobian(camera: Camera, point):
+    """Rows (du/d·, dv/d·) of the Jacobian of the lens at camera ``point``."""
+    at = camera.model.linearisation_point(camera.K, camera.width, camera.height, point)
+    one, zero = jnp.ones_like(at[0]), jnp.zeros_like(at[0])
+    columns = [
+        jax.jvp(
+            lambda *p: camera.model.project_point(camera.K, p),
+            at,
+            tuple(one if i == j else zero for i in range(3)),
+        )[1]
+        for j in range(3)
+    ]
+    return tuple(zip(*columns))
+
+
+def in_depth_range(camera: Camera, z: Array) -> Array:
+    """Where camera z is drawn; a NaN is not."""
+    return (z > camera.near) & (z < camera.far)
+
+
+def depth_order(
+    gaussians: Gaussians, camera: Camera, config: RasterConfig
+) -> tuple[Array, Array]:
+    """Slots front to back, and how many of them, the first ones, may be visible.
+
+    Conservative: what is left out has no pixel with α at or above the cut.
+
+    Returns:
+      order: [N] int32 permutation of the slots; equal depths by slot.
+      count: [] int32.
+    """
+    params = lax.stop_gradient(gaussians.params)
+    camera = lax.stop_gradient(camera)
+    means, log_scales = params.means.T, params.log_scales.T
+    logits = params.logit_opacities
+    x, y, z = transform_point(camera.viewmat, means)
+    live = gaussians.active & in_depth_range(camera, z) & jnp.isfinite(logits)
+    for value in (*means, *log_scales):
+        live &= jnp.isfinite(value)
+    point = (jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1))
+    u, v = camera.model.project_point(camera.K, point)
+    largest = exp_log_scale(jnp.max(jnp.where(live, log_scales, 0), axis=0))
+    opacity = jax.nn.sigmoid(logits)
+    reach = reach_of(opacity, config)
+    for centre, row, size in zip(
+        (u, v), ewa_jacobian(camera, point), (camera.width, camera.height)
+    ):
+        gain = sum(j * j for j in row)
+        extent = jnp.sqrt(reach * (largest * largest * gain + config.dilation))
+        extent = extent * 1.001 + 0.01  # room for rounding
+        # Phrased so that an overflow to inf keeps the Gaussian for `project`.
+        live &= ~(centre + extent < 0.5) & ~(centre - extent > size - 0.5)
+    live &= reach > 0
+    order = argsort_float(jnp.where(live, z, jnp.inf))
+    return order, jnp.sum(live, dtype=jnp.int32)
+
+
+def reach_of(opacity: Array, config: RasterConfig) -> Array:
+    """Q = 2 ln(opacity / cut) at which α meets the cut; 0 if it never does."""
+    seen = opacity > config.alpha_cut
+    return 2 * jnp.log(jnp.where(seen, opacity / config.alpha_cut, 1))
+
+
+def project(
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RasterConfig,
+    order: Array,
+    count: Array,
+    features: Array | None = None,
+    probe: Array | None = None,
+    abs_probe: Array | None = None,
+) -> Projected:
+    """Project the slots ``order`` [R], of which the first ``count`` are live.
+
+    Every input of a dead rank is replaced before it is used, so that neither values
+    nor derivatives can leak, whatever the slot holds.
+
+    Args:
+      gaussians: capacity N.
+      camera: a single camera.
+      config: dilation, antialias and alpha_cut are used.
+      order, count: from `depth_order`, possibly cut to the first R.
+      features: [N, C] used in place of SH colour, or None.
+      probe: [N, 2] added to the projected means; its gradient is the densification
+        statistic. Or None.
+      abs_probe: [N, 2] zeros that collect the absolute gradient. Or None.
+    """
+    rows = jax.tree.map(lambda a: a[order], gaussians.params)
+    live = lax.iota(jnp.int32, order.shape[0]) < count
+    colour_rows = rows.sh if features is None else features[order]
+    live &= jnp.all(jnp.isfinite(colour_rows), axis=tuple(range(1, colour_rows.ndim)))
+    unit, good = safe_normalize(
+        tuple(jnp.where(live, q, 1) for q in rows.quats.T), (1.0, 0.0, 0.0, 0.0)
+    )
+    live &= good
+    means = tuple(jnp.where(live, m, 0) for m in rows.means.T)
+    scales = tuple(exp_log_scale(jnp.where(live, s, 0)) for s in rows.log_scales.T)
+    x, y, z = transform_point(camera.viewmat, means)
+    # A dead rank's mean is the origin, which may lie anywhere: park it at z = 1.
+    x, y, z = jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1)
+    u, v = camera.model.project_point(camera.K, (x, y, z))
+    if probe is not None:
+        u, v = u + probe[order, 0], v + probe[order, 1]
+
+    m1, m2 = _half_covariance(camera, (x, y, z), unit, scales)
+    a, b, c, det, det_sharp = _dilate(m1, m2, config.dilation)
+    live &= (det > 0) & (det < jnp.inf) & (a < jnp.inf) & (c < jnp.inf)
+    a, b, c = jnp.where(live, a, 1), jnp.where(live, b, 0), jnp.where(live, c, 1)
+    det = jnp.where(live, det, 1)
+    # sqrt(max(0.005², ratio)): the floor of Mip-Splatting and gsplat.
+    ratio = jnp.where(live, det_sharp, 1) / det
+    floor = 0.005**2
+    compensation = jnp.sqrt(jnp.where(ratio > floor, ratio, floor))
+
+    opacity = jax.nn.sigmoid(jnp.where(live, rows.logit_opacities, 0))
+    if config.antialias:
+        opacity = opacity * compensation
+    reach = jnp.where(live, reach_of(lax.stop_gradient(opacity), config), 0)
+    if features is None:
+        colors = _sh_colors(camera, means, rows.sh, live)
+    else:
+        colors = jnp.where(live, colour_rows.T, 0)
+    return Projected(
+        u=u,
+        v=v,
+        depth=z,
+        inv_sx=1 / jnp.sqrt(a),
+        slope=b / a,
+        inv_sy=jnp.sqrt(a / det),
+        var_y=c,
+        det=det,
+        opacity=jnp.where(live, opacity, 0),
+        reach=reach,
+        colors=colors,
+        compensation=compensation,
+        probe=None if abs_probe is None else abs_probe[order].T,
+    )
+
+
+def _half_covariance(camera: Camera, point, unit, scales):
+    """Rows m1, m2 of J W R S, as components: the 2D covariance is M Mᵀ."""
+    rotation = rotations.rotation_rows(*unit)
+    halves = []
+    for jacobian_row in ewa_jacobian(camera, point):
+        in_world = [
+            sum(jacobian_row[i] * camera.viewmat[i, j] for i in range(3))
+            for j in range(3)
+        ]
+        halves.append(
+            tuple(
+                sum(in_world[i] * rotation[i][j] for i in range(3)) * scales[j]
+                for j in range(3)
+            )
+        )
+    return halves
+
+
+def _dilate(m1, m2, dilation: float):
+    """Covariance a, b, c, its determinant, and the determinant before dilation.
+
+    The determinant comes from the factors, ‖m1 × m2‖² + e (‖m1‖² + ‖m2‖²) + e²: for
+    needles ac − b² cancels (a third of them turn negative at 10⁴ px).
+    """
+    sharp_a, sharp_c = sum(m * m for m in m1), sum(m * m for m in m2)
+    b = sum(p * q for p, q in zip(m1, m2))
+    cross = (
+        m1[1] * m2[2] - m1[2] * m2[1],
+        m1[2] * m2[0] - m1[0] * m2[2],
+        m1[0] * m2[1] - m1[1] * m2[0],
+    )
+    det_sharp = sum(n * n for n in cross)
+    det = det_sharp + dilation * (sharp_a + sharp_c) + dilation * dilation
+    return sharp_a + dilation, b, sharp_c + dilation, det, det_sharp
+
+
+def _sh_colors(camera: Camera, means, sh: Array, live: Array) -> Array:
+    """Colour [3, R] of coefficients [R, K, 3] seen from the camera; + 0.5, ≥ 0."""
+    degree = sh_lib.degree_of(sh.shape[1])
+    coefficients = jnp.where(live, jnp.moveaxis(sh, 0, -1), 0)
+    if degree == 0:
+        raw = sh_lib.C0 * coefficients[0]
+    else:
+        centre = camera_centre(camera.viewmat)
+        offset = tuple(m - c for m, c in zip(means, centre))
+        direction, _ = safe_normalize(offset, (0.0, 0.0, 1.0))
+        basis = sh_lib.sh_basis(degree, *direction)
+        raw = sum(value * coefficients[k] for k, value in enumerate(basis))
+    shifted = raw + 0.5
+    return jnp.where(shifted > 0, shifted, 0)
+
+
+def conics_of(projected: Projected) -> Array:
+    """Inverse 2D covariances [R, 3] as (xx, xy, yy), for comparison with others."""
+    var_x = 1 / (projected.inv_sx * projected.inv_sx)
+    cov_xy = projected.slope * var_x
+    entries = (projected.var_y, -cov_xy, var_x)
+    return jnp.stack([entry / projected.det for entry in entries], -1)
+
+
+def radii_of(projected: Projected) -> Array:
+    """Half the longer side [R] of the box around Q ≤ reach, in px; 0 if unseen."""
+    var_x = 1 / (projected.inv_sx * projected.inv_sx)
+    return safe_sqrt(projected.reach * jnp.maximum(var_x, projected.var_y))
+

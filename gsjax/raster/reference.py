@@ -1,0 +1,134 @@
+"""Dense reference: every Gaussian at every pixel, no tiles, no capacity.
+
+Slow and obviously right; run it in float64. The cut-offs of a `RasterConfig` apply
+only if one is given. Deliberately shares nothing with the fast path but the
+parameters: matrices instead of components, an inverse instead of factors.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax import sh as sh_lib
+from gsjax.cameras import Camera, camera_centre
+from gsjax.gaussians import Gaussians
+from gsjax.raster.types import Array, RasterConfig
+from gsjax.rotations import covariance
+
+
+def reference_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.3):
+    """Project by matrices: means2d [N, 2], depth [N], cov2d [N, 2, 2], ratio [N], seen.
+
+    ``cov2d`` includes the dilation; ``ratio`` is det before it over det after;
+    ``seen`` [N] tells what lies between near and far (the rest is set to z = 1).
+    """
+    p = gaussians.params
+    rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    points = jnp.einsum("ij,nj->ni", rotation, p.means, precision="highest")
+    points = points + translation
+    seen = (points[:, 2] > camera.near) & (points[:, 2] < camera.far)
+    points = jnp.where(seen[:, None], points, jnp.asarray([0.0, 0.0, 1.0]))
+    world = covariance(p.quats, jnp.exp(p.log_scales))
+
+    def lens(point):
+        return jnp.stack(camera.model.project_point(camera.K, tuple(point)))
+
+    def limited(point):
+        return jnp.stack(
+            camera.model.linearisation_point(
+                camera.K, camera.width, camera.height, tuple(point)
+            )
+        )
+
+    jacobian = jax.vmap(lambda point: jax.jacfwd(lens)(limited(point)))(points)
+    half = jnp.einsum("nij,jk->nik", jacobian, rotation, precision="highest")
+    sharp = jnp.einsum("nij,njk,nlk->nil", half, world, half, precision="highest")
+    cov2d = sharp + dilation * jnp.eye(2)
+    ratio = jnp.linalg.det(sharp) / jnp.linalg.det(cov2d)
+    return jax.vmap(lens)(points), points[:, 2], cov2d, ratio, seen
+
+
+def reference_colors(gaussians: Gaussians, camera: Camera) -> Array:
+    """SH colour [N, 3] of each Gaussian seen from the camera."""
+    offset = gaussians.params.means - camera_centre(camera.viewmat)
+    directions = offset / jnp.linalg.norm(offset, axis=-1, keepdims=True)
+    return jnp.maximum(sh_lib.eval_sh(gaussians.params.sh, directions) + 0.5, 0)
+
+
+def reference_render(
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RasterConfig | None = None,
+    background: Array | None = None,
+    *,
+    features: Array | None = None,
+    dilation: float = 0.3,
+    antialias: bool = False,
+) -> dict[str, Array]:
+    """Composite every active Gaussian at every pixel; O(N H W) memory.
+
+    Args:
+      gaussians: the active mask must be concrete (not traced).
+      camera: a single camera; near and far cull.
+      config: its cut, cap, stop and dilation apply; None means no cut-off at all,
+        with ``dilation`` and ``antialias`` as given.
+      background: [C], default black.
+      features: [N, C] in place of the SH colour.
+
+    Returns:
+      "rgb" [H, W, C], "alpha", "depth", "median_depth" [H, W], and "margin" [H, W]:
+      the smallest relative distance of the pixel from any threshold (α from the cut,
+      T from the stop), to tell where two renderers may differ by a whole Gaussian.
+    """
+    if config is not None:
+        dilation, antialias = config.dilation, config.antialias
+    slots = np.flatnonzero(np.asarray(gaussians.active))
+    gaussians = jax.tree.map(lambda a: a[slots], gaussians)
+    means2d, depth, cov2d, ratio, inside = reference_project(
+        gaussians, camera, dilation
+    )
+    opacity = jax.nn.sigmoid(gaussians.params.logit_opacities)
+    if antialias:
+        opacity = opacity * jnp.sqrt(jnp.maximum(ratio, 0.005**2))
+    order = jnp.argsort(jnp.where(inside, depth, jnp.inf), stable=True)
+    colors = (
+        reference_colors(gaussians, camera) if features is None else features[slots]
+    )
+    colors, depth, inside = colors[order], depth[order], inside[order]
+    means2d, opacity = means2d[order], jnp.where(inside, opacity[order], 0)
+    inverse = jnp.linalg.inv(cov2d[order])
+
+    ys, xs = jnp.mgrid[: camera.height, : camera.width] + 0.5
+    offset = jnp.stack([xs, ys], -1).reshape(-1, 2) - means2d[:, None]
+    power = jnp.einsum("npi,nij,npj->np", offset, inverse, offset, precision="highest")
+    alpha = opacity[:, None] * jnp.exp(-0.5 * power)  # [N, pixels]
+    margin = jnp.full(alpha.shape[1], jnp.inf)
+    if config is not None:
+        margin = jnp.min(jnp.abs(alpha / config.alpha_cut - 1), axis=0)
+        alpha = jnp.where(alpha < config.alpha_cap, alpha, config.alpha_cap)
+        alpha = jnp.where(alpha >= config.alpha_cut, alpha, 0)
+    after = jnp.cumprod(1 - alpha, axis=0)
+    before = jnp.concatenate([jnp.ones_like(after[:1]), after[:-1]])
+    if config is not None:
+        tested = after if config.stop_rule == "before" else before
+        blended = tested > config.stop
+        if config.stop > 0:
+            near_stop = jnp.abs(tested / config.stop - 1)
+            margin = jnp.minimum(margin, jnp.min(near_stop, axis=0))
+    else:
+        blended = jnp.ones_like(after, bool)
+    weight = jnp.where(blended, alpha * before, 0)
+    total = jnp.sum(weight, axis=0)
+    rgb = jnp.einsum("np,nc->pc", weight, colors, precision="highest")
+    if background is not None:
+        rgb = rgb + (1 - total)[:, None] * jnp.asarray(background)
+    half = (before > 0.5) & (after <= 0.5) & blended
+    shape = (camera.height, camera.width)
+    expected = depth @ weight / jnp.where(total > 1e-10, total, 1)
+    return {
+        "rgb": rgb.reshape(*shape, -1),
+        "alpha": total.reshape(shape),
+        "depth": expected.reshape(shape),
+        "median_depth": jnp.sum(jnp.where(half, depth[:, None], 0), 0).reshape(shape),
+        "margin": margin.reshape(shape),
+    }

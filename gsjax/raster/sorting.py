@@ -1,0 +1,57 @@
+"""Exact sorts by a single packed key without payload.
+
+Measured on CPU: a sort of keys alone is four to five times faster than one that
+carries a payload or compares twice (100 k: 6 ms against 28 ms), and on GPU it is the
+one that XLA hands to a radix sort. Where two parts fit into 32 bits one uint32 is
+sorted, else one uint64, which is built inside `jax.enable_x64` so that it exists
+whatever the user's setting; both are exact.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+Array = jax.Array
+
+
+def bits_for(count: int) -> int:
+    """Bits that hold the numbers 0 to count - 1."""
+    return max(1, (count - 1).bit_length())
+
+
+def sort_pairs(high: Array, low: Array, high_count: int, low_count: int) -> Array:
+    """Sort by (high, low), both int32 and below their counts; returns ``low`` sorted.
+
+    Equal to ``low[np.lexsort((low, high))]``.
+    """
+    low_bits = bits_for(low_count)
+    if bits_for(high_count) + low_bits <= 32:
+        key = (high.astype(jnp.uint32) << low_bits) | low.astype(jnp.uint32)
+        mask = jnp.uint32(2**low_bits - 1)
+        return (lax.sort(key, is_stable=False) & mask).astype(jnp.int32)
+    return _sort_wide(high.astype(jnp.uint32), low)
+
+
+def argsort_float(values: Array) -> Array:
+    """Stable ascending order [n] of floats ≥ 0 or +inf; ties by index."""
+    index = lax.iota(jnp.int32, values.shape[0])
+    if values.dtype == jnp.float32:
+        # Bits of non-negative floats order like the floats.
+        return _sort_wide(lax.bitcast_convert_type(values, jnp.uint32), index)
+    return lax.sort((values, index), num_keys=2)[1]
+
+
+def argsort_descending(counts: Array) -> Array:
+    """Stable descending order [n] of int32 counts ≥ 0; ties by index."""
+    key = (2**31 - 1 - counts).astype(jnp.uint32)
+    return _sort_wide(key, lax.iota(jnp.int32, counts.shape[0]))
+
+
+def _sort_wide(high: Array, low: Array) -> Array:
+    """Sort by (high uint32, low int32 ≥ 0); returns ``low`` sorted."""
+    with jax.enable_x64(True):
+        wide = lax.convert_element_type(high, jnp.uint64) << np.uint64(32)
+        key = wide | lax.convert_element_type(low, jnp.uint64)
+        low_bits = lax.sort(key, is_stable=False) & np.uint64(2**32 - 1)
+        return lax.convert_element_type(low_bits, jnp.int32)
