@@ -48,7 +48,7 @@ class _Element(NamedTuple):
     """One element of the header; a list property has the type None."""
 
     name: str
-    count: int
+    rows: int
     types: dict[str, str | None]
 
     @property
@@ -72,9 +72,7 @@ class _Header(NamedTuple):
     size: int
 
 
-def read_ply(
-    path: str | PathLike[str], *, drop_nonfinite: bool = False
-) -> Gaussians:
+def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaussians:
     """Gaussians of a 3DGS PLY file, binary or ascii, of any SH degree up to 4.
 
     Properties are found by name, in any order and of any scalar type; those that
@@ -105,19 +103,16 @@ def read_ply(
             _check_size(header)
             fields = _read_body(file, header, bases)
     except OSError as error:
-        reason = error.strerror or error
         raise InputError(
-            f"{path}: cannot be read: {reason}; check the path and its permissions"
+            f"{path}: cannot be read: {error.strerror or error}; check path and "
+            "permissions"
         ) from error
     _check_values(path, fields, drop_nonfinite)
-    return make_gaussians(**fields)
+    return make_gaussians(**fields, capacity=None)
 
 
 def _warn(message: str) -> None:
-    warnings.warn(message, UserWarning, stacklevel=4)
-
-
-# --- header ---------------------------------------------------------------------
+    warnings.warn(message, UserWarning, stacklevel=3)
 
 
 def _read_header(file: BinaryIO, path: Path) -> _Header:
@@ -172,18 +167,14 @@ def _parse_header(
                 if name in elements:
                     raise InputError(f"{where}: this element is declared twice")
                 last = elements[name] = _Element(name, int(count), {})
-            case ["element", *_]:
-                raise InputError(f"{where}: 'element NAME COUNT' is wanted")
             case ["property", *kinds, name] if last and len(kinds) in (1, 3):
                 if name in last.types:
                     raise InputError(f"{where}: this property is declared twice")
                 last.types[name] = _property_type(where, kinds)
-            case ["property", *_] if last is None:
-                raise InputError(f"{where}: stands before any 'element' line")
             case _:
                 raise InputError(
-                    f"{where}: not a line of a PLY header; the file is damaged or "
-                    "its header was edited: export it again"
+                    f"{where}: 'element NAME COUNT', or after one 'property TYPE "
+                    "NAME', is wanted; the header is damaged: export the file again"
                 )
     if order is None:
         raise InputError(f"{path}: the header has no 'format'; wanted: {[*_FORMATS]}")
@@ -247,13 +238,13 @@ def _check_size(header: _Header) -> None:
     open_end = not order or any(element.has_list for element in header.after)
     if not open_end:
         elements += header.after
-    wanted = sum(e.count * e.least_bytes(order) for e in elements)
+    wanted = sum(e.rows * e.least_bytes(order) for e in elements)
     if not order:
         wanted = max(0, wanted - 1)  # the last line may lack its end
     actual = header.size - header.body
     if actual < wanted:
         sizes = ", ".join(
-            f"{e.count} {e.name} × {e.least_bytes(order)} bytes" for e in elements
+            f"{e.rows} {e.name} × {e.least_bytes(order)} bytes" for e in elements
         )
         raise InputError(
             f"{path}: the body (from byte {header.body}) is truncated: the header "
@@ -265,9 +256,6 @@ def _check_size(header: _Header) -> None:
             f"{path}: {actual - wanted} bytes after the last element (from byte "
             f"{header.body + wanted}) are ignored; the header may be wrong"
         )
-
-
-# --- body -----------------------------------------------------------------------
 
 
 def _allocate(count: int, bases: int, dtype) -> dict[str, np.ndarray]:
@@ -298,7 +286,7 @@ def _read_body(file: BinaryIO, header: _Header, bases: int) -> dict[str, np.ndar
     # float64 only if the file holds more than float32 can and jax would keep it.
     wide = not {"f8", "i4", "u4"}.isdisjoint(header.vertex.types.values())
     dtype = np.dtype(jnp.result_type(float)) if wide else np.dtype(np.float32)
-    fields = _allocate(header.vertex.count, bases, dtype)
+    fields = _allocate(header.vertex.rows, bases, dtype)
     views = _views(fields)
     file.seek(header.body)
     read_rows = _binary_rows if header.order else _ascii_rows
@@ -315,9 +303,9 @@ def _binary_rows(file: BinaryIO, header: _Header) -> Iterator[tuple[int, np.ndar
     """(rows, columns by name) in pieces; ``file`` stands at the body."""
     vertex, order = header.vertex, header.order
     dtype = np.dtype([(name, f"{order}{kind}") for name, kind in vertex.types.items()])
-    file.seek(sum(e.count * e.least_bytes(order) for e in header.before), os.SEEK_CUR)
-    for start in range(0, vertex.count, _CHUNK_ROWS):
-        size = min(_CHUNK_ROWS, vertex.count - start)
+    file.seek(sum(e.rows * e.least_bytes(order) for e in header.before), os.SEEK_CUR)
+    for start in range(0, vertex.rows, _CHUNK_ROWS):
+        size = min(_CHUNK_ROWS, vertex.rows - start)
         data = file.read(size * dtype.itemsize)
         if len(data) < size * dtype.itemsize:
             raise InputError(
@@ -333,10 +321,10 @@ def _ascii_rows(
     """(rows, columns by name) in pieces; ``file`` stands at the body."""
     path, vertex = header.path, header.vertex
     offset, line = header.body, b"\n"
-    for line in islice(file, sum(element.count for element in header.before)):
+    for line in islice(file, sum(element.rows for element in header.before)):
         offset += len(line)
-    for start in range(0, vertex.count, _CHUNK_ROWS):
-        size = min(_CHUNK_ROWS, vertex.count - start)
+    for start in range(0, vertex.rows, _CHUNK_ROWS):
+        size = min(_CHUNK_ROWS, vertex.rows - start)
         table = np.empty((size, len(vertex.types)))
         for row in range(size):
             line = file.readline()
@@ -367,10 +355,7 @@ def _check_values(
     infinite = np.isinf(opacities)
     if infinite.any():
         opacities[infinite] = np.copysign(_MAX_LOGIT, opacities[infinite])
-        _warn(
-            f"{path}: {infinite.sum()} opacities are ±inf (0 or 1 exactly); set to "
-            "the logit of 2^-24 or 1 - 2^-24"
-        )
+        _warn(f"{path}: {infinite.sum()} opacities of ±inf set to ±{_MAX_LOGIT:.4f}")
     bad = {
         name: ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
         for name, array in fields.items()
@@ -411,9 +396,6 @@ def _warn_of_values(path: Path, fields: Mapping[str, np.ndarray]) -> None:
         )
 
 
-# --- writing --------------------------------------------------------------------
-
-
 def write_ply(
     path: str | PathLike[str], gaussians: Gaussians, *, overwrite: bool = False
 ) -> None:
@@ -447,20 +429,14 @@ def write_ply(
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        reason = error.strerror or error
         raise InputError(
-            f"{path}: cannot be written: {reason}; check the permissions and the "
-            "space left in its folder"
+            f"{path}: cannot be written: {error.strerror or error}; check permissions "
+            "and space"
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
     if nonfinite:
-        warnings.warn(
-            f"{path}: {nonfinite} of the Gaussians written have values that are NaN "
-            "or infinite in float32",
-            UserWarning,
-            stacklevel=2,
-        )
+        _warn(f"{path}: {nonfinite} of the Gaussians written are NaN or infinite")
 
 
 def _write_body(file: BinaryIO, gaussians: Gaussians) -> int:

@@ -102,12 +102,18 @@ class Schedule(NamedTuple):
 
 
 class Work(NamedTuple):
-    """The steps: ``ranks`` [S, G, K] (R where there is none), ``block`` and ``live``
-    [S]. Steps of a block follow one another, front to back.
+    """The steps, [S] each; those of a block follow one another, front to back.
+
+    Attributes:
+      ranks: [S, G, K] what to composite; R where there is none.
+      block: which block of tiles. Past the last step: one past the last block.
+      first: whether it is the first of its block.
+      live: whether there is anything to do.
     """
 
     ranks: Array
     block: Array
+    first: Array
     live: Array
 
 
@@ -292,14 +298,14 @@ def make_work(
     fits = schedule.steps <= room
     block, level = expand(jnp.where(fits, schedule.levels, 0), room)
     live = block < blocks
-    block = jnp.where(live, block, 0)
     start = jnp.cumsum(lists.length) - lists.length
-    tile = schedule.tiles[block]
+    tile = schedule.tiles.at[block].get(mode="fill", fill_value=lists.length.shape[0])
     offset = level[:, None, None] * chunk + lax.iota(jnp.int32, chunk)
     inside = live[:, None, None] & (offset < _take(lists.length, tile)[..., None])
     position = _take(start, tile)[..., None] + offset
     return Work(
         ranks=jnp.where(inside, _take(lists.ranks, position), ranks),
         block=block,
+        first=level == 0,
         live=live,
     )

@@ -192,9 +192,14 @@ def composite(
       asked for. T in the grid's order.
     """
     blocks, group = schedule.tiles.shape
-    pixels = _pixel_matrix(grid.tile, projected.u.dtype)
+    dtype = projected.u.dtype
+    pixels = _pixel_matrix(grid.tile, dtype)
     count = pixels.shape[0]
     chunks = _gather(projected, work, schedule.tiles, grid, device, config)
+
+    fresh = {"sums": jnp.zeros((group, chunks["channels"].shape[-1], count), dtype)}
+    if "median_depth" in config.outputs:
+        fresh["median"] = jnp.zeros((group, count), dtype)
 
     @jax.checkpoint
     def advance(go, carried, chunk):
@@ -202,39 +207,36 @@ def composite(
             return _composite_chunk(carried, chunk, pixels, config)
 
         def skip():
-            shapes = jax.eval_shape(blend)[1]
-            return carried, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+            return carried, jax.tree.map(jnp.zeros_like, fresh)
 
         return lax.cond(go, blend, skip)
 
-    def step(canvas, inputs):
-        block, live, chunk = inputs
-        carried = canvas["transmittance"][block]
+    # Every step hands out what its block has summed so far, and the last one of the
+    # block is picked afterwards. An image carried along and updated in place would
+    # be copied at every step of the backward pass.
+    def step(carry, inputs):
+        carried, summed = carry
+        first, live, chunk = inputs
+        carried = jnp.where(first, 1, carried)
         go = live & jnp.any(lax.stop_gradient(carried) > config.stop)
         carried, added = advance(go, carried, chunk)
-        new = {"transmittance": canvas["transmittance"].at[block].set(carried)}
-        for name, value in added.items():
-            new[name] = canvas[name].at[block].add(value)
-        return new, None
+        summed = jax.tree.map(lambda s, a: jnp.where(first, a, s + a), summed, added)
+        return (carried, summed), summed
 
-    channels = chunks["channels"].shape[-1]
-    dtype = projected.u.dtype
-    canvas = {
-        "transmittance": jnp.ones((blocks, group, count), dtype),
-        "sums": jnp.zeros((blocks, group, channels, count), dtype),
-    }
-    if "median_depth" in config.outputs:
-        canvas["median"] = jnp.zeros((blocks, group, count), dtype)
-    canvas, _ = lax.scan(step, canvas, (work.block, work.live, chunks))
+    init = (jnp.ones((group, count), dtype), fresh)
+    _, summed = lax.scan(step, init, (work.first, work.live, chunks))
     place = (
         jnp.zeros(grid.tiles, jnp.int32)
         .at[schedule.tiles.reshape(-1)]
         .set(lax.iota(jnp.int32, blocks * group), mode="drop")
     )
+    last = jnp.cumsum(schedule.levels) - 1
+    last = jnp.where(schedule.levels > 0, last, work.live.shape[0])
     return {
-        name: value.reshape(blocks * group, *value.shape[2:])[place]
-        for name, value in canvas.items()
-        if name != "transmittance"
+        name: value.at[last]
+        .get(mode="fill", fill_value=0)
+        .reshape(blocks * group, *value.shape[2:])[place]
+        for name, value in summed.items()
     }
 
 
