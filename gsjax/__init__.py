@@ -1,18 +1,30 @@
 """3D Gaussian splatting in pure JAX: exact, differentiable, tiled."""
 
-from gsjax.cameras import (
-    Camera as Camera,
-)
-from gsjax.cameras import (
-    make_camera as make_camera,
-)
-from gsjax.gaussians import (
-    Gaussians as Gaussians,
-)
-from gsjax.gaussians import (
-    make_gaussians as make_gaussians,
-)
+from gsjax.cameras import Camera as Camera
+from gsjax.cameras import CameraModel as CameraModel
+from gsjax.cameras import look_at as look_at
+from gsjax.cameras import make_camera as make_camera
+from gsjax.cameras import resize_camera as resize_camera
+from gsjax.cameras import stack_cameras as stack_cameras
+from gsjax.devices import use_all_cores as use_all_cores
+from gsjax.errors import CapacityError as CapacityError
+from gsjax.errors import GsjaxError as GsjaxError
+from gsjax.errors import InputError as InputError
+from gsjax.gaussians import GaussianParams as GaussianParams
+from gsjax.gaussians import Gaussians as Gaussians
+from gsjax.gaussians import capacity_bucket as capacity_bucket
+from gsjax.gaussians import compact as compact
+from gsjax.gaussians import concatenate as concatenate
+from gsjax.gaussians import grow as grow
+from gsjax.gaussians import make_gaussians as make_gaussians
+from gsjax.gaussians import num_active as num_active
+from gsjax.gaussians import select as select
+from gsjax.gaussians import with_sh_degree as with_sh_degree
+from gsjax.io import load as load
+from gsjax.io import save as save
 from gsjax.raster.reference import reference_render as reference_render
+from gsjax.raster.render import exact_config as exact_config
 from gsjax.raster.render import render as render
 from gsjax.raster.render import render_exact as render_exact
 from gsjax.raster.types import RasterConfig as RasterConfig
+from gsjax.raster.types import Render as Render

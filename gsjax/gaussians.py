@@ -173,9 +173,7 @@ def empty_like(gaussians: Gaussians, capacity: int) -> Gaussians:
         )
         for name, array in gaussians.params.__dict__.items()
     }
-    return Gaussians(
-        params=GaussianParams(**params), active=jnp.zeros(capacity, bool)
-    )
+    return Gaussians(params=GaussianParams(**params), active=jnp.zeros(capacity, bool))
 
 
 def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:

@@ -43,9 +43,7 @@ def safe_normalize(components: tuple[Array, ...], fallback: tuple[float, ...]):
     # A NaN fails both comparisons: guards are phrased positively.
     good = (size >= jnp.finfo(size.dtype).tiny) & (size < jnp.inf)
     scale = jnp.where(good, size, 1)
-    scaled = tuple(
-        jnp.where(good, c, f) / scale for c, f in zip(components, fallback)
-    )
+    scaled = tuple(jnp.where(good, c, f) / scale for c, f in zip(components, fallback))
     norm = jnp.sqrt(sum(c * c for c in scaled))
     return tuple(c / norm for c in scaled), good
 

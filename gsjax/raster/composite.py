@@ -57,9 +57,7 @@ def _transmittance_jvp(primals, tangents):
         return running + d, running
 
     rate = d_alpha / (1 - alpha)
-    summed, sums = lax.scan(
-        step, jnp.zeros_like(rate[:, 0]), jnp.moveaxis(rate, 1, 0)
-    )
+    summed, sums = lax.scan(step, jnp.zeros_like(rate[:, 0]), jnp.moveaxis(rate, 1, 0))
     return (total, before), (-total * summed, -before * jnp.moveaxis(sums, 0, 1))
 
 
@@ -94,10 +92,10 @@ def _alphas(chunk: dict[str, Array], pixels: Array, config: RasterConfig) -> Arr
     x, y = chunk["x"], chunk["y"]  # mean relative to the tile's corner
     zero = jnp.zeros_like(x)
     rows = [
-        jnp.stack([inv_sx, zero, -inv_sx * x], -1),
-        jnp.stack([-inv_sy * slope, inv_sy, -inv_sy * (y - slope * x)], -1),
+        jnp.stack([inv_sx, zero, -inv_sx * x], -2),
+        jnp.stack([-inv_sy * slope, inv_sy, -inv_sy * (y - slope * x)], -2),
     ]
-    y1, y2 = (_einsum("gkf,pf->gkp", row, pixels) for row in rows)
+    y1, y2 = (_einsum("pf,gfk->gkp", pixels, row) for row in rows)
     if config.absgrad and "probe" in chunk:
         factors = (inv_sx, slope, inv_sy)
         y1, y2 = _collect_absolute(y1, y2, factors, chunk["probe"])
@@ -127,7 +125,7 @@ def _composite_chunk(
     else:
         blended = lax.stop_gradient(reached) > config.stop
     weight = jnp.where(blended, alpha * reached, 0)
-    out = {"sums": _einsum("gkp,gkc->gcp", weight, chunk["channels"])}
+    out = {"sums": _einsum("gkp,cgk->gcp", weight, chunk["channels"])}
     if "median_depth" in config.outputs:
         half = lax.stop_gradient(
             (reached > 0.5) & (reached * (1 - alpha) <= 0.5) & blended
@@ -171,7 +169,7 @@ def _gather(
         if "median_depth" in config.outputs:
             chunks["depth"] = depth
     channels.append(jnp.ones_like(chunks["opacity"]))
-    chunks["channels"] = jnp.stack(channels, -1)
+    chunks["channels"] = jnp.stack(channels, 1)
     if projected.probe is not None:
         chunks["probe"] = jnp.stack([take(p) for p in projected.probe], 1)
     return chunks
@@ -197,7 +195,7 @@ def composite(
     count = pixels.shape[0]
     chunks = _gather(projected, work, schedule.tiles, grid, device, config)
 
-    fresh = {"sums": jnp.zeros((group, chunks["channels"].shape[-1], count), dtype)}
+    fresh = {"sums": jnp.zeros((group, chunks["channels"].shape[1], count), dtype)}
     if "median_depth" in config.outputs:
         fresh["median"] = jnp.zeros((group, count), dtype)
 

@@ -231,4 +231,3 @@ def radii_of(projected: Projected) -> Array:
     """Half the longer side [R] of the box around Q ≤ reach, in px; 0 if unseen."""
     var_x = 1 / (projected.inv_sx * projected.inv_sx)
     return safe_sqrt(projected.reach * jnp.maximum(var_x, projected.var_y))
-
