@@ -14,6 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from gsjax.errors import InputError
 
@@ -167,7 +168,7 @@ def make_camera(
 def _check_values(viewmat, K, near, far) -> None:
     """Host-side checks; tracers pass (their values are not known yet)."""
     values = {"viewmat": viewmat, "K": K, "near": near, "far": far}
-    if any(isinstance(v, jax.core.Tracer) for v in values.values()):
+    if any(isinstance(v, Tracer) for v in values.values()):
         return
     host = {name: np.asarray(value) for name, value in values.items()}
     for name in ("viewmat", "K", "near"):

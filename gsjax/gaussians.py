@@ -11,6 +11,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from gsjax import sh as sh_lib
 from gsjax.errors import InputError
@@ -105,7 +106,8 @@ def make_gaussians(
             )
     sh_lib.degree_of(arrays["sh"].shape[1])
     params = GaussianParams(**arrays)
-    gaussians = Gaussians(params=params, active=jnp.ones(count, bool))
+    active = jnp.ones(count, bool)
+    gaussians = Gaussians(params=params, active=active)  # pyright: ignore
     capacity = max(count, 1) if capacity is None else capacity
     if capacity < max(count, 1):
         raise InputError(
@@ -173,7 +175,8 @@ def empty_like(gaussians: Gaussians, capacity: int) -> Gaussians:
         )
         for name, array in gaussians.params.__dict__.items()
     }
-    return Gaussians(params=GaussianParams(**params), active=jnp.zeros(capacity, bool))
+    inactive = jnp.zeros(capacity, bool)
+    return Gaussians(params=GaussianParams(**params), active=inactive)  # pyright: ignore
 
 
 def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
@@ -206,7 +209,7 @@ def compact(gaussians: Gaussians, capacity: int | None = None) -> Gaussians:
     """
     capacity = gaussians.capacity if capacity is None else capacity
     active = gaussians.active
-    if not isinstance(active, jax.core.Tracer):
+    if not isinstance(active, Tracer):
         count = int(np.sum(np.asarray(active)))
         if count > capacity:
             raise InputError(

@@ -36,11 +36,12 @@ def degree_of(bases: int) -> int:
 def sh_basis(degree: int, x: Array, y: Array, z: Array) -> list[Array]:
     """The (degree + 1)² basis values at unit directions (x, y, z), each as x."""
     basis = [jnp.full_like(x, C0)]
-    if degree >= 1:
-        c = 0.4886025119029199
-        basis += [-c * y, c * z, -c * x]
+    if degree == 0:
+        return basis
+    c1 = 0.4886025119029199
+    basis += [-c1 * y, c1 * z, -c1 * x]
+    xx, yy, zz = x * x, y * y, z * z
     if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
         basis += [
             1.0925484305920792 * x * y,
             -1.0925484305920792 * y * z,

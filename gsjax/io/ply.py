@@ -11,65 +11,25 @@ than the arrays it returns (and once more on the way to the device).
 
 import math
 import os
-import re
 import secrets
 import stat
-import warnings
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from os import PathLike
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, make_gaussians
-from gsjax.sh import MAX_DEGREE, num_bases
+from gsjax.io.ply_header import Header, check_properties, check_size, read_header, warn
 
-_TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2"},
-    **{"int": "i4", "uint": "u4", "float": "f4", "double": "f8"},
-    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
-    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
-}
-# Byte order of each body; ascii has none.
-_FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _NORMALS = ("nx", "ny", "nz")
-_F_REST_COUNTS = [3 * (num_bases(d) - 1) for d in range(MAX_DEGREE + 1)]
-_MAX_HEADER = 1 << 20
 _CHUNK_ROWS = 1 << 14
 # Exporters write ±inf for opacities of exactly 0 and 1; the range of `logit`.
 _MAX_LOGIT = math.log((1 - 2.0**-24) / 2.0**-24)
-
-
-class _Element(NamedTuple):
-    """One element of the header; a list property has the type None."""
-
-    name: str
-    rows: int
-    types: dict[str, str | None]
-
-    @property
-    def has_list(self) -> bool:
-        return None in self.types.values()
-
-    def least_bytes(self, order: str) -> int:
-        """Size of a row: exact if binary, at least this in ascii ("0 0 0\\n")."""
-        if not order:
-            return max(1, 2 * len(self.types))
-        return sum(int(kind[1]) for kind in self.types.values() if kind)
-
-
-class _Header(NamedTuple):
-    path: Path
-    order: str
-    before: list[_Element]
-    vertex: _Element
-    after: list[_Element]
-    body: int
-    size: int
 
 
 def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaussians:
@@ -98,9 +58,9 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
         if not stat.S_ISREG(path.stat().st_mode):
             raise InputError(f"{path}: not a regular file; pass a .ply file")
         with path.open("rb") as file:
-            header = _read_header(file, path)
-            bases = _check_properties(header)
-            _check_size(header)
+            header = read_header(file, path)
+            bases = check_properties(header, _views(_allocate(0, 1, np.float32)))
+            check_size(header)
             fields = _read_body(file, header, bases)
     except OSError as error:
         raise InputError(
@@ -109,153 +69,6 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
         ) from error
     _check_values(path, fields, drop_nonfinite)
     return make_gaussians(**fields, capacity=None)
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, UserWarning, stacklevel=3)
-
-
-def _read_header(file: BinaryIO, path: Path) -> _Header:
-    head = file.read(_MAX_HEADER)
-    size = os.fstat(file.fileno()).st_size
-    magic = re.match(rb"ply[ \t]*(\r\n|\n|\r)", head)
-    if magic is None:
-        raise InputError(
-            f"{path}: byte 0: found {head[:16]!r} where a PLY file has the line "
-            "'ply'; the file is empty, damaged or of another format"
-        )
-    eol = magic[1]
-    pattern = re.compile(re.escape(eol) + rb"end_header[ \t]*" + re.escape(eol))
-    end = pattern.search(head, magic.end() - len(eol))
-    if end is None:
-        raise InputError(
-            f"{path}: no line 'end_header' in the first {len(head)} of {size} bytes; "
-            "the file is truncated or damaged: export or download it again"
-        )
-    text = head[magic.end() : max(end.start(), magic.end())]
-    order, elements = _parse_header(path, text.split(eol) if text else [], eol)
-    names = [element.name for element in elements]
-    if "vertex" not in names:
-        raise InputError(
-            f"{path}: the header has no 'element vertex'; found {names[:8]}; export "
-            "the scene as a 3DGS PLY"
-        )
-    at = names.index("vertex")
-    before, after = elements[:at], elements[at + 1 :]
-    return _Header(path, order, before, elements[at], after, end.end(), size)
-
-
-def _parse_header(
-    path: Path, lines: list[bytes], eol: bytes
-) -> tuple[str, list[_Element]]:
-    order: str | None = None
-    elements: dict[str, _Element] = {}
-    last: _Element | None = None
-    offset = len(b"ply" + eol)
-    for number, raw in enumerate(lines, 2):
-        line = raw.decode("ascii", "replace")
-        where = f"{path}: header line {number} (byte {offset}), {line[:80]!r}"
-        offset += len(raw) + len(eol)
-        match line.split():
-            case ["comment" | "obj_info", *_]:
-                continue
-            case ["format", kind, "1.0"] if kind in _FORMATS and order is None:
-                order = _FORMATS[kind]
-            case ["format", *_]:
-                raise InputError(f"{where}: one format, 1.0, of {[*_FORMATS]} is known")
-            case ["element", name, count] if re.fullmatch("[0-9]{1,20}", count):
-                if name in elements:
-                    raise InputError(f"{where}: this element is declared twice")
-                last = elements[name] = _Element(name, int(count), {})
-            case ["property", *kinds, name] if last and len(kinds) in (1, 3):
-                if name in last.types:
-                    raise InputError(f"{where}: this property is declared twice")
-                last.types[name] = _property_type(where, kinds)
-            case _:
-                raise InputError(
-                    f"{where}: 'element NAME COUNT', or after one 'property TYPE "
-                    "NAME', is wanted; the header is damaged: export the file again"
-                )
-    if order is None:
-        raise InputError(f"{path}: the header has no 'format'; wanted: {[*_FORMATS]}")
-    return order, list(elements.values())
-
-
-def _property_type(where: str, kinds: list[str]) -> str | None:
-    is_list = len(kinds) == 3 and kinds[0] == "list"
-    scalars = kinds[1:] if is_list else kinds
-    if (len(kinds) == 3 and not is_list) or not all(k in _TYPES for k in scalars):
-        raise InputError(f"{where}: unknown type; known: {', '.join(_TYPES)}")
-    return None if is_list else _TYPES[scalars[0]]
-
-
-def _check_properties(header: _Header) -> int:
-    """Number K of SH bases; raises unless all that a Gaussian needs is there."""
-    path, found = header.path, header.vertex.types
-    lists = [name for name, kind in found.items() if kind is None]
-    if lists:
-        raise InputError(
-            f"{path}: element vertex has the list properties {lists[:8]}; Gaussians "
-            "have scalar properties only: export the scene as a 3DGS PLY"
-        )
-    rest = sum(re.fullmatch("f_rest_[0-9]+", name) is not None for name in found)
-    missing = [n for n in _views(_allocate(0, 1, np.float32)) if n not in found]
-    if "f_dc_0" in missing and {"red", "green", "blue"} <= found.keys():
-        raise InputError(
-            f"{path}: this is a point cloud (red, green, blue), not a Gaussian PLY "
-            f"(missing: {', '.join(missing)}); train a scene from the points first"
-        )
-    if "packed_position" in found:
-        raise InputError(
-            f"{path}: this is a compressed (packed) Gaussian PLY, which is not read; "
-            "convert it to the standard, uncompressed PLY"
-        )
-    if rest in _F_REST_COUNTS:
-        missing += [f"f_rest_{i}" for i in range(rest) if f"f_rest_{i}" not in found]
-    if missing:
-        raise InputError(
-            f"{path}: element vertex lacks the properties {', '.join(missing)}; found "
-            f"{len(found)}: {', '.join([*found][:20])}; export the scene as a 3DGS PLY"
-        )
-    if rest not in _F_REST_COUNTS:
-        raise InputError(
-            f"{path}: {rest} properties f_rest_* are no whole SH degree; degrees 0 to "
-            f"{MAX_DEGREE} have {_F_REST_COUNTS}"
-        )
-    return 1 + rest // 3
-
-
-def _check_size(header: _Header) -> None:
-    """Compare the bytes that the header promises with those that are there."""
-    path, order = header.path, header.order
-    for element in header.before:
-        if element.has_list:
-            raise InputError(
-                f"{path}: element {element.name} has a list property and stands before "
-                "vertex, so that its size is unknown; put vertex first"
-            )
-    elements = [*header.before, header.vertex]
-    open_end = not order or any(element.has_list for element in header.after)
-    if not open_end:
-        elements += header.after
-    wanted = sum(e.rows * e.least_bytes(order) for e in elements)
-    if not order:
-        wanted = max(0, wanted - 1)  # the last line may lack its end
-    actual = header.size - header.body
-    if actual < wanted:
-        sizes = ", ".join(
-            f"{e.rows} {e.name} × {e.least_bytes(order)} bytes" for e in elements
-        )
-        raise InputError(
-            f"{path}: the body (from byte {header.body}) is truncated: the header "
-            f"declares {'' if order else 'at least '}{wanted} bytes ({sizes}), "
-            f"{actual} are there; export or download the file again"
-        )
-    if actual > wanted and not open_end:
-        _warn(
-            f"{path}: {actual - wanted} bytes after the last element (from byte "
-            f"{header.body + wanted}) are ignored; the header may be wrong"
-        )
 
 
 def _allocate(count: int, bases: int, dtype) -> dict[str, np.ndarray]:
@@ -282,7 +95,7 @@ def _views(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return views
 
 
-def _read_body(file: BinaryIO, header: _Header, bases: int) -> dict[str, np.ndarray]:
+def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarray]:
     # float64 only if the file holds more than float32 can and jax would keep it.
     wide = not {"f8", "i4", "u4"}.isdisjoint(header.vertex.types.values())
     dtype = np.dtype(jnp.result_type(float)) if wide else np.dtype(np.float32)
@@ -299,7 +112,7 @@ def _read_body(file: BinaryIO, header: _Header, bases: int) -> dict[str, np.ndar
     return fields
 
 
-def _binary_rows(file: BinaryIO, header: _Header) -> Iterator[tuple[int, np.ndarray]]:
+def _binary_rows(file: BinaryIO, header: Header) -> Iterator[tuple[int, np.ndarray]]:
     """(rows, columns by name) in pieces; ``file`` stands at the body."""
     vertex, order = header.vertex, header.order
     dtype = np.dtype([(name, f"{order}{kind}") for name, kind in vertex.types.items()])
@@ -316,7 +129,7 @@ def _binary_rows(file: BinaryIO, header: _Header) -> Iterator[tuple[int, np.ndar
 
 
 def _ascii_rows(
-    file: BinaryIO, header: _Header
+    file: BinaryIO, header: Header
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """(rows, columns by name) in pieces; ``file`` stands at the body."""
     path, vertex = header.path, header.vertex
@@ -342,9 +155,9 @@ def _ascii_rows(
             offset += len(line)
         yield size, dict(zip(vertex.types, table.T))
     if not line.endswith((b"\n", b"\r")):
-        _warn(f"{path}: the last line has no end; its last value may be truncated")
+        warn(f"{path}: the last line has no end; its last value may be truncated")
     if not header.after and any(extra.strip() for extra in file):
-        _warn(f"{path}: text after the last element (byte {offset}) is ignored")
+        warn(f"{path}: text after the last element (byte {offset}) is ignored")
 
 
 def _check_values(
@@ -355,7 +168,7 @@ def _check_values(
     infinite = np.isinf(opacities)
     if infinite.any():
         opacities[infinite] = np.copysign(_MAX_LOGIT, opacities[infinite])
-        _warn(f"{path}: {infinite.sum()} opacities of ±inf set to ±{_MAX_LOGIT:.4f}")
+        warn(f"{path}: {infinite.sum()} opacities of ±inf set to ±{_MAX_LOGIT:.4f}")
     bad = {
         name: ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
         for name, array in fields.items()
@@ -372,7 +185,7 @@ def _check_values(
                 f"{message}; finite values are wanted: repair the file, or "
                 "gsjax.io.ply.read_ply(path, drop_nonfinite=True) drops them"
             )
-        _warn(f"{message}; dropped")
+        warn(f"{message}; dropped")
         for name in fields:
             fields[name] = fields[name][~rows]
     _warn_of_values(path, fields)
@@ -382,14 +195,14 @@ def _warn_of_values(path: Path, fields: Mapping[str, np.ndarray]) -> None:
     quats, opacities = fields["quats"], fields["logit_opacities"]
     zero = np.abs(quats).max(axis=1, initial=0) < np.finfo(quats.dtype).tiny
     if zero.any():
-        _warn(
+        warn(
             f"{path}: {zero.sum()} of {len(zero)} quaternions are zero, the first: "
             f"{np.flatnonzero(zero)[:5].tolist()}; such Gaussians are culled"
         )
     # A heuristic: trained scenes have logits outside [0, 1] and scales below 1.
     probabilities = ((opacities >= 0) & (opacities <= 1)).all()
     if len(opacities) and probabilities and (fields["log_scales"] > 0).all():
-        _warn(
+        warn(
             f"{path}: all opacities lie in [0, 1] and all scales are positive, which "
             "looks like activated values; a 3DGS PLY stores logit(opacity) and "
             "log(scale), and they are read as such: check how the file was exported"
@@ -436,7 +249,7 @@ def write_ply(
     finally:
         temporary.unlink(missing_ok=True)
     if nonfinite:
-        _warn(f"{path}: {nonfinite} of the Gaussians written are NaN or infinite")
+        warn(f"{path}: {nonfinite} of the Gaussians written are NaN or infinite")
 
 
 def _write_body(file: BinaryIO, gaussians: Gaussians) -> int:

@@ -64,10 +64,10 @@ def tile_origins(grid: Grid, tile: Array, device: Array) -> tuple[Array, Array]:
 
 
 class Spans(NamedTuple):
-    """Boxes of tiles: local rows ``first`` … of which ``count``, each ``cols`` wide."""
+    """Boxes of tiles, [R] each: ``rows`` local rows from ``first``, ``cols`` wide."""
 
     first: Array
-    count: Array
+    rows: Array
     cols: Array
 
 
@@ -144,9 +144,9 @@ def row_spans(projected: Projected, camera: Array, grid: Grid, device: Array) ->
     # Global rows of tiles g0 … g1 hold the local rows j with g0 ≤ j·stride + d ≤ g1.
     first = -((device - top // grid.tile) // grid.stride)
     last = (bottom // grid.tile - device) // grid.stride
-    count = jnp.where(seen, jnp.maximum(last - first + 1, 0), 0)
+    rows = jnp.where(seen, jnp.maximum(last - first + 1, 0), 0)
     cols = right // grid.tile - left // grid.tile + 1
-    return Spans(first=camera * grid.rows + first, count=count, cols=cols)
+    return Spans(first=camera * grid.rows + first, rows=rows, cols=cols)
 
 
 def _extent(squared: Array) -> Array:
@@ -241,8 +241,8 @@ def make_lists(
     wanted.
     """
     ranks = projected.u.shape[0]
-    items, safe = total_count(spans.count)
-    counts = jnp.where(safe & (items <= capacity), spans.count, 0)
+    items, safe = total_count(spans.rows)
+    counts = jnp.where(safe & (items <= capacity), spans.rows, 0)
     rank, place = expand(counts, capacity)
     row = _take(spans.first, rank) + place
     first_tile, tile_count = _column_spans(projected, rank, row, grid, device)

@@ -15,6 +15,7 @@ from gsjax import sh as sh_lib
 from gsjax.cameras import Camera, camera_centre
 from gsjax.gaussians import Gaussians
 from gsjax.numerics import exp_log_scale, safe_normalize, safe_sqrt
+from gsjax.raster.ladder import on_ladder
 from gsjax.raster.sorting import argsort_float
 from gsjax.raster.types import Array, Projected, RasterConfig
 
@@ -50,13 +51,14 @@ def in_depth_range(camera: Camera, z: Array) -> Array:
 def depth_order(
     gaussians: Gaussians, camera: Camera, config: RasterConfig
 ) -> tuple[Array, Array]:
-    """Slots front to back, and how many of them, the first ones, may be visible.
+    """Slots front to back, and how many there are that may be visible.
 
     Conservative: what is left out has no pixel with α at or above the cut.
 
     Returns:
-      order: [N] int32 permutation of the slots; equal depths by slot.
-      count: [] int32.
+      order: [R] int32 slots, R the visible capacity; equal depths by slot; N past the
+        last. If more than R are visible, those of the lowest slots are kept.
+      count: [] int32, not limited to R.
     """
     params = lax.stop_gradient(gaussians.params)
     camera = lax.stop_gradient(camera)
@@ -80,8 +82,28 @@ def depth_order(
         # Phrased so that an overflow to inf keeps the Gaussian for `project`.
         live &= ~(centre + extent < 0.5) & ~(centre - extent > size - 0.5)
     live &= reach > 0
-    order = argsort_float(jnp.where(live, z, jnp.inf))
-    return order, jnp.sum(live, dtype=jnp.int32)
+    return _compact_and_sort(live, z, config)
+
+
+def _compact_and_sort(
+    live: Array, z: Array, config: RasterConfig
+) -> tuple[Array, Array]:
+    """Live slots by depth: squeezed together first, then sorted at their number."""
+    slots = live.shape[0]
+    room = min(config.visible_capacity or slots, slots)
+    place = jnp.cumsum(live, dtype=jnp.int32)
+    count = place[-1]
+    target = jnp.where(live, place - 1, room)
+    packed = jnp.full(room, slots, jnp.int32)
+    packed = packed.at[target].set(lax.iota(jnp.int32, slots), mode="drop")
+
+    def sort(size: int) -> Array:
+        some = packed[:size]
+        depth = z.at[some].get(mode="fill", fill_value=jnp.inf)
+        order = some[argsort_float(depth)]
+        return jnp.pad(order, (0, room - size), constant_values=slots)
+
+    return on_ladder(count, room, config.rungs, sort), count
 
 
 def reach_of(opacity: Array, config: RasterConfig) -> Array:
@@ -100,7 +122,7 @@ def project(
     probe: Array | None = None,
     abs_probe: Array | None = None,
 ) -> Projected:
-    """Project the slots ``order`` [R], of which the first ``count`` are live.
+    """Project the slots ``order`` [R], of which the first ``count`` are there.
 
     Every input of a dead rank is replaced before it is used, so that neither values
     nor derivatives can leak, whatever the slot holds.
@@ -109,12 +131,13 @@ def project(
       gaussians: capacity N.
       camera: a single camera.
       config: dilation, antialias and alpha_cut are used.
-      order, count: from `depth_order`, possibly cut to the first R.
+      order, count: from `depth_order`.
       features: [N, C] used in place of SH colour, or None.
       probe: [N, 2] added to the projected means; its gradient is the densification
         statistic. Or None.
       abs_probe: [N, 2] zeros that collect the absolute gradient. Or None.
     """
+    order = jnp.minimum(order, gaussians.capacity - 1)
     rows = jax.tree.map(lambda a: a[order], gaussians.params)
     live = lax.iota(jnp.int32, order.shape[0]) < count
     colour_rows = rows.sh if features is None else features[order]

@@ -4,7 +4,6 @@ Nothing here is jitted: wrap `render` with ``config`` static. `render_exact` is 
 exception: it jits, looks at the counts on the host, and regrows.
 """
 
-from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -19,6 +18,8 @@ from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.numerics import safe_divide
 from gsjax.raster import bins
 from gsjax.raster.composite import composite
+from gsjax.raster.ladder import on_ladder
+from gsjax.raster.occlude import hidden
 from gsjax.raster.project import depth_order, project, radii_of
 from gsjax.raster.types import Array, Demand, Projected, RasterConfig, Render
 
@@ -72,7 +73,7 @@ def render(
         order, visible = depth_order(gaussians, one, config)
         out = project(gaussians, one, config, order, visible, features, p, a)
         radii = jnp.zeros(gaussians.capacity, out.u.dtype)
-        radii = radii.at[order].set(lax.stop_gradient(radii_of(out)))
+        radii = radii.at[order].set(lax.stop_gradient(radii_of(out)), mode="drop")
         return out, radii, visible
 
     if count == 1:
@@ -84,7 +85,10 @@ def render(
     sums, demand, overflowed = rasterise(
         projected, count, camera.width, camera.height, config
     )
-    demand = demand._replace(visible=jnp.sum(visible, dtype=jnp.int32))
+    visible = jnp.max(visible)
+    room = min(config.visible_capacity or gaussians.capacity, gaussians.capacity)
+    demand = demand._replace(visible=visible)
+    overflowed |= visible > room
     images = _finish(sums, config, background, count, projected.colors.shape[0])
     if not camera.batched:
         images = {name: image[0] for name, image in images.items()}
@@ -154,53 +158,75 @@ def rasterise(
     ranks = projected.u.shape[0]
     capacity = config.pair_capacity or default_pair_capacity(ranks, grid)
     share = -(-capacity // devices)
+    seen = _unhidden(lax.stop_gradient(projected), cameras, width, height, config)
     local = partial(_rasterise_local, grid=grid, config=config, capacity=share)
     if devices == 1:
-        images, pairs, wanted = local(jnp.zeros(1, jnp.int32), projected)
+        images, pairs, wanted = local(jnp.zeros(1, jnp.int32), projected, seen)
     else:
         mesh = Mesh(np.array(jax.local_devices()[:devices]), ("tiles",))
         images, pairs, wanted = jax.shard_map(
             local,
             mesh=mesh,
-            in_specs=(PartitionSpec("tiles"), PartitionSpec()),
+            in_specs=(PartitionSpec("tiles"), PartitionSpec(), PartitionSpec()),
             out_specs=PartitionSpec("tiles"),
             check_vma=False,
-        )(jnp.arange(devices, dtype=jnp.int32), projected)
+        )(jnp.arange(devices, dtype=jnp.int32), projected, seen)
     images = {name: _untile(image, grid) for name, image in images.items()}
     overflowed = jnp.any(wanted > share)
     wanted = jnp.max(wanted)
     limit = bins.COUNT_LIMIT // devices
     capacity_wanted = jnp.where(wanted < limit, wanted * devices, 2**31 - 1)
     pairs_float = jnp.sum(pairs.astype(jnp.float32))
-    total = jnp.where(pairs_float < bins.COUNT_LIMIT, jnp.sum(pairs), 2**31 - 1)
+    total = jnp.where(
+        pairs_float < bins.COUNT_LIMIT, jnp.sum(pairs, dtype=jnp.int32), 2**31 - 1
+    )
     demand = Demand(visible=jnp.int32(0), pairs=total, capacity=capacity_wanted)
     return images, demand, overflowed
+
+
+def _unhidden(
+    projected: Projected, cameras: int, width: int, height: int, config: RasterConfig
+) -> Projected:
+    """``projected`` with no reach for what is hidden."""
+    if config.stop <= 0 or not config.occlusion:
+        return projected
+
+    def split(value):  # [..., B · R] → [B, ..., R]
+        value = value.reshape(*value.shape[:-1], cameras, -1)
+        return jnp.moveaxis(value, -2, 0)
+
+    per_camera = jax.tree.map(split, projected)
+    behind = lax.map(lambda one: hidden(one, width, height, config), per_camera)
+    return projected._replace(reach=jnp.where(behind.ravel(), 0, projected.reach))
 
 
 def _rasterise_local(
     device: Array,
     projected: Projected,
+    geometry: Projected,
     *,
     grid: bins.Grid,
     config: RasterConfig,
     capacity: int,
 ):
-    """One device's tiles; ``device`` is [1]. Results gain a leading device axis."""
+    """One device's tiles; ``device`` is [1]. Results gain a leading device axis.
+
+    ``geometry`` is what to bin: ``projected`` without derivatives and without what
+    is hidden.
+    """
     device = device[0]
     ranks = projected.u.shape[0]
     group = bins.tiles_per_step(config, grid, jax.default_backend())
     camera = lax.iota(jnp.int32, ranks) // (ranks // grid.cameras)
-    geometry = lax.stop_gradient(projected)
     spans = bins.row_spans(geometry, camera, grid, device)
     # The boxes bound the pairs from above, for no more than a sum.
-    bound = jnp.sum(spans.count.astype(jnp.float32) * spans.cols)
-    lists = _on_ladder(
-        bound,
-        capacity,
-        config.rungs,
-        lambda room: bins.make_lists(geometry, spans, grid, device, room),
-        lambda lists: lists._replace(ranks=_pad(lists.ranks, capacity)),
-    )
+    bound = jnp.sum(spans.rows.astype(jnp.float32) * spans.cols)
+
+    def sort(room):
+        lists = bins.make_lists(geometry, spans, grid, device, room)
+        return lists._replace(ranks=jnp.pad(lists.ranks, (0, capacity - room)))
+
+    lists = on_ladder(bound, capacity, config.rungs, sort)
     schedule = bins.make_schedule(lists.length, grid, group, config.chunk_size)
 
     def blend(room):
@@ -208,30 +234,11 @@ def _rasterise_local(
         return composite(projected, work, schedule, grid, device, config)
 
     room = bins.step_capacity(capacity, grid, group, config.chunk_size)
-    images = _on_ladder(schedule.steps, room, config.rungs, blend)
+    images = on_ladder(schedule.steps, room, config.rungs, blend)
     for_steps = bins.pairs_for_steps(schedule.steps, grid, group, config.chunk_size)
     wanted = jnp.maximum(jnp.maximum(lists.items, lists.pairs), for_steps)
     images = {name: image[None] for name, image in images.items()}
     return images, lists.pairs[None], wanted[None]
-
-
-def _pad(values: Array, length: int) -> Array:
-    return jnp.pad(values, (0, length - values.shape[0]))
-
-
-def _on_ladder(
-    wanted: Array, full: int, rungs: int, run: Callable, unify: Callable = lambda x: x
-):
-    """``unify(run(size))`` with the smallest of full, full/4, … that holds ``wanted``.
-
-    Work of fixed size is done at the size a view needs, not at the capacity.
-    """
-    sizes = sorted({max(1, -(-full // 4**i)) for i in range(rungs)}, reverse=True)
-    if len(sizes) == 1:
-        return unify(run(full))
-    index = sum((wanted <= size).astype(jnp.int32) for size in sizes[1:])
-    branches = [lambda size=size: unify(run(size)) for size in sizes]
-    return lax.switch(index, branches)
 
 
 def _untile(image: Array, grid: bins.Grid) -> Array:
@@ -296,10 +303,9 @@ def render_exact(
     max_capacity: int = 2**30 - 1,
     **kwargs,
 ) -> Render:
-    """`render`, jitted, its capacity regrown until nothing overflows.
+    """`render`, jitted, its capacities regrown until nothing overflows.
 
-    For calls from the host; inside jit, use `exact_config` once and watch
-    ``overflowed``.
+    For calls from the host; for use under jit, see `exact_config`.
 
     Args:
       gaussians, camera, config, background: as for `render`.
@@ -313,21 +319,7 @@ def render_exact(
         result = _render_jit(gaussians, camera, config, background, **kwargs)
         if not bool(result.overflowed):
             return result
-        config = config.replace(
-            pair_capacity=_next_capacity(int(result.demand.capacity), max_capacity)
-        )
-
-
-def _next_capacity(wanted: int, max_capacity: int) -> int:
-    bucket = capacity_bucket(wanted)
-    if wanted > max_capacity:
-        raise CapacityError(
-            f"this view wants a pair capacity of {wanted:,}"
-            f"{' or more' if wanted == 2**31 - 1 else ''}, above the limit of "
-            f"{max_capacity:,}; render a smaller image or fewer Gaussians, use "
-            "larger tiles, or raise max_capacity"
-        )
-    return min(bucket, max_capacity)
+        config = _regrow(config, result.demand, max_capacity)
 
 
 def exact_config(
@@ -337,7 +329,10 @@ def exact_config(
     *,
     max_capacity: int = 2**30 - 1,
 ) -> RasterConfig:
-    """``config`` with a pair capacity that holds this view, for use under jit.
+    """``config`` with capacities that fit these cameras, for use under jit.
+
+    They are the buckets just above what this view wants: larger than needed by a
+    third at most, so that nothing is paid for slots that are empty or out of view.
 
     Raises:
       CapacityError: as `render_exact`.
@@ -346,6 +341,36 @@ def exact_config(
     while True:
         result = _render_jit(gaussians, camera, light)
         if not bool(result.overflowed):
-            return config.replace(pair_capacity=light.pair_capacity)
-        capacity = _next_capacity(int(result.demand.capacity), max_capacity)
-        light = light.replace(pair_capacity=capacity)
+            fitted = _fit(result.demand, max_capacity)
+            return config.replace(
+                pair_capacity=fitted["pair_capacity"],
+                visible_capacity=min(fitted["visible_capacity"], gaussians.capacity),
+            )
+        light = _regrow(light, result.demand, max_capacity)
+
+
+def _fit(demand: Demand, max_capacity: int) -> dict[str, int]:
+    """Buckets that hold the demand."""
+    wanted = int(demand.capacity)
+    if wanted > max_capacity:
+        raise CapacityError(
+            f"this view wants a pair capacity of {wanted:,}"
+            f"{' or more' if wanted == 2**31 - 1 else ''}, above the limit of "
+            f"{max_capacity:,}; render a smaller image or fewer Gaussians, use "
+            "larger tiles, or raise max_capacity"
+        )
+    return {
+        "pair_capacity": min(capacity_bucket(wanted), max_capacity),
+        "visible_capacity": capacity_bucket(int(demand.visible)),
+    }
+
+
+def _regrow(config: RasterConfig, demand: Demand, max_capacity: int) -> RasterConfig:
+    """``config`` with no capacity below the demand; none shrinks."""
+    fitted = _fit(demand, max_capacity)
+    grown = {
+        name: max(size, getattr(config, name) or 0) for name, size in fitted.items()
+    }
+    if config.visible_capacity is None:
+        grown.pop("visible_capacity")
+    return config.replace(**grown)

@@ -46,7 +46,11 @@ class RasterConfig:
       pair_capacity: room for (tile, Gaussian) pairs; None chooses from the sizes.
         If it is too small, `Render.overflowed` is set and `Render.demand` says what
         was wanted; `render_exact` regrows. Unused room costs memory, hardly time.
-      rungs: how many sizes, each a quarter of the one before, the binning and the
+      visible_capacity: room for Gaussians in view (of each camera); None means all
+        slots. Reported and regrown like ``pair_capacity``.
+      occlusion: leave out, before binning, what lies behind pixels that have all
+        stopped. Bit-equal; pays where something opaque fills part of the view.
+      rungs: how many sizes, each a quarter of the one before, sorting, binning and
         compositing are compiled for; the smallest that fits is run.
       devices: how many devices share the tiles; None means all local ones.
     """
@@ -63,6 +67,8 @@ class RasterConfig:
     chunk_size: int = 32
     tiles_per_step: int | None = None
     pair_capacity: int | None = None
+    visible_capacity: int | None = None
+    occlusion: bool = True
     rungs: int = 3
     devices: int | None = None
 
@@ -81,6 +87,8 @@ class RasterConfig:
             "tiles_per_step": self.tiles_per_step is None or self.tiles_per_step >= 1,
             "pair_capacity": self.pair_capacity is None
             or 1 <= self.pair_capacity < 2**30,
+            "visible_capacity": self.visible_capacity is None
+            or self.visible_capacity >= 1,
             "rungs": self.rungs >= 1,
             "devices": self.devices is None or self.devices >= 1,
         }
@@ -160,8 +168,9 @@ class Demand(NamedTuple):
     """Counts wanted, int32; a count of 2³⁰ or more is reported as 2³¹ − 1.
 
     Attributes:
-      visible: Gaussians inside the view (of all cameras).
-      pairs: (tile, Gaussian) pairs.
+      visible: Gaussians inside the view, of the camera that sees most; the
+        ``visible_capacity`` that would have been enough.
+      pairs: (tile, Gaussian) pairs, of all cameras.
       capacity: the ``pair_capacity`` that would have been enough.
     """
 

@@ -1,0 +1,151 @@
+"""Images to files: what a render returns, as PNG, .npy and animation.
+
+OpenCV encodes and is loaded when first needed. Files are written beside their name
+and then renamed: they appear complete or not at all.
+"""
+
+import io
+import os
+import secrets
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from gsjax.errors import InputError, MissingExtraError
+
+_MAX_16 = 65535
+
+
+class DepthPicture(NamedTuple):
+    """A depth map as a picture.
+
+    Attributes:
+      pixels: [H, W] uint16; 0 where nothing is, else 1 at ``near`` to 65535 at ``far``.
+      near, far: least and greatest depth in the view; both 0 if nothing is in it.
+    """
+
+    pixels: np.ndarray
+    near: float
+    far: float
+
+
+def opencv():
+    """The module cv2.
+
+    Raises:
+      MissingExtraError: if it is absent or does not load.
+    """
+    try:
+        import cv2
+    except ImportError as error:
+        raise MissingExtraError(
+            f"OpenCV, which writes images, does not load ({error}); install it: "
+            "pip install opencv-contrib-python-headless"
+        ) from error
+    return cv2
+
+
+def to_8_bit(image: np.ndarray) -> np.ndarray:
+    """uint8 of values in [0, 1], clipped and rounded to nearest; no gamma."""
+    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+
+
+def depth_picture(depth: np.ndarray) -> DepthPicture:
+    """A picture of a depth map [H, W] in which 0 means that nothing is there."""
+    found = np.isfinite(depth) & (depth > 0)
+    pixels = np.zeros(depth.shape, np.uint16)
+    if not found.any():
+        return DepthPicture(pixels, 0.0, 0.0)
+    values = depth[found].astype(np.float64)
+    near, far = float(values.min()), float(values.max())
+    relative = (values - near) / (far - near) if far > near else 0 * values
+    pixels[found] = np.rint(1 + (_MAX_16 - 1) * relative)
+    return DepthPicture(pixels, near, far)
+
+
+def encode_png(pixels: np.ndarray) -> bytes:
+    """PNG of [H, W] grey or [H, W, 3] RGB, uint8 or uint16."""
+    cv2 = opencv()
+    stored = pixels[..., ::-1] if pixels.ndim == 3 else pixels  # OpenCV has BGR
+    done, data = cv2.imencode(".png", np.ascontiguousarray(stored))
+    if not done:
+        raise InputError(f"OpenCV cannot encode {pixels.shape} {pixels.dtype} as PNG")
+    return data.tobytes()
+
+
+def encode_npy(image: np.ndarray) -> bytes:
+    """The .npy file of an array, as float32."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.asarray(image, np.float32), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def encode_webp(frames: Iterable[np.ndarray], seconds: float) -> bytes:
+    """Animated WebP of [H, W, 3] RGB uint8 frames that loops for ever.
+
+    Args:
+      frames: the pictures, all of one size.
+      seconds: how long all of them take.
+    """
+    cv2 = opencv()
+    animation = cv2.Animation()
+    animation.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
+    count = len(animation.frames)
+    animation.durations = np.full(count, round(1000 * seconds / count), np.int32)
+    quality = [cv2.IMWRITE_WEBP_QUALITY, 90]
+    done, data = cv2.imencodeanimation(".webp", animation, quality)
+    if not done:
+        raise InputError("OpenCV cannot encode the animation as WebP")
+    return data.tobytes()
+
+
+def refuse_existing(paths: Iterable[Path], overwrite: bool) -> None:
+    """Check names before the work that would fill them.
+
+    Raises:
+      InputError: if one exists and ``overwrite`` is not set, or is a folder.
+    """
+    found = [path for path in paths if path.exists()]
+    folders = [path for path in found if path.is_dir()]
+    if folders:
+        raise InputError(f"{folders[0]}: is a folder; a file is to be written there")
+    if found and not overwrite:
+        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+        raise InputError(
+            f"{found[0]}{more}: exists; pass --overwrite, or another folder with -o"
+        )
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder and those above it.
+
+    Raises:
+      InputError: if that cannot be.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be made a folder: {error.strerror or error}"
+        ) from error
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write ``data``, in place of what may be there.
+
+    Raises:
+      InputError: if it cannot be written.
+    """
+    temporary = path.parent / f".gsjax-{secrets.token_hex(6)}.tmp"
+    try:
+        temporary.write_bytes(data)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written: {error.strerror or error}; check permissions "
+            "and space"
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,217 @@
+"""The header of a PLY file: parsed, and held against the size of the file.
+
+The sizes that a header declares are checked here before anything is allocated.
+"""
+
+import os
+import re
+import warnings
+from collections.abc import Collection
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from gsjax.errors import InputError
+from gsjax.sh import MAX_DEGREE, num_bases
+
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2"},
+    **{"int": "i4", "uint": "u4", "float": "f4", "double": "f8"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
+    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
+}
+# Byte order of each body; ascii has none.
+_FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+_F_REST_COUNTS = [3 * (num_bases(d) - 1) for d in range(MAX_DEGREE + 1)]
+_MAX_HEADER = 1 << 20
+
+
+class Element(NamedTuple):
+    """One element of the header; a list property has the type None."""
+
+    name: str
+    rows: int
+    types: dict[str, str | None]
+
+    @property
+    def has_list(self) -> bool:
+        return None in self.types.values()
+
+    def least_bytes(self, order: str) -> int:
+        """Size of a row: exact if binary, at least this in ascii ("0 0 0\\n")."""
+        if not order:
+            return max(1, 2 * len(self.types))
+        return sum(int(kind[1]) for kind in self.types.values() if kind)
+
+
+class Header(NamedTuple):
+    """What a header says.
+
+    Attributes:
+      path: the file, for messages.
+      order: byte order of the body, "<", ">", or "" for ascii.
+      before, vertex, after: the elements, in the order of the body.
+      body: byte at which the body starts.
+      size: bytes of the file.
+    """
+
+    path: Path
+    order: str
+    before: list[Element]
+    vertex: Element
+    after: list[Element]
+    body: int
+    size: int
+
+
+def warn(message: str) -> None:
+    """Warn on behalf of the caller of the calling function."""
+    warnings.warn(message, UserWarning, stacklevel=3)
+
+
+def read_header(file: BinaryIO, path: Path) -> Header:
+    """Parse the header of a file that stands at its start."""
+    head = file.read(_MAX_HEADER)
+    size = os.fstat(file.fileno()).st_size
+    magic = re.match(rb"ply[ \t]*(\r\n|\n|\r)", head)
+    if magic is None:
+        raise InputError(
+            f"{path}: byte 0: found {head[:16]!r} where a PLY file has the line "
+            "'ply'; the file is empty, damaged or of another format"
+        )
+    eol = magic[1]
+    pattern = re.compile(re.escape(eol) + rb"end_header[ \t]*" + re.escape(eol))
+    end = pattern.search(head, magic.end() - len(eol))
+    if end is None:
+        raise InputError(
+            f"{path}: no line 'end_header' in the first {len(head)} of {size} bytes; "
+            "the file is truncated or damaged: export or download it again"
+        )
+    text = head[magic.end() : max(end.start(), magic.end())]
+    order, elements = _parse_header(path, text.split(eol) if text else [], eol)
+    names = [element.name for element in elements]
+    if "vertex" not in names:
+        raise InputError(
+            f"{path}: the header has no 'element vertex'; found {names[:8]}; export "
+            "the scene as a 3DGS PLY"
+        )
+    at = names.index("vertex")
+    before, after = elements[:at], elements[at + 1 :]
+    return Header(path, order, before, elements[at], after, end.end(), size)
+
+
+def _parse_header(
+    path: Path, lines: list[bytes], eol: bytes
+) -> tuple[str, list[Element]]:
+    order: str | None = None
+    elements: dict[str, Element] = {}
+    last: Element | None = None
+    offset = len(b"ply" + eol)
+    for number, raw in enumerate(lines, 2):
+        line = raw.decode("ascii", "replace")
+        where = f"{path}: header line {number} (byte {offset}), {line[:80]!r}"
+        offset += len(raw) + len(eol)
+        match line.split():
+            case ["comment" | "obj_info", *_]:
+                continue
+            case ["format", kind, "1.0"] if kind in _FORMATS and order is None:
+                order = _FORMATS[kind]
+            case ["format", *_]:
+                raise InputError(f"{where}: one format, 1.0, of {[*_FORMATS]} is known")
+            case ["element", name, count] if re.fullmatch("[0-9]{1,20}", count):
+                if name in elements:
+                    raise InputError(f"{where}: this element is declared twice")
+                last = elements[name] = Element(name, int(count), {})
+            case ["property", *kinds, name] if last and len(kinds) in (1, 3):
+                if name in last.types:
+                    raise InputError(f"{where}: this property is declared twice")
+                last.types[name] = _property_type(where, kinds)
+            case _:
+                raise InputError(
+                    f"{where}: 'element NAME COUNT', or after one 'property TYPE "
+                    "NAME', is wanted; the header is damaged: export the file again"
+                )
+    if order is None:
+        raise InputError(f"{path}: the header has no 'format'; wanted: {[*_FORMATS]}")
+    return order, list(elements.values())
+
+
+def _property_type(where: str, kinds: list[str]) -> str | None:
+    is_list = len(kinds) == 3 and kinds[0] == "list"
+    scalars = kinds[1:] if is_list else kinds
+    if (len(kinds) == 3 and not is_list) or not all(k in _TYPES for k in scalars):
+        raise InputError(f"{where}: unknown type; known: {', '.join(_TYPES)}")
+    return None if is_list else _TYPES[scalars[0]]
+
+
+def check_properties(header: Header, required: Collection[str]) -> int:
+    """Number K of SH bases; raises unless all that a Gaussian needs is there.
+
+    Args:
+      header: of the file.
+      required: properties of a Gaussian of degree 0, that is without f_rest.
+    """
+    path, found = header.path, header.vertex.types
+    lists = [name for name, kind in found.items() if kind is None]
+    if lists:
+        raise InputError(
+            f"{path}: element vertex has the list properties {lists[:8]}; Gaussians "
+            "have scalar properties only: export the scene as a 3DGS PLY"
+        )
+    rest = sum(re.fullmatch("f_rest_[0-9]+", name) is not None for name in found)
+    missing = [name for name in required if name not in found]
+    if "f_dc_0" in missing and {"red", "green", "blue"} <= found.keys():
+        raise InputError(
+            f"{path}: this is a point cloud (red, green, blue), not a Gaussian PLY "
+            f"(missing: {', '.join(missing)}); train a scene from the points first"
+        )
+    if "packed_position" in found:
+        raise InputError(
+            f"{path}: this is a compressed (packed) Gaussian PLY, which is not read; "
+            "convert it to the standard, uncompressed PLY"
+        )
+    if rest in _F_REST_COUNTS:
+        missing += [f"f_rest_{i}" for i in range(rest) if f"f_rest_{i}" not in found]
+    if missing:
+        raise InputError(
+            f"{path}: element vertex lacks the properties {', '.join(missing)}; found "
+            f"{len(found)}: {', '.join([*found][:20])}; export the scene as a 3DGS PLY"
+        )
+    if rest not in _F_REST_COUNTS:
+        raise InputError(
+            f"{path}: {rest} properties f_rest_* are no whole SH degree; degrees 0 to "
+            f"{MAX_DEGREE} have {_F_REST_COUNTS}"
+        )
+    return 1 + rest // 3
+
+
+def check_size(header: Header) -> None:
+    """Compare the bytes that the header promises with those that are there."""
+    path, order = header.path, header.order
+    for element in header.before:
+        if element.has_list:
+            raise InputError(
+                f"{path}: element {element.name} has a list property and stands before "
+                "vertex, so that its size is unknown; put vertex first"
+            )
+    elements = [*header.before, header.vertex]
+    open_end = not order or any(element.has_list for element in header.after)
+    if not open_end:
+        elements += header.after
+    wanted = sum(e.rows * e.least_bytes(order) for e in elements)
+    if not order:
+        wanted = max(0, wanted - 1)  # the last line may lack its end
+    actual = header.size - header.body
+    if actual < wanted:
+        sizes = ", ".join(
+            f"{e.rows} {e.name} × {e.least_bytes(order)} bytes" for e in elements
+        )
+        raise InputError(
+            f"{path}: the body (from byte {header.body}) is truncated: the header "
+            f"declares {'' if order else 'at least '}{wanted} bytes ({sizes}), "
+            f"{actual} are there; export or download the file again"
+        )
+    if actual > wanted and not open_end:
+        warn(
+            f"{path}: {actual - wanted} bytes after the last element (from byte "
+            f"{header.body + wanted}) are ignored; the header may be wrong"
+        )

@@ -1,0 +1,31 @@
+"""Fixed-size work done at the size a view needs instead of at the capacity."""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax.numpy as jnp
+from jax import lax
+
+from gsjax.raster.types import Array
+
+T = TypeVar("T")
+
+
+def on_ladder(wanted: Array, full: int, rungs: int, run: Callable[[int], T]) -> T:
+    """``run(size)`` with the smallest of full, full / 4, … that holds ``wanted``.
+
+    Every size is compiled and one is run (`lax.switch`; under `jax.vmap` all are, and
+    one is picked). What ``run`` returns must have the same shapes for every size.
+
+    Args:
+      wanted: [] count, int or float.
+      full: the capacity, taken where nothing smaller is enough.
+      rungs: number of sizes, at most; those below 256 are not worth their compilation.
+    """
+    sizes = [full]
+    while len(sizes) < rungs and sizes[-1] >= 1024:
+        sizes.append(-(-sizes[-1] // 4))
+    if len(sizes) == 1:
+        return run(full)
+    index = sum((wanted <= size).astype(jnp.int32) for size in sizes[1:])
+    return lax.switch(index, [lambda size=size: run(size) for size in sizes])
