@@ -81,7 +81,8 @@ struct Tile {
     for (int i = 0; i < n; i++) {
       const float dx = g.x - px[i], dy = g.y - py[i];
       const float sigma = 0.5f * (g.a * dx * dx + g.c * dy * dy) + g.b * dx * dy;
-      const float value = g.opacity * std::exp(-sigma);
+      // The vectorised exp takes a slow path where its result would underflow.
+      const float value = g.opacity * std::exp(-std::min(sigma, 80.0f));
       raw[i] = (sigma >= 0.0f) & (value >= kMinAlpha) ? value : 0.0f;
     }
   }
@@ -156,6 +157,41 @@ struct Tile {
       d[6] += sr, d[7] += sg, d[8] += sb;
     }
   }
+
+  // The same gradient the way GPU code has it: one pixel after another, each walking
+  // the list on its own and adding to the Gaussians as it goes. Not vectorised.
+  void backward_by_pixel(const Scene &s, int begin, int end, const float *v_image,
+                         const float *v_alpha, float *grads) {
+    const float *bg = s.background;
+    each_pixel(s, [&](int64_t p, int i) {
+      const float *v = v_image + 3 * p;
+      float after = T[i];
+      float rest = after * (bg[0] * v[0] + bg[1] * v[1] + bg[2] * v[2] - v_alpha[p]);
+      for (int k = end - 1; k >= begin; k--) {
+        if ((k + 1 - begin) % kSave == 0 && k + 1 < end)
+          after = saved[int64_t(k + 1 - begin) / kSave * n + i];
+        const Splat g(s, s.ids[k]);
+        const float dx = g.x - px[i], dy = g.y - py[i];
+        const float sigma = 0.5f * (g.a * dx * dx + g.c * dy * dy) + g.b * dx * dy;
+        const float value = g.opacity * std::exp(-sigma);
+        if (sigma < 0.0f || value < kMinAlpha) continue;
+        const float alpha = std::min(kMaxAlpha, value);
+        const float inverse = 1.0f / (1.0f - alpha);
+        const float before = after * inverse, weight = alpha * before;
+        const float cv = g.red * v[0] + g.green * v[1] + g.blue * v[2];
+        float *d = grads + int64_t(kGrads) * s.ids[k];
+        d[6] += weight * v[0], d[7] += weight * v[1], d[8] += weight * v[2];
+        const float va = before * cv - rest * inverse;
+        rest += weight * cv;
+        after = before;
+        if (value >= kMaxAlpha) continue;
+        const float m = value * va;
+        d[0] -= m * (g.a * dx + g.b * dy), d[1] -= m * (g.b * dx + g.c * dy);
+        d[2] -= 0.5f * m * dx * dx, d[3] -= m * dx * dy, d[4] -= 0.5f * m * dy * dy;
+        d[5] += m / g.opacity;
+      }
+    });
+  }
 };
 
 // work(thread index) on each of `threads` new threads. Denormals are flushed to zero
@@ -176,7 +212,7 @@ void parallel(int threads, F work) {
 // Forward pass and, if grads is not null, backward pass; grads [N,9] is overwritten.
 template <int SIZE>
 void run(const Scene &s, int count, int threads, float *image, float *transmittance,
-         const float *v_image, const float *v_alpha, float *grads) {
+         const float *v_image, const float *v_alpha, float *grads, bool by_pixel) {
   const int64_t across = (s.width + SIZE - 1) / SIZE;
   const int64_t tiles = across * ((s.height + SIZE - 1) / SIZE);
   const int64_t size = int64_t(kGrads) * count;
@@ -189,7 +225,10 @@ void run(const Scene &s, int count, int threads, float *image, float *transmitta
       Tile<SIZE> tile(s, int(i));
       tile.forward(s, begin, end, grads != nullptr);
       tile.write(s, image, transmittance);
-      if (grads) tile.backward(s, begin, end, v_image, v_alpha, sums[t].data());
+      if (grads && by_pixel)
+        tile.backward_by_pixel(s, begin, end, v_image, v_alpha, sums[t].data());
+      else if (grads)
+        tile.backward(s, begin, end, v_image, v_alpha, sums[t].data());
     }
   });
   if (!grads) return;
@@ -203,11 +242,12 @@ void run(const Scene &s, int count, int threads, float *image, float *transmitta
 
 int dispatch(int tile_size, const Scene &s, int count, int threads, float *image,
              float *transmittance, const float *v_image, const float *v_alpha,
-             float *grads) {
+             float *grads, bool by_pixel) {
   auto *f = tile_size == 8 ? run<8> : tile_size == 16 ? run<16>
           : tile_size == 32 ? run<32> : nullptr;
   if (!f) return 1;
-  f(s, count, std::max(1, threads), image, transmittance, v_image, v_alpha, grads);
+  f(s, count, std::max(1, threads), image, transmittance, v_image, v_alpha, grads,
+    by_pixel);
   return 0;
 }
 
@@ -223,19 +263,20 @@ extern "C" int yardstick_forward(
   const Scene s{means2d, conics, opacities, colors, tile_ranges, ids, width, height,
                 background};
   return dispatch(tile_size, s, count, threads, image, transmittance, nullptr, nullptr,
-                  nullptr);
+                  nullptr, false);
 }
 
 // The forward pass of each tile followed by its backward pass. grads [N,9] receives
-// (mean x y, conic a b c, opacity, color r g b) of each Gaussian.
+// (mean x y, conic a b c, opacity, color r g b) of each Gaussian. by_pixel chooses the
+// loop over pixels outside (plain) or inside (vectorised).
 extern "C" int yardstick_backward(
     const float *means2d, const float *conics, const float *opacities,
     const float *colors, const int32_t *tile_ranges, const int32_t *ids, int count,
     int width, int height, int tile_size, const float *background, int threads,
-    const float *v_image, const float *v_alpha, float *image, float *transmittance,
+    int by_pixel, const float *v_image, const float *v_alpha, float *image, float *transmittance,
     float *grads) {
   const Scene s{means2d, conics, opacities, colors, tile_ranges, ids, width, height,
                 background};
   return dispatch(tile_size, s, count, threads, image, transmittance, v_image, v_alpha,
-                  grads);
+                  grads, by_pixel != 0);
 }

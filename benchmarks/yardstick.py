@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
+import itertools
 import os
 import shutil
 import subprocess
@@ -170,13 +171,15 @@ def forward(
 
 def forward_backward(
     means2d, conics, opacities, colors, tile_ranges, ids, width, height, background,
-    v_image, v_alpha, tile_size=16, threads=2,
+    v_image, v_alpha, tile_size=16, threads=2, by_pixel=False,
 ):  # fmt: skip
     """:func:`forward` together with its vector-Jacobian product.
 
     Args:
         v_image: [H, W, 3] cotangent of the image.
         v_alpha: [H, W] cotangent of the accumulated alpha, 1 - transmittance.
+        by_pixel: walk the lists pixel by pixel, as GPU code does (plain), instead
+            of Gaussian by Gaussian with the pixels vectorised (tuned).
         The others are those of :func:`forward`.
 
     Returns:
@@ -195,7 +198,7 @@ def forward_backward(
     out = np.empty((len(means2d), 9), np.float32)
     _call(
         _library().yardstick_backward,
-        (*inputs, v_image, v_alpha, image, transmittance, out),
+        (*inputs, int(by_pixel), v_image, v_alpha, image, transmittance, out),
     )
     grads = {
         "means2d": out[:, 0:2],
@@ -284,7 +287,7 @@ def exact_lists(
     bounds = np.searchsorted(total, np.arange(0, total[-1:].sum(), 1 << 20), "right")
     bounds = np.unique(np.r_[0, bounds, len(order)])
     tile_parts, id_parts = [np.empty(0, int)], [np.empty(0, int)]
-    for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
+    for begin, end in itertools.pairwise(bounds):
         g = np.repeat(np.arange(begin, end), counts[begin:end])
         k = np.arange(len(g)) - (total - counts - (total - counts)[begin])[g]
         row, column = top[g] + k // columns[g], left[g] + k % columns[g]
@@ -353,7 +356,14 @@ def main() -> None:
             ),
             7,
         )
-        for name, times in (("forward", f), ("forward + backward", b)):
+        p = time_ms(
+            lambda t=threads: forward_backward(
+                *scene, v[..., :3], v[..., 3], threads=t, by_pixel=True
+            ),
+            3,
+        )
+        rows = ("forward", f), ("forward + backward", b), ("the same by pixel", p)
+        for name, times in rows:
             ms = float(np.median(times))
             print(
                 f"{threads} thread(s), {name}: {ms:.1f} ms, "

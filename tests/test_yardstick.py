@@ -119,15 +119,16 @@ def test_forward(tile_size, threads):
 
 
 @needs_compiler
+@pytest.mark.parametrize("by_pixel", [False, True])
 @pytest.mark.parametrize("tile_size", [8, 16])
-def test_backward(tile_size):
+def test_backward(tile_size, by_pixel):
     scene = make_scene()
     rng = np.random.default_rng(0)
     v_image = rng.normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
     v_alpha = rng.normal(size=(HEIGHT, WIDTH)).astype(np.float32)
     inputs = compositor_inputs(scene, tile_size)
     image, trans, grads = yardstick.forward_backward(
-        *inputs, v_image, v_alpha, tile_size=tile_size
+        *inputs, v_image, v_alpha, tile_size=tile_size, by_pixel=by_pixel
     )
     alone = yardstick.forward(*inputs, tile_size=tile_size)
     np.testing.assert_array_equal(image, alone[0])

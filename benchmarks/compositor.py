@@ -1,0 +1,168 @@
+"""Claim: compositing in JAX keeps within a small factor of plain C++ on two cores.
+
+``python benchmarks/compositor.py`` times, in one run and interleaved, the compositor
+of the default settings (8 × 8 tiles, its own lists) against a C++ compositor with two
+threads over the standard exact 16 × 16 lists of the same scene, without early
+termination; forward, and value and gradient. The C++ gradient comes in two forms: by
+Gaussian with the pixels vectorised (tuned), and by pixel, as GPU code has it (plain).
+"""
+
+from __future__ import annotations
+
+import gsjax
+
+gsjax.use_all_cores()
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import measure  # noqa: E402
+import numpy as np  # noqa: E402
+import scenes  # noqa: E402
+import yardstick  # noqa: E402
+from jax.sharding import Mesh, PartitionSpec  # noqa: E402
+
+from gsjax.raster import bins  # noqa: E402
+from gsjax.raster.composite import composite  # noqa: E402
+from gsjax.raster.project import conics_of, depth_order, project  # noqa: E402
+
+
+def stages(case: scenes.Case, config: gsjax.RasterConfig):
+    """Jitted stages of one view, each with its inputs ready: a dict of functions."""
+    gaussians, camera = case.gaussians, case.camera
+    devices = jax.local_device_count()
+    grid = bins.make_grid(camera.width, camera.height, config.tile_size, 1, devices)
+    group = bins.tiles_per_step(config, grid, jax.default_backend())
+    room = -(-config.pair_capacity // devices)
+    mesh = Mesh(np.array(jax.local_devices()), ("tiles",))
+    index = jnp.arange(devices, dtype=jnp.int32)
+
+    def spread(function, *sharded):
+        """``function(device, *arguments)`` on every device; see `bins.Grid`."""
+
+        def local(device, *arguments):
+            arguments = [
+                jax.tree.map(lambda x: x[0], a) if s else a
+                for a, s in zip(arguments, sharded)
+            ]
+            out = function(device[0], *arguments)
+            return jax.tree.map(lambda x: x[None], out)
+
+        axis = PartitionSpec("tiles")
+        specs = tuple(axis if s else PartitionSpec() for s in sharded)
+        return jax.jit(
+            lambda *a: jax.shard_map(
+                local, mesh=mesh, in_specs=(axis, *specs), out_specs=axis,
+                check_vma=False,
+            )(index, *a)
+        )  # fmt: skip
+
+    @jax.jit
+    def projected_of(gaussians, camera):
+        order, count = depth_order(gaussians, camera, config)
+        return project(gaussians, camera, config, order, count)
+
+    def bin_local(device, projected):
+        camera_index = jnp.zeros(projected.u.shape, jnp.int32)
+        spans = bins.row_spans(projected, camera_index, grid, device)
+        lists = bins.make_lists(projected, spans, grid, device, room)
+        schedule = bins.make_schedule(lists.length, grid, group, config.chunk_size)
+        return lists, schedule
+
+    steps = bins.step_capacity(room, grid, group, config.chunk_size)
+
+    def composite_local(device, projected, lists, schedule):
+        ranks = projected.u.shape[0]
+        work = bins.make_work(lists, schedule, config.chunk_size, ranks, steps)
+        return composite(projected, work, schedule, grid, device, config)
+
+    binning = spread(bin_local, False)
+    compositing = spread(composite_local, False, True, True)
+    projected = projected_of(gaussians, camera)
+    lists, schedule = binning(projected)
+    image = compositing(projected, lists, schedule)
+    cotangent = jax.random.normal(jax.random.key(0), image["sums"].shape)
+
+    def loss(projected, lists, schedule, cotangent):
+        return jnp.sum(compositing(projected, lists, schedule)["sums"] * cotangent)
+
+    gradient = jax.jit(jax.value_and_grad(loss))
+    render = jax.jit(gsjax.render, static_argnames="config")
+
+    def render_loss(params, camera, weight):
+        result = gsjax.render(gaussians.replace(params=params), camera, config)
+        return jnp.sum(result.rgb * weight)
+
+    weight = jax.random.normal(jax.random.key(1), (camera.height, camera.width, 3))
+    training = jax.jit(jax.value_and_grad(render_loss))
+    evaluations = (
+        float(jnp.sum(schedule.steps)) * group * config.chunk_size * config.tile_size**2
+    )
+    functions = {
+        "project": lambda: projected_of(gaussians, camera),
+        "bin": lambda: binning(projected),
+        "composite": lambda: compositing(projected, lists, schedule),
+        "composite v+g": lambda: gradient(projected, lists, schedule, cotangent),
+        "render": lambda: render(gaussians, camera, config=config),
+        "render v+g": lambda: training(gaussians.params, camera, weight),
+    }
+    return functions, projected, evaluations
+
+
+def reference(case: scenes.Case, projected, config: gsjax.RasterConfig):
+    """The C++ compositor over the standard lists: a dict of functions."""
+    width, height = case.camera.width, case.camera.height
+    seen = np.asarray(projected.reach) > 0
+    means2d = np.stack([projected.u, projected.v], -1)[seen]
+    conics = np.asarray(conics_of(projected))[seen]
+    opacity = np.asarray(projected.opacity)[seen]
+    colors = np.asarray(projected.colors.T)[seen]
+    depth = np.asarray(projected.depth)[seen]
+    ranges, ids = yardstick.exact_lists(
+        means2d, conics, opacity, depth, width, height, 16, config.alpha_cut
+    )
+    scene = (means2d, conics, opacity, colors, ranges, ids, width, height, np.zeros(3))
+    rng = np.random.default_rng(0)
+    v_image = rng.normal(size=(height, width, 3)).astype(np.float32)
+    v_alpha = rng.normal(size=(height, width)).astype(np.float32)
+
+    def backward(by_pixel):
+        return lambda: yardstick.forward_backward(
+            *scene, v_image, v_alpha, by_pixel=by_pixel
+        )[0]
+
+    functions = {
+        "C++": lambda: yardstick.forward(*scene)[0],
+        "C++ v+g tuned": backward(False),
+        "C++ v+g plain": backward(True),
+    }
+    return functions, len(ids) * 256
+
+
+def main() -> None:
+    """Measure and save."""
+    rows = []
+    for case in scenes.real_cases():
+        config = gsjax.exact_config(case.gaussians, case.camera)
+        ours, projected, evaluations = stages(case, config)
+        theirs, their_evaluations = reference(case, projected, config)
+        ms = measure.interleaved({**ours, **theirs})
+        rows.append(
+            {
+                "scene": case.name,
+                **{f"{name} ms": value for name, value in ms.items()},
+                "forward / C++": ms["composite"] / ms["C++"],
+                "v+g / C++ tuned": ms["composite v+g"] / ms["C++ v+g tuned"],
+                "v+g / C++ plain": ms["composite v+g"] / ms["C++ v+g plain"],
+                "render / composite": ms["render"] / ms["composite"],
+                "evaluations M": evaluations / 1e6,
+                "C++ evaluations M": their_evaluations / 1e6,
+                "ns C++": 1e6 * ms["C++"] / their_evaluations,
+                "ns C++ v+g tuned": 1e6 * ms["C++ v+g tuned"] / their_evaluations,
+                "ns C++ v+g plain": 1e6 * ms["C++ v+g plain"] / their_evaluations,
+            }
+        )
+    measure.save("compositor", rows, claim=__doc__)
+
+
+if __name__ == "__main__":
+    main()
