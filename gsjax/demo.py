@@ -35,7 +35,7 @@ class DemoFiles(NamedTuple):
 class DemoSettings(NamedTuple):
     """How much there is to see."""
 
-    count: int = 20_000
+    gaussians: int = 20_000
     frames: int = 48
     width: int = 640
     height: int = 480

@@ -93,7 +93,7 @@ def encode_webp(frames: Iterable[np.ndarray], seconds: float) -> bytes:
     animation = cv2.Animation()
     animation.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
     count = len(animation.frames)
-    animation.durations = np.full(count, round(1000 * seconds / count), np.int32)
+    animation.durations = [round(1000 * seconds / count)] * count
     quality = [cv2.IMWRITE_WEBP_QUALITY, 90]
     done, data = cv2.imencodeanimation(".webp", animation, quality)
     if not done:

@@ -69,12 +69,7 @@ def render(
     _check_features(features, gaussians)
 
     def project_one(inputs):
-        one, p, a = inputs
-        order, visible = depth_order(gaussians, one, config)
-        out = project(gaussians, one, config, order, visible, features, p, a)
-        radii = jnp.zeros(gaussians.capacity, out.u.dtype)
-        radii = radii.at[order].set(lax.stop_gradient(radii_of(out)), mode="drop")
-        return out, radii, visible
+        return _project_one(gaussians, config, features, *inputs)
 
     if count == 1:
         squeezed = jax.tree.map(lambda a: a[0], (cameras, probe, abs_probe))
@@ -102,6 +97,41 @@ def render(
         demand=demand,
         overflowed=overflowed,
     )
+
+
+def _project_one(
+    gaussians: Gaussians,
+    config: RasterConfig,
+    features: Array | None,
+    camera: Camera,
+    probe: Array | None,
+    abs_probe: Array | None,
+) -> tuple[Projected, Array, Array]:
+    """One camera: what was projected, radii [N], and the count of what may be seen.
+
+    A branch of its own, taken where anything is active: how the projection is fused,
+    and so rounded, then does not depend on what uses it, and images are the same bits
+    whatever the capacity and the devices. Recomputed in the backward pass rather
+    than kept.
+    """
+
+    @jax.checkpoint
+    def some(params, camera, features, probe, abs_probe):
+        whole = gaussians.replace(params=params)  # pyright: ignore
+        order, visible = depth_order(whole, camera, config)
+        out = project(whole, camera, config, order, visible, features, probe, abs_probe)
+        radii = jnp.zeros(gaussians.capacity, out.u.dtype)
+        seen = lax.stop_gradient(radii_of(out))
+        return out, radii.at[order].set(seen, mode="drop"), visible
+
+    def none(*operands):
+        shapes = jax.eval_shape(some, *operands)
+        empty = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+        ones = jnp.ones_like(empty[0].u)
+        return (empty[0]._replace(inv_sx=ones, inv_sy=ones, det=ones), *empty[1:])
+
+    operands = (gaussians.params, camera, features, probe, abs_probe)
+    return lax.cond(jnp.any(gaussians.active), some, none, *operands)
 
 
 def _with_batch(name: str, probe, gaussians: Gaussians, camera: Camera):

@@ -58,7 +58,8 @@ def torus_knot_scene(
     parts = [_shaded(knot, knot), _shaded(floor, knot)]
     fields = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     cameras = orbit(frames, width, height)
-    return SyntheticScene(make_gaussians(**fields), cameras, BACKGROUND)
+    gaussians = make_gaussians(**fields, capacity=None)
+    return SyntheticScene(gaussians, cameras, BACKGROUND)
 
 
 def orbit(
@@ -193,7 +194,7 @@ def _sunlit(points: np.ndarray, casters: np.ndarray) -> np.ndarray:
     np.maximum.at(nearest, tuple(cell(seen).astype(int).T), seen[:, 2])
     local = (points - _CENTRE) @ axes.T
     where = cell(local)
-    offsets = np.stack(np.mgrid[-1:2, -1:2], -1).reshape(-1, 2)
+    offsets = np.mgrid[-1:2, -1:2].reshape(2, -1).T
     lit = [
         local[:, 2] > nearest[tuple((where + 0.8 * o).astype(int).T)] - 0.16
         for o in offsets

@@ -1,0 +1,263 @@
+"""Set-up of all tests: float64, two host devices, small scenes, shared compilations.
+
+Compiling dominates the run time, so every scene of the catalogue has the same number
+of Gaussians and the same image size, and all tests call the same jitted functions.
+"""
+
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", 2)
+
+import jax.numpy as jnp
+
+import gsjax
+from gsjax import Gaussians, RasterConfig
+from gsjax.cameras import Camera
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+# One size of the ladder and one device: anything more is compiled again.
+LIGHT = {"rungs": 1, "devices": 1, "pair_capacity": 8192}
+ALL = ("rgb", "alpha", "depth", "median_depth")
+COMPAT = RasterConfig.compat(**LIGHT, outputs=ALL)
+ACCURATE = RasterConfig.accurate(**LIGHT, outputs=ALL)
+FAST = RasterConfig.fast(**LIGHT, outputs=ALL)
+PRESETS = {"compat": COMPAT, "accurate": ACCURATE, "fast": FAST}
+
+COUNT, WIDTH, HEIGHT = 192, 45, 29
+BACKGROUND = np.array([0.2, 0.5, 0.9])
+
+needs_two_devices = pytest.mark.skipif(
+    jax.local_device_count() < 2, reason="needs two local devices"
+)
+on_cpu = pytest.mark.skipif(
+    jax.default_backend() != "cpu", reason="bit-equality is promised on CPU"
+)
+
+render = jax.jit(gsjax.render, static_argnames="config")
+
+
+@partial(jax.jit, static_argnames="config")
+def _reference(gaussians, camera, config, background, features):
+    active = np.ones(gaussians.capacity, bool)
+    return gsjax.reference_render(
+        gaussians.replace(active=active), camera, config, background, features=features
+    )
+
+
+def reference(
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RasterConfig | None,
+    background=None,
+    features=None,
+) -> dict[str, jax.Array]:
+    """`gsjax.reference_render`, jitted, of scenes without inactive slots."""
+    if config is not None:  # only these matter; the rest would compile it again
+        names = ("alpha_cut", "alpha_cap", "stop", "stop_rule", "dilation", "antialias")
+        config = RasterConfig(**{name: getattr(config, name) for name in names})
+    return _reference(gaussians, camera, config, background, features)
+
+
+MEASURED: list[tuple[str, float, float]] = []
+
+
+@pytest.fixture
+def report(request):
+    """Note a measured error beside its bar: ``report(what, error, bar)``."""
+    module = request.node.module.__name__
+
+    def note(what: str, error, bar: float):
+        MEASURED.append((f"{module}: {what}", float(error), bar))
+
+    return note
+
+
+def pytest_terminal_summary(terminalreporter):
+    """With ``-v``: the errors measured, those nearest to their bars first."""
+    if MEASURED and terminalreporter.config.option.verbose > 0:
+        terminalreporter.section("measured errors")
+        for what, error, bar in sorted(MEASURED, key=lambda m: -m[1] / m[2]):
+            terminalreporter.write_line(f"{error:9.2e} of {bar:7.1e}  {what}")
+
+
+def oracle_data(name: str):
+    """Arrays of one of the files beside the project, or a skip."""
+    path = DATA / "garden" / f"{name}.npz"
+    if not path.exists():
+        pytest.skip(f"{path.name} is not there (../shared/data/garden)")
+    return dict(np.load(path, allow_pickle=False))
+
+
+def cast(tree, dtype):
+    """The same pytree with its floats as ``dtype``; gsjax follows its inputs."""
+
+    def one(leaf):
+        floating = jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
+        return jnp.asarray(leaf, dtype) if floating else leaf
+
+    return jax.tree.map(one, tree)
+
+
+def pose(seed: int = 0) -> np.ndarray:
+    """A general world → camera matrix."""
+    rng = np.random.default_rng(seed)
+    return gsjax.look_at(rng.normal(size=3), rng.normal(size=3) + 4, rng.normal(size=3))
+
+
+def camera_of(
+    width=WIDTH, height=HEIGHT, viewmat=None, centre=None, focal=(40.0, 43.0), **kwargs
+) -> Camera:
+    """A camera with general focal lengths and principal point."""
+    cx, cy = (0.52 * width, 0.47 * height) if centre is None else centre
+    K = np.array([[focal[0], 0, cx], [0, focal[1], cy], [0, 0, 1]])
+    viewmat = pose() if viewmat is None else viewmat
+    # Rounded once, so that float32 and float64 see the same numbers.
+    viewmat, K = (np.asarray(v, np.float32) for v in (viewmat, K))
+    return gsjax.make_camera(viewmat=viewmat, K=K, width=width, height=height, **kwargs)
+
+
+def gaussians_at(points, scales, opacities, *, viewmat=None, seed=0, degree=3):
+    """Gaussians at camera coordinates ``points`` [N, 3], the rest drawn at random.
+
+    Values are those of float32, as float64. Colours stay clear of the clip at 0.
+    """
+    rng = np.random.default_rng(seed)
+    points = np.asarray(points, np.float64)
+    count = points.shape[0]
+    viewmat = np.asarray(pose() if viewmat is None else viewmat, np.float32)
+    viewmat = viewmat.astype(np.float64)
+    means = np.linalg.solve(viewmat[:3, :3], (points - viewmat[:3, 3]).T).T
+    opacities = np.broadcast_to(np.asarray(opacities, np.float64), count)
+    bases = (degree + 1) ** 2
+    sh = rng.uniform(-0.1, 0.1, (count, bases, 3))
+    sh[:, 0] = rng.uniform(0.2, 1.7, (count, 3))
+    fields = {
+        "means": means,
+        "quats": rng.normal(size=(count, 4)) * rng.uniform(0.3, 3, (count, 1)),
+        "log_scales": np.log(np.broadcast_to(scales, (count, 3))),
+        "logit_opacities": np.log(opacities) - np.log1p(-opacities),
+        "sh": sh,
+    }
+    return gsjax.make_gaussians(**{k: np.float32(v) for k, v in fields.items()})
+
+
+def frustum_points(rng, count=COUNT, near=2.0, far=8.0, spread=0.6) -> np.ndarray:
+    """Camera coordinates spread over the view and a little beyond, distinct in z."""
+    z = np.sort(rng.uniform(near, far, count))[rng.permutation(count)]
+    xy = rng.uniform(-spread, spread, (count, 2)) * (WIDTH / 40, HEIGHT / 43)
+    return np.column_stack([xy * z[:, None], z])
+
+
+def psnr(image, wanted) -> float:
+    """Peak signal-to-noise ratio in dB, for a range of 1."""
+    return float(-10 * np.log10(np.mean(np.square(np.subtract(image, wanted)))))
+
+
+def assert_not_empty(alpha, share=0.05):
+    """At least ``share`` of the pixels are covered visibly."""
+    assert np.mean(np.asarray(alpha) > 0.02) > share
+
+
+# The catalogue: name → (Gaussians, camera). All have COUNT Gaussians and one size.
+
+
+def _random():
+    rng = np.random.default_rng(1)
+    scales = np.exp(rng.normal(-2.3, 0.9, (COUNT, 3)))
+    return gaussians_at(frustum_points(rng), scales, rng.beta(0.6, 0.8, COUNT))
+
+
+def _needles(length):
+    """Needles ``length`` px long, a hundredth of a pixel wide, half of them far out."""
+    rng = np.random.default_rng(2)
+    points = frustum_points(rng)
+    points[::2, :2] *= max(1, length / 200)
+    long = length * points[:, 2] / 40 * rng.uniform(0.5, 1, COUNT)
+    thin = np.full(COUNT, 1e-3)
+    return gaussians_at(points, np.column_stack([thin, long, thin]), 0.3)
+
+
+def _huge():
+    rng = np.random.default_rng(3)
+    return gaussians_at(frustum_points(rng), rng.uniform(20, 500, (COUNT, 1)), 0.05)
+
+
+def _tiny():
+    rng = np.random.default_rng(4)
+    scales = np.exp(rng.uniform(-40, -6, (COUNT, 3)))
+    return gaussians_at(frustum_points(rng), scales, rng.uniform(0.1, 0.99, COUNT))
+
+
+def _fog():
+    rng = np.random.default_rng(5)
+    scales = rng.uniform(0.5, 2, (COUNT, 3))
+    return gaussians_at(frustum_points(rng), scales, rng.uniform(0.002, 0.03, COUNT))
+
+
+def _wall():
+    """A wall between what stands in front of it and what it hides altogether."""
+    rng = np.random.default_rng(6)
+    points = frustum_points(rng)
+    order = np.argsort(points[:, 2])
+    front, wall = order[:80], order[80:120]
+    points[front, 2] *= 0.1
+    points[front, :2] *= 0.1
+    points[wall, 2] = rng.uniform(0.99, 1.01, 40)
+    points[wall, :2] = rng.uniform(-0.3, 0.3, (40, 2))
+    scales, opacities = np.full((COUNT, 1), 0.1), np.full(COUNT, 0.5)
+    scales[front], opacities[front] = 0.01, 0.3
+    scales[wall], opacities[wall] = 0.4, 0.999
+    return gaussians_at(points, scales, opacities)
+
+
+def _equal_depths():
+    rng = np.random.default_rng(7)
+    points = frustum_points(rng)
+    points[:, 2] = rng.choice([2.0, 3.0, 4.0], COUNT)
+    scales = np.exp(rng.normal(-2, 0.5, (COUNT, 3)))
+    return gaussians_at(points, scales, 0.4, viewmat=np.eye(4))
+
+
+def _around():
+    """All around the camera: behind it, beside it, and on either side of near."""
+    rng = np.random.default_rng(8)
+    points = rng.normal(0, 2, (COUNT, 3))
+    points[: COUNT // 4, 2] = rng.normal(0.01, 0.01, COUNT // 4)
+    scales = np.exp(rng.normal(-2, 0.7, (COUNT, 3)))
+    return gaussians_at(points, scales, rng.uniform(0.05, 0.9, COUNT))
+
+
+def _saturated():
+    scene = _random()
+    logits = np.resize(np.float32([9, 17, 40, 88, 120, 500]), COUNT)
+    params = scene.params.replace(logit_opacities=jnp.asarray(logits, float))
+    return scene.replace(params=params)
+
+
+SCENES = {
+    "random": (_random, {}),
+    "needles_10": (partial(_needles, 10.0), {}),
+    "needles_1000": (partial(_needles, 1e3), {}),
+    "needles_10000": (partial(_needles, 1e4), {}),
+    "huge": (_huge, {}),
+    "tiny": (_tiny, {}),
+    "fog": (_fog, {}),
+    "wall": (_wall, {}),
+    "equal_depths": (_equal_depths, {"viewmat": np.eye(4)}),
+    "around": (_around, {}),
+    "off_centre": (_random, {"centre": (-6.0, 33.0)}),
+    "saturated": (_saturated, {}),
+}
+
+
+def scene_of(kind: str) -> tuple[Gaussians, Camera]:
+    """A scene of the catalogue with its camera, in float64."""
+    make, changes = SCENES[kind]
+    return make(), camera_of(**changes)

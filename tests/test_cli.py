@@ -1,0 +1,340 @@
+"""The command line: files, results, exit codes and one-line errors."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gsjax
+from gsjax import cli
+from gsjax.raster.types import Demand, Render
+from gsjax.scene.synthetic import torus_knot_scene
+from gsjax.scene.transforms import CameraEntry, load_transforms
+from gsjax.scene.transforms_writer import transforms_json
+
+WIDTH, HEIGHT = 32, 24
+CONFIG = gsjax.RasterConfig(outputs=("rgb",), rungs=1)  # one rung compiles faster
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    """A folder with scene.ply and cameras.json (two cameras)."""
+    folder = tmp_path_factory.mktemp("scene")
+    made = torus_knot_scene(count=60, frames=2, width=WIDTH, height=HEIGHT)
+    gsjax.save(folder / "scene.ply", made.gaussians)
+    entries = [CameraEntry(f"view {i}", c) for i, c in enumerate(made.cameras)]
+    (folder / "cameras.json").write_text(transforms_json(entries))
+    return folder
+
+
+def render_args(scene: Path, out: Path, *more: str) -> list[str]:
+    cameras = str(scene / "cameras.json")
+    args = ["render", str(scene / "scene.ply"), "--cameras", cameras]
+    return [*args, "-o", str(out), *more]
+
+
+def read_image(path: Path) -> np.ndarray:
+    import cv2
+
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    return image[..., ::-1] if image.ndim == 3 else image
+
+
+def error_of(capsys) -> str:
+    """The one line on stderr."""
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("gsjax: error: ")
+    return lines[0]
+
+
+# --- render ---
+
+
+def test_render_writes_what_render_exact_gives(scene, tmp_path, capsys):
+    out = tmp_path / "new" / "views"
+    assert cli.main(render_args(scene, out, "--npy")) == 0
+    said = capsys.readouterr()
+    assert said.out.splitlines() == [str(out / f"view {i}.png") for i in (0, 1)]
+    assert "views 2/2" in said.err
+    names = sorted(path.name for path in out.iterdir())
+    assert names == ["view 0.npy", "view 0.png", "view 1.npy", "view 1.png"]
+    gaussians = gsjax.load(scene / "scene.ply")
+    for name, camera in load_transforms(scene / "cameras.json"):
+        wanted = np.asarray(gsjax.render_exact(gaussians, camera, CONFIG).rgb)
+        found = np.load(out / f"{name}.npy")
+        assert found.dtype == np.float32
+        assert found.std() > 0.05, "the picture is not empty"
+        np.testing.assert_array_equal(found, wanted.astype(np.float32))
+        pixels = read_image(out / f"{name}.png")
+        assert pixels.dtype == np.uint8
+        rounded = np.rint(np.clip(found, 0, 1) * 255)
+        np.testing.assert_array_equal(pixels, rounded)
+
+
+def test_kinds_size_preset_and_background(scene, tmp_path, capsys):
+    more = ["--what", "depth,alpha,rgb", "--npy", "--size", "20x10"]
+    more += ["--preset", "fast", "--background", "0.25,.5,1"]
+    assert cli.main(render_args(scene, tmp_path, *more)) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 6
+    depth, alpha = (
+        np.load(tmp_path / "view 0.npy"),
+        np.load(tmp_path / "view 0.alpha.npy"),
+    )
+    assert depth.shape == alpha.shape == (10, 20)
+    picture = read_image(tmp_path / "view 0.png")
+    assert picture.dtype == np.uint16
+    near, far = map(
+        float, re.findall(r"depth (\S+) \(1\) to (\S+) \(65535\)", lines[0])[0]
+    )
+    back = near + (picture.astype(float) - 1) / 65534 * (far - near)
+    seen = picture > 0
+    assert seen.any()
+    np.testing.assert_array_equal(seen, depth > 0)
+    np.testing.assert_allclose(back[seen], depth[seen], rtol=2e-5)
+    grey = read_image(tmp_path / "view 0.alpha.png")
+    assert (grey.dtype, grey.ndim) == (np.uint8, 2)
+    rgb = np.load(tmp_path / "view 0.rgb.npy")
+    empty = alpha == 0
+    assert empty.any()
+    assert (rgb[empty] == np.float32([0.25, 0.5, 1])).all()
+
+
+def test_capacity_grows_once_and_stays(scene, tmp_path, monkeypatch):
+    used = []
+
+    def pretended(_gaussians, camera, config, _background):
+        used.append(config)
+        wanted = 1_000_000 if len(used) == 1 else 5
+        return Render(
+            rgb=np.zeros((camera.height, camera.width, 3)),
+            alpha=None,
+            depth=None,
+            median_depth=None,
+            radii=np.zeros(1),
+            demand=Demand(visible=1, pairs=wanted, capacity=wanted),
+            overflowed=np.False_,
+        )
+
+    monkeypatch.setattr("gsjax.views.render_exact", pretended)
+    assert cli.main(render_args(scene, tmp_path, "--preset", "accurate")) == 0
+    first, second = used
+    assert first.pair_capacity < 1_000_000
+    assert second.pair_capacity == gsjax.capacity_bucket(1_000_000)
+    assert first.alpha_cut == gsjax.RasterConfig.accurate().alpha_cut
+    assert first.outputs == ("rgb",)
+
+
+def test_nothing_is_overwritten_unasked(scene, tmp_path, capsys):
+    (tmp_path / "view 1.png").write_text("mine")
+    assert cli.main(render_args(scene, tmp_path)) == 3
+    assert "view 1.png: exists; pass --overwrite" in error_of(capsys)
+    assert [p.name for p in tmp_path.iterdir()] == ["view 1.png"]
+    assert cli.main(render_args(scene, tmp_path, "--overwrite")) == 0
+    assert read_image(tmp_path / "view 1.png").shape == (HEIGHT, WIDTH, 3)
+
+
+def test_two_images_of_one_name_are_refused(scene, tmp_path, capsys):
+    content = json.loads((scene / "cameras.json").read_text())
+    names = ("a.png", "a.alpha.png")
+    for frame, name in zip(content["frames"], names):
+        frame["file_path"] = name
+    cameras = tmp_path / "cameras.json"
+    cameras.write_text(json.dumps(content))
+    args = ["render", str(scene / "scene.ply"), "--cameras", str(cameras)]
+    assert cli.main([*args, "-o", str(tmp_path / "o"), "--what", "rgb,alpha"]) == 3
+    assert "two images would have this name" in error_of(capsys)
+
+
+# --- errors ---
+
+
+def bad_json(scene: Path, tmp_path: Path) -> list[str]:
+    (tmp_path / "bad.json").write_text("{")
+    args = render_args(scene, tmp_path)
+    args[args.index("--cameras") + 1] = str(tmp_path / "bad.json")
+    return args
+
+
+def bad_ply(_: Path, tmp_path: Path) -> list[str]:
+    (tmp_path / "bad.ply").write_bytes(b"ply\n")
+    return ["info", str(tmp_path / "bad.ply")]
+
+
+def folder_is_file(scene: Path, tmp_path: Path) -> list[str]:
+    (tmp_path / "file").write_text("")
+    return render_args(scene, tmp_path / "file")
+
+
+BAD = {
+    "missing": (3, lambda _s, t: ["info", str(t / "none.ply")], "none.ply"),
+    "json": (3, bad_json, "not JSON"),
+    "ply": (3, bad_ply, "end_header"),
+    "folder": (3, folder_is_file, "cannot be made a folder"),
+    "suffix": (3, lambda _s, _t: ["info", "a.spz"], "no known format"),
+    "command": (2, lambda _s, _t: ["paint"], "paint"),
+    "option": (2, lambda s, _t: ["info", str(s / "scene.ply"), "--foo"], "foo"),
+    "missing option": (2, lambda _s, _t: ["render", "a.ply"], "--cameras"),
+    "choice": (2, lambda s, t: render_args(s, t, "--preset", "best"), "best"),
+    "size": (2, lambda s, t: render_args(s, t, "--size", "0x3"), "--size '0x3'"),
+    "what": (2, lambda s, t: render_args(s, t, "--what", "rgb,x"), "--what"),
+    "colour": (2, lambda s, t: render_args(s, t, "--background", "1,2"), "R,G,B"),
+    "frames": (2, lambda _s, _t: ["demo", "--frames", "0"], "--frames"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_an_error_is_one_line_and_a_code(name, scene, tmp_path, capsys):
+    code, args, text = BAD[name]
+    assert cli.main(args(scene, tmp_path)) == code
+    assert text in error_of(capsys)
+
+
+def test_debug_shows_the_traceback(tmp_path, capsys):
+    assert cli.main(["info", str(tmp_path / "none.ply"), "--debug"]) == 3
+    told = capsys.readouterr().err
+    assert "Traceback" in told
+    assert told.splitlines()[-1].startswith("gsjax: error: ")
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (KeyboardInterrupt(), 130),
+        (gsjax.CapacityError("too\nmuch"), 3),
+        (RuntimeError("x" * 999), 1),
+        (PermissionError(13, "Permission denied"), 3),
+    ],
+)
+def test_other_errors(error, code, scene, capsys, monkeypatch):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr("gsjax.io.load", fail)
+    assert cli.main(["info", str(scene / "scene.ply")]) == code
+    assert len(error_of(capsys)) < 400
+
+
+def test_without_opencv_the_remedy_is_named(scene, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    assert cli.main(render_args(scene, tmp_path)) == 6
+    assert "pip install opencv-contrib-python-headless" in error_of(capsys)
+
+
+def test_a_warning_is_one_line(tmp_path, capsys):
+    made = torus_knot_scene(count=20, frames=1, width=4, height=4).gaussians
+    opacities = made.params.logit_opacities.at[:7].set(np.inf)
+    params = made.params.replace(logit_opacities=opacities)  # pyright: ignore
+    path = tmp_path / "hard.ply"
+    with pytest.warns(UserWarning, match="infinite"):
+        gsjax.save(path, made.replace(params=params))  # pyright: ignore
+    assert cli.main(["info", str(path)]) == 0
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1
+    assert told[0].startswith(f"gsjax: warning: {path}: 7 opacities of ±inf")
+
+
+def test_process_has_the_code_and_no_traceback(tmp_path):
+    args = ["-m", "gsjax.cli", "info", str(tmp_path / "none.ply")]
+    done = subprocess.run([sys.executable, *args], capture_output=True, text=True)
+    assert done.returncode == 3
+    assert done.stdout == ""
+    assert done.stderr.startswith("gsjax: error: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_import_is_light():
+    heavy = "{'cv2', 'pycolmap', 'tyro', 'tqdm'}"
+    code = f"import gsjax, sys; assert not {heavy} & sys.modules.keys()"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# --- info, doctor, demo ---
+
+
+def test_info(scene, capsys):
+    path = scene / "scene.ply"
+    assert cli.main(["info", str(path)]) == 0
+    text = capsys.readouterr().out
+    gaussians = gsjax.load(path)
+    assert f"Gaussians         {gaussians.capacity:,}" in text
+    assert cli.main(["info", str(path), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    means = np.asarray(gaussians.params.means)
+    assert facts["count"] == gaussians.capacity
+    assert facts["sh_degree"] == 1
+    assert facts["numbers_per_gaussian"] == 23
+    assert facts["file_bytes"] == path.stat().st_size
+    assert facts["parameter_bytes"] == gaussians.capacity * 23 * means.itemsize
+    assert facts["zero_quaternions"] == 0
+    np.testing.assert_allclose(facts["bounds"], [means.min(0), means.max(0)])
+    np.testing.assert_allclose(facts["anisotropy"]["50%"], 1 / 0.15, rtol=1e-5)
+    assert 0.5 < facts["opacity"]["50%"] < facts["opacity"]["75%"] < 1
+
+
+def test_info_of_an_empty_scene(tmp_path, capsys):
+    zeros = np.zeros
+    gsjax.save(
+        tmp_path / "empty.ply",
+        gsjax.make_gaussians(
+            means=zeros((0, 3)),
+            quats=zeros((0, 4)),
+            log_scales=zeros((0, 3)),
+            logit_opacities=zeros(0),
+            sh=zeros((0, 1, 3)),
+        ),
+    )
+    assert cli.main(["info", str(tmp_path / "empty.ply"), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["count"], facts["bounds"], facts["scale"]["50%"]) == (0, None, None)
+    assert cli.main(["info", str(tmp_path / "empty.ply")]) == 0
+
+
+def test_doctor(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert cli.main(["doctor"]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"render .*: well$", text, re.M)
+    assert re.search(r"pycolmap  absent .*pip install pycolmap$", text, re.M)
+    monkeypatch.setattr("gsjax.doctor.render_error", lambda: (float("nan"), 9))
+    assert cli.main(["doctor"]) == 1
+    assert "NOT WELL" in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_demo(tmp_path, capsys):
+    import cv2
+
+    args = ["demo", "-o", str(tmp_path), "--gaussians", "80", "--frames", "3"]
+    args += ["--size", "40x30"]
+    assert cli.main(args) == 0
+    said = capsys.readouterr()
+    paths = [Path(line) for line in said.out.splitlines()]
+    assert sorted(paths) == sorted(tmp_path.iterdir())
+    assert read_image(tmp_path / "still.png").shape == (30, 40, 3)
+    assert read_image(tmp_path / "depth.png").dtype == np.uint16
+    done, turntable = cv2.imreadanimation(str(tmp_path / "turntable.webp"))
+    assert done
+    assert len(turntable.frames) == 3
+    assert turntable.frames[0].shape[:2] == (15, 20)
+    # The commands that it says to try next are commands.
+    tries = [line.split()[2:] for line in said.err.splitlines() if "  gsjax " in line]
+    assert [line[0] for line in tries] == ["info", "render"]
+    for line in tries:
+        assert cli.main(line) == 0
+    capsys.readouterr()
+    assert cli.main(args) == 3
+    assert "exists; pass --overwrite" in error_of(capsys)
+
+
+def test_help_and_version(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("gsjax ")
+    for args in ([], ["--help"], ["render", "--help"]):
+        assert cli.main(args) == 0
+        assert "usage: gsjax" in capsys.readouterr().out

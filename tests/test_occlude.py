@@ -1,0 +1,125 @@
+"""What is left out behind opaque parts changes no bit, and it is left out indeed."""
+
+import jax
+import numpy as np
+import pytest
+from conftest import (
+    COUNT,
+    HEIGHT,
+    LIGHT,
+    WIDTH,
+    assert_not_empty,
+    camera_of,
+    frustum_points,
+    gaussians_at,
+    render,
+)
+
+from gsjax import RasterConfig
+from gsjax.raster.occlude import OPEN, _closed_from, _halve, hidden
+from gsjax.raster.project import depth_order, project
+
+PRESETS = {
+    "compat": RasterConfig.compat(**LIGHT),
+    "accurate": RasterConfig.accurate(**LIGHT),
+    "fast": RasterConfig.fast(**LIGHT),
+}
+
+
+def scene_behind(layers: int, across: float = 1.0):
+    """COUNT Gaussians, of which the nearest ``layers`` are wide and opaque.
+
+    ``across`` is their σ in image widths; they stand in the left half of the view.
+    """
+    rng = np.random.default_rng(0)
+    points = frustum_points(rng, near=3.0)
+    scales = np.exp(rng.normal(-2, 0.5, (COUNT, 3)))
+    opacities = rng.uniform(0.1, 0.9, COUNT)
+    points[:layers] = [-0.25, 0.0, 1.0]
+    points[:layers, 2] += 0.01 * np.arange(layers)
+    scales[:layers] = across * WIDTH / 40
+    opacities[:layers] = 0.9999
+    return gaussians_at(points, scales, opacities)
+
+
+def projected_of(gaussians, camera, config):
+    @jax.jit
+    def run(gaussians, camera):
+        order, count = depth_order(gaussians, camera, config)
+        return order, project(gaussians, camera, config, order, count)
+
+    return run(gaussians, camera)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize(("layers", "across"), [(0, 1.0), (8, 1.0), (40, 0.15)])
+def test_bit_equal_with_and_without(preset, layers, across):
+    config = PRESETS[preset]
+    gaussians, camera = scene_behind(layers, across), camera_of()
+    with_it = render(gaussians, camera, config=config)
+    without = render(gaussians, camera, config=config.replace(occlusion=False))
+    assert not with_it.overflowed
+    assert_not_empty(with_it.alpha)
+    for name in ("rgb", "alpha", "depth"):
+        np.testing.assert_array_equal(getattr(with_it, name), getattr(without, name))
+    if layers == 8:
+        assert int(with_it.demand.pairs) < int(without.demand.pairs) / 2
+    if layers == 0:
+        assert int(with_it.demand.pairs) == int(without.demand.pairs)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_what_is_hidden_was_never_blended(preset):
+    """Against a dense composite: no pixel gives a hidden rank any weight."""
+    config, camera = PRESETS[preset], camera_of()
+    _, p = projected_of(scene_behind(40, 0.15), camera, config)
+    behind = np.asarray(jax.jit(hidden, static_argnums=(1, 2, 3))(
+        p, WIDTH, HEIGHT, config))  # fmt: skip
+    assert 10 < behind[np.asarray(p.reach) > 0].sum() < COUNT
+    ys, xs = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    column = [np.asarray(a)[:, None, None] for a in (p.u, p.v, p.inv_sx, p.inv_sy)]
+    dx, dy = xs - column[0], ys - column[1]
+    y2 = column[3] * (dy - np.asarray(p.slope)[:, None, None] * dx)
+    alpha = np.asarray(p.opacity)[:, None, None] * np.exp(
+        -0.5 * ((column[2] * dx) ** 2 + y2**2)
+    )
+    alpha = np.minimum(alpha, config.alpha_cap) * (alpha >= config.alpha_cut)
+    after = np.cumprod(1 - alpha, axis=0)
+    before = np.concatenate([np.ones_like(after[:1]), after[:-1]])
+    tested = after if config.stop_rule == "before" else before
+    blended = (alpha > 0) & (tested > config.stop)
+    assert not blended[behind].any()
+    assert blended[~behind].any()
+
+
+def test_gradients_bit_equal():
+    config, camera = PRESETS["compat"], camera_of()
+    gaussians = scene_behind(8)
+
+    def gradient(config):
+        def loss(params):
+            return (
+                render(gaussians.replace(params=params), camera, config=config)
+                .rgb[..., 0]
+                .sum()
+            )
+
+        return jax.grad(loss)(gaussians.params)
+
+    one, other = gradient(config), gradient(config.replace(occlusion=False))
+    assert float(abs(one.means).max()) > 0
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other)):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_square_stays_open_without_candidates():
+    config, camera = PRESETS["compat"], camera_of()
+    _, p = projected_of(scene_behind(0), camera, config)
+    index = np.full(64, COUNT, np.int32)
+    closed = _closed_from(p, index, np.int32(0), WIDTH, HEIGHT, config)
+    assert (np.asarray(closed) == OPEN).all()
+
+
+def test_halve_takes_maxima_of_what_exists():
+    closed = np.arange(15, dtype=np.int32).reshape(3, 5)
+    np.testing.assert_array_equal(_halve(closed), [[6, 8, 9], [11, 13, 14]])

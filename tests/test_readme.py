@@ -1,0 +1,64 @@
+"""The README's Python runs as it stands, and its table is that of the code."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import gsjax
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+# What the snippets claim in their comments.
+CLAIMS = """
+assert np.isfinite(value) and all(np.isfinite(g).all() for g in gradient.values())
+assert np.abs(gradient["means"]).max() > 0 and image.rgb.std() > 0.05
+assert images.shape == (3, 48, 64, 3) and images.std() > 0.05
+np.testing.assert_allclose(mapped, images, atol=1e-6)
+assert of_features.shape == (n, 8) and np.abs(of_features).max() > 0
+assert (np.abs(screen_abs) >= np.abs(screen) * (1 - 1e-3) - 1e-5).all()
+assert np.abs(screen).max() > 0
+"""
+
+
+@pytest.mark.long
+def test_python_blocks_run(tmp_path):
+    """In a process of their own: float32, all cores, as a user would."""
+    blocks = re.findall(r"^```python\n(.*?)^```$", README, re.M | re.S)
+    assert len(blocks) >= 5
+    script = tmp_path / "readme.py"
+    script.write_text("\n".join([*blocks, CLAIMS]), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", str(script)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "scene.ply").exists()
+
+
+def test_presets_are_as_in_the_table():
+    presets = [gsjax.RasterConfig.compat(), gsjax.RasterConfig.accurate()]
+    presets.append(gsjax.RasterConfig.fast())
+    for name in ("alpha_cut", "alpha_cap", "stop", "stop_rule"):
+        row = re.search(rf"^\| `{name}`.*$", README, re.M)
+        assert row is not None
+        cells = [cell.strip() for cell in row[0].strip("|").split("|")[1:]]
+        values = [getattr(preset, name) for preset in presets]
+        if name == "stop_rule":
+            assert cells == values
+        else:
+            numbers = [eval(cell.replace("−", "-"), {}) for cell in cells]
+            assert numbers == values
+
+
+def test_names_exist():
+    table = README.split("## The names")[1].split("### Presets")[0]
+    names = set(re.findall(r"`([A-Za-z_]\w*)", table)) - {"capacity", "config"}
+    missing = [name for name in sorted(names) if not hasattr(gsjax, name)]
+    assert missing == []
