@@ -82,7 +82,8 @@ def test_exact_lists(tile_size):
     across, down = -(-WIDTH // tile_size), -(-HEIGHT // tile_size)
     assert ranges.dtype == ids.dtype == np.int32
     assert ranges.shape == (across * down, 2)
-    assert ranges[0, 0] == 0 and ranges[-1, 1] == len(ids)
+    assert ranges[0, 0] == 0
+    assert ranges[-1, 1] == len(ids)
     assert (ranges[1:, 0] == ranges[:-1, 1]).all()
 
     means2d, conics, opacities, _, depths = in_float64(scene).values()
@@ -185,7 +186,8 @@ def test_empty_and_bad_arguments():
     scene = {name: value[:0] for name, value in make_scene().items()}
     inputs = compositor_inputs(scene)
     image, trans = yardstick.forward(*inputs)
-    assert (trans == 1).all() and (image == BACKGROUND).all()
+    assert (trans == 1).all()
+    assert (image == BACKGROUND).all()
     with pytest.raises(ValueError, match="tile_size"):
         yardstick.forward(*inputs, tile_size=12)
     with pytest.raises(ValueError, match="shape"):

@@ -42,11 +42,12 @@ def hidden(
 def _candidates(projected: Projected) -> tuple[Array, Array]:
     """Ranks of Gaussians wide and opaque enough to close a square, front-most first.
 
-    A heuristic of what pays: the narrow side of Q ≤ 1 no less than half a square
-    (det / trace bounds the smaller eigenvalue from below), and α ≥ 1/4 in the middle.
+    A heuristic of what pays: σ no less than half a square on the narrow side (2 det /
+    trace is at most twice, and for round ones just, the smaller eigenvalue), and
+    α ≥ 1/4 in the middle.
     """
     trace = 1 / (projected.inv_sx * projected.inv_sx) + projected.var_y
-    wide = projected.det > trace * (0.5 * SQUARE) ** 2
+    wide = 2 * projected.det > trace * (0.5 * SQUARE) ** 2
     chosen = wide & (projected.opacity > 0.25) & (projected.reach > 0)
     place = jnp.cumsum(chosen, dtype=jnp.int32)
     room = min(CANDIDATES, place.shape[0])
