@@ -27,7 +27,9 @@ from gsjax.raster.reference import reference_colors, reference_project
 COUNT, WIDTH, HEIGHT, DIRECTIONS = 24, 19, 13, 32
 OUTPUTS = ("rgb", "alpha", "depth")
 COMPAT = COMPAT.replace(outputs=OUTPUTS)
-SMOOTH = COMPAT.replace(alpha_cut=1e-14, alpha_cap=1 - 1e-9, stop=0.0)
+SMOOTH = COMPAT.replace(
+    alpha_cut=1e-14, alpha_cap=1 - 1e-9, stop=0.0, stop_rule="after"
+)
 CONFIGS = {"smooth": SMOOTH, "compat": COMPAT}
 LEAVES = (
     *("means", "quats", "log_scales", "logit_opacities", "sh"),
@@ -97,15 +99,30 @@ gradient = jax.jit(jax.grad(loss), static_argnames="config")
 
 
 @partial(jax.jit, static_argnames="config")
+def dense_gradient(point, config):
+    """That of the reference, by name."""
+
+    def dense_loss(point):
+        images = gsjax.reference_render(*scene_at(point), config, point["background"])
+        return weighted(images)
+
+    return jax.grad(dense_loss)(point)
+
+
+@partial(jax.jit, static_argnames="config")
 def central_slopes(point, directions, step, config):
     """(L(x + h d) − L(x − h d)) / 2h for a leading axis of directions."""
 
-    def value(direction, h):
-        return loss(jax.tree.map(lambda x, d: x + h * d, point, direction), config)
+    def difference(direction):
+        def value(h):
+            moved = jax.tree.map(lambda x, d: x + h * d, point, direction)
+            return loss(moved, config)
 
-    return jax.lax.map(
-        lambda d: (value(d, step) - value(d, -step)) / (2 * step), directions
-    )
+        # Mapped, so that the renderer is compiled once.
+        ahead, behind = jax.lax.map(value, step * jnp.asarray([1.0, -1.0]))
+        return (ahead - behind) / (2 * step)
+
+    return jax.lax.map(difference, directions)
 
 
 @partial(jax.jit, static_argnames="config")
@@ -194,16 +211,7 @@ def test_hessian_vector_product(report):
 @pytest.mark.parametrize("kind", CONFIGS)
 def test_gradient_is_that_of_the_reference(kind, report):
     config, point = CONFIGS[kind], base_point()
-
-    @jax.jit
-    def dense(point):
-        return jax.grad(
-            lambda p: weighted(
-                gsjax.reference_render(*scene_at(p), config, p["background"])
-            )
-        )(point)
-
-    wanted, found = dense(point), gradient(point, config)
+    wanted, found = dense_gradient(point, config), gradient(point, config)
     for name in set(LEAVES) - {"probe"}:
         error = np.linalg.norm(found[name] - wanted[name])
         error /= np.linalg.norm(wanted[name])
@@ -414,11 +422,7 @@ def test_alpha_of_exactly_one(dtype, report):
     images = reference(*scene_at(point), config)
     assert images["alpha"][6, 9] > 1 - 1e-15
     assert_not_empty(images["alpha"])
-    wanted = jax.grad(
-        lambda p: weighted(
-            gsjax.reference_render(*scene_at(p), config, p["background"])
-        )
-    )(point)
+    wanted = dense_gradient(point, config)
     found = gradient(cast(point, dtype), config)
     bar = 1e-10 if dtype == jnp.float64 else 1e-5
     for name in set(LEAVES) - {"probe"}:

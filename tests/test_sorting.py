@@ -1,0 +1,79 @@
+"""Packed single-key sorts equal numpy's stable sorts, whatever the widths."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsjax.raster.sorting import (
+    argsort_descending,
+    argsort_float,
+    bits_for,
+    sort_pairs,
+)
+
+LENGTH = 64  # one shape, one compilation
+
+sort_narrow = jax.jit(lambda h, l: sort_pairs(h, l, 2**10, 2**12))
+sort_wide = jax.jit(lambda h, l: sort_pairs(h, l, 2**20, 2**31 - 1))
+argsort = jax.jit(argsort_float)
+descending = jax.jit(argsort_descending)
+
+
+def numbers(limit):
+    return st.lists(st.integers(0, limit), min_size=LENGTH, max_size=LENGTH)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 255, 256, 257, 2**20])
+def test_bits_hold_the_largest(count):
+    assert count - 1 < 2 ** bits_for(count)
+    assert count == 1 or count - 1 >= 2 ** (bits_for(count) - 1)
+
+
+@settings(deadline=None, max_examples=50)
+@given(high=numbers(2**10 - 1), low=numbers(2**12 - 1))
+def test_narrow_keys(high, low):
+    got = sort_narrow(jnp.asarray(high, jnp.int32), jnp.asarray(low, jnp.int32))
+    np.testing.assert_array_equal(got, np.asarray(low)[np.lexsort((low, high))])
+
+
+@settings(deadline=None, max_examples=50)
+@given(high=numbers(2**20 - 1), low=numbers(2**31 - 2))
+def test_wide_keys(high, low):
+    got = sort_wide(jnp.asarray(high, jnp.int32), jnp.asarray(low, jnp.int32))
+    assert got.dtype == jnp.int32
+    np.testing.assert_array_equal(got, np.asarray(low)[np.lexsort((low, high))])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@settings(deadline=None, max_examples=50)
+@given(data=st.data())
+def test_floats_with_ties_and_infinities(dtype, data):
+    whole = np.dtype(dtype).name.replace("float", "uint")
+    # Any normal float from its bits, and infinity; ties drawn in.
+    low, high = (int(np.asarray(v, dtype).view(whole)) for v in
+                 (np.finfo(dtype).tiny, np.inf))  # fmt: skip
+    common = [0, high, int(np.asarray(1, dtype).view(whole))]
+    bits = st.one_of(st.integers(low, high), st.sampled_from(common))
+    drawn = data.draw(st.lists(bits, min_size=LENGTH, max_size=LENGTH))
+    values = np.asarray(drawn, whole).view(dtype)
+    np.testing.assert_array_equal(argsort(values), np.argsort(values, kind="stable"))
+
+
+def test_full_precision_of_the_depth():
+    """Neighbouring floats are told apart: no bit of the depth is dropped."""
+    start = np.float32(3.7)
+    values = start + np.arange(LENGTH, dtype=np.float32) * np.spacing(start)
+    assert len(np.unique(values)) == LENGTH
+    shuffled = np.random.default_rng(0).permutation(values)
+    np.testing.assert_array_equal(shuffled[argsort(shuffled)], values)
+
+
+@settings(deadline=None, max_examples=50)
+@given(counts=numbers(2**31 - 1))
+def test_descending(counts):
+    counts = np.asarray(counts, np.int32)
+    wanted = np.argsort(-counts.astype(np.int64), kind="stable")
+    np.testing.assert_array_equal(descending(counts), wanted)
