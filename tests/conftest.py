@@ -65,6 +65,24 @@ def reference(
     return _reference(gaussians, camera, config, background, features)
 
 
+@jax.jit
+def loss_and_gradients(gaussians: Gaussians, camera: Camera):
+    """Of a loss over three outputs: (images, gradients of params and camera)."""
+    rng = np.random.default_rng(2)
+    weights = {n: rng.normal(size=(HEIGHT, WIDTH)) for n in ("rgb", "alpha", "depth")}
+
+    def loss(params, camera):
+        out = gsjax.render(gaussians.replace(params=params), camera, COMPAT)
+        weigh = cast(weights, out.rgb.dtype)
+        total = jnp.sum(out.rgb * weigh["rgb"][..., None])
+        for name in ("alpha", "depth"):
+            total += jnp.sum(getattr(out, name) * weigh[name])
+        return total, out
+
+    grads, out = jax.grad(loss, (0, 1), has_aux=True)(gaussians.params, camera)
+    return out, grads
+
+
 MEASURED: list[tuple[str, float, float]] = []
 
 
@@ -213,7 +231,7 @@ def _wall():
     points[wall, :2] = rng.uniform(-0.3, 0.3, (40, 2))
     scales, opacities = np.full((COUNT, 1), 0.1), np.full(COUNT, 0.5)
     scales[front], opacities[front] = 0.01, 0.3
-    scales[wall], opacities[wall] = 0.4, 0.999
+    scales[wall], opacities[wall] = 1.5, 0.999
     return gaussians_at(points, scales, opacities)
 
 

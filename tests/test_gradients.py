@@ -197,7 +197,9 @@ def test_hessian_vector_product(report):
         )
         found, step = product(point, direction), 1e-6
         ahead, behind = (
-            gradient(jax.tree.map(lambda x, d: x + h * d, point, direction), SMOOTH)
+            gradient(
+                jax.tree.map(lambda x, d, h=h: x + h * d, point, direction), SMOOTH
+            )
             for h in (step, -step)
         )
         for name in set(LEAVES) - {"background"}:

@@ -3,6 +3,8 @@
 Bit-equal: capacities, order of the slots, contents of dead slots, number of devices,
 repeated runs, tiles side by side, size of the ladder, `jax.vmap` over cameras.
 
+Capacity is never silent: one too few is reported, exactly enough is exact.
+
 Within rounding, and why: *tile and chunk sizes*, because positions are relative to
 the tile's corner, and products and sums are taken chunk by chunk, so they associate
 differently (≤ 2e-5 in float32); a *batch* of cameras and the *occlusion* switch,
@@ -22,6 +24,7 @@ from conftest import (
     assert_not_empty,
     camera_of,
     cast,
+    loss_and_gradients,
     needs_two_devices,
     on_cpu,
     render,
@@ -29,7 +32,8 @@ from conftest import (
 )
 
 import gsjax
-from gsjax.gaussians import Gaussians
+from gsjax.errors import CapacityError
+from gsjax.raster.bins import total_count
 
 KINDS = ("random", "wall", "equal_depths")
 DTYPES = (jnp.float32, jnp.float64)
@@ -61,16 +65,14 @@ def largest_difference(first, second):
 
 
 @on_cpu
-@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(
-    "changes",
+    ("changes", "dtype"),
     [
-        {"pair_capacity": 5000},
-        {"rungs": 3},
-        {"rungs": 2, "pair_capacity": 20000, "visible_capacity": 192},
-        {"tiles_per_step": 5},
-        pytest.param({"devices": 2}, marks=needs_two_devices),
-        pytest.param({"devices": 2, "rungs": 3}, marks=needs_two_devices),
+        ({"pair_capacity": 5000, "tiles_per_step": 5}, jnp.float32),
+        ({"pair_capacity": 20000, "visible_capacity": 192}, jnp.float64),
+        ({"rungs": 3}, jnp.float32),
+        pytest.param({"devices": 2}, jnp.float32, marks=needs_two_devices),
+        pytest.param({"devices": 2}, jnp.float64, marks=needs_two_devices),
     ],
     ids=str,
 )
@@ -82,8 +84,8 @@ def test_settings_are_bit_equal(changes, dtype):
 
 
 @on_cpu
-@pytest.mark.parametrize("capacity", [COUNT + 1, 256])
-def test_slots_are_bit_equal(capacity):
+def test_slots_are_bit_equal():
+    capacity = COUNT + 9
     for kind in KINDS:
         gaussians, camera = scene_of(kind)
         grown = gsjax.grow(gaussians, capacity)
@@ -138,7 +140,7 @@ def test_equal_depths_are_ordered_by_slot():
 GARBAGE = (0.0, np.nan, np.inf, -np.inf, 1e30, -1e30)
 
 
-def with_garbage(gaussians: Gaussians, value: float) -> Gaussians:
+def with_garbage(gaussians: gsjax.Gaussians, value: float):
     """Two slots in three dead, holding ``value`` everywhere."""
     dead = np.ones(3 * COUNT, bool)
     live = np.sort(np.random.default_rng(0).permutation(3 * COUNT)[:COUNT])
@@ -147,37 +149,22 @@ def with_garbage(gaussians: Gaussians, value: float) -> Gaussians:
         lambda a: jnp.full((3 * COUNT, *a.shape[1:]), value, a.dtype).at[live].set(a),
         gaussians.params,
     )
-    return Gaussians(params=params, active=jnp.asarray(~dead)), live
+    return gsjax.Gaussians(params=params, active=jnp.asarray(~dead)), live
 
 
 @on_cpu
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_contents_of_dead_slots_are_bit_equal(dtype):
     gaussians, camera = cast(scene_of("random"), dtype)
-    rng = np.random.default_rng(1)
-    cotangent = jnp.asarray(rng.normal(size=BACKGROUND.shape), dtype)
-
-    @jax.jit
-    def value_and_grad(params, active, camera):
-        def loss(params, camera):
-            scene = Gaussians(params=params, active=active)
-            out = gsjax.render(scene, camera, COMPAT)
-            return jnp.sum(out.rgb * cotangent) + jnp.sum(out.depth), out
-
-        return jax.value_and_grad(loss, (0, 1), has_aux=True)(params, camera)
-
     wanted = images(gaussians, camera, dtype=dtype)
     first = None
     for value in GARBAGE:
         scene, live = with_garbage(gaussians, value)
-        (_, out), (by_params, by_camera) = value_and_grad(
-            scene.params, scene.active, camera
-        )
+        out, (by_params, by_camera) = loss_and_gradients(scene, camera)
         assert_same(out, wanted, ("alpha", "depth", "median_depth"))
         np.testing.assert_array_equal(out.radii[live], wanted.radii)
-        dead = ~np.asarray(scene.active)
         for leaf in jax.tree.leaves(by_params):
-            assert (leaf[dead] == 0).all(), value
+            assert (leaf[~scene.active] == 0).all(), value
             assert np.isfinite(leaf).all(), value
         kept = jax.tree.map(lambda a, keep=live: a[keep], by_params)
         found = jax.tree.leaves((out.rgb, kept, by_camera))
@@ -185,6 +172,17 @@ def test_contents_of_dead_slots_are_bit_equal(dtype):
         for a, b in zip(found, first):
             np.testing.assert_array_equal(a, b)
     assert all(np.any(leaf != 0) for leaf in jax.tree.leaves(by_params))
+
+
+@on_cpu
+def test_the_same_without_x64():
+    """float32 is the default of users, who leave `jax_enable_x64` alone."""
+    gaussians, camera = cast(scene_of("random"), jnp.float32)
+    wanted = images(gaussians, camera)
+    with jax.enable_x64(False):
+        out = render(gaussians, camera, COMPAT, jnp.float32(BACKGROUND))
+        assert_same(out, wanted, (*ALL, "radii"))
+    assert out.demand == wanted.demand
 
 
 def test_single_batch_and_vmap(report):
@@ -240,4 +238,96 @@ def test_occlusion(report):
             assert error <= bar, kind
             assert found.demand.pairs <= plain.demand.pairs
             if kind == "wall":
-                assert found.demand.pairs < 0.8 * plain.demand.pairs
+                assert found.demand.pairs < 0.4 * plain.demand.pairs
+
+
+def test_capacity_of_exactly_the_need():
+    gaussians, camera = scene_of("random")
+    wanted = images(gaussians, camera)
+    need, visible = int(wanted.demand.capacity), int(wanted.demand.visible)
+    assert need == wanted.demand.pairs > 100
+    exact = COMPAT.replace(pair_capacity=need, visible_capacity=visible)
+    assert_same(images(gaussians, camera, exact), wanted)
+    given = cast((gaussians, camera), jnp.float32)
+    for name, size in (("pair_capacity", need), ("visible_capacity", visible)):
+        out = render(*given, exact.replace(**{name: size - 1}), np.float32(BACKGROUND))
+        assert out.overflowed
+        found = {
+            "pair_capacity": out.demand.capacity,
+            "visible_capacity": out.demand.visible,
+        }
+        assert found[name] == size
+
+
+@needs_two_devices
+def test_capacity_over_two_devices():
+    """The demand is that of the device with the most, times the devices."""
+    gaussians, camera = cast(scene_of("random"), jnp.float32)
+    config = COMPAT.replace(devices=2)
+    wanted = images(gaussians, camera)
+    need = int(render(gaussians, camera, config).demand.capacity)
+    assert need >= wanted.demand.capacity
+    enough = config.replace(pair_capacity=need)
+    assert_same(images(gaussians, camera, enough), wanted)
+    out = render(gaussians, camera, enough.replace(pair_capacity=need - 2))
+    assert out.overflowed
+    assert out.demand.capacity == need
+
+
+def test_render_exact_regrows():
+    gaussians, camera = cast(scene_of("random"), jnp.float32)
+    wanted = images(gaussians, camera)
+    tiny = COMPAT.replace(pair_capacity=1, visible_capacity=1)
+    background = jnp.float32(BACKGROUND)
+    assert render(gaussians, camera, tiny, background).overflowed
+    out = gsjax.render_exact(gaussians, camera, tiny, background)
+    assert not out.overflowed
+    assert_same(out, wanted)
+    fitted = gsjax.exact_config(gaussians, camera, tiny)
+    assert fitted.replace(pair_capacity=1, visible_capacity=1) == tiny
+    assert_same(images(gaussians, camera, fitted), wanted)
+    with pytest.raises(CapacityError, match="wants a pair capacity"):
+        gsjax.render_exact(gaussians, camera, tiny, background, max_capacity=100)
+
+
+def test_counts_past_32_bits_do_not_wrap():
+    """4096 splats over 2^20 tiles of one pixel: 2^32 pairs, which wraps to 0."""
+    scene = gsjax.make_gaussians(
+        means=np.tile([0.0, 0, 1], (4096, 1)),
+        quats=np.tile([1.0, 0, 0, 0], (4096, 1)),
+        log_scales=np.full((4096, 3), 18.0),
+        logit_opacities=np.zeros(4096),
+        sh=np.zeros((4096, 1, 3)),
+    )
+    camera = camera_of(2**20, 1, viewmat=np.eye(4), focal=(1.0, 1.0))
+    config = COMPAT.replace(
+        outputs=("alpha",),
+        tile_size=1,
+        chunk_size=1,
+        tiles_per_step=1024,
+        pair_capacity=8192,
+        occlusion=False,
+    )
+    out = render(*cast((scene, camera), jnp.float32), config)
+    assert out.overflowed
+    assert out.demand.pairs == out.demand.capacity == 2**31 - 1
+    with pytest.raises(CapacityError, match="2,147,483,647 or more"):
+        gsjax.render_exact(*cast((scene, camera), jnp.float32), config)
+
+
+@pytest.mark.parametrize(
+    ("counts", "wanted"),
+    [
+        ([3, 0, 4], 7),
+        ([2**30 - 2**12, 5], 2**30 - 2**12 + 5),
+        ([2**30, 2**10], 2**31 - 1),
+        ([2**30, 2**30, 1], 2**31 - 1),  # wraps to -2^31 + 1
+        ([2**30] * 4, 2**31 - 1),  # wraps to 0
+        ([2**30] * 4 + [100], 2**31 - 1),  # wraps to 100
+    ],
+)
+def test_total_count_saturates(counts, wanted):
+    total, safe = total_count(jnp.asarray(counts, jnp.int32))
+    assert total.dtype == jnp.int32
+    assert total == wanted
+    assert safe == (wanted < 2**30)

@@ -1,0 +1,328 @@
+"""Bad input: a typed error that names it, or a Gaussian that vanishes without trace."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import (
+    ALL,
+    BACKGROUND,
+    COMPAT,
+    COUNT,
+    HEIGHT,
+    WIDTH,
+    assert_not_empty,
+    camera_of,
+    cast,
+    loss_and_gradients,
+    on_cpu,
+    render,
+    scene_of,
+)
+
+import gsjax
+from gsjax import InputError, RasterConfig
+
+GOOD = {
+    "means": np.zeros((4, 3)),
+    "quats": np.ones((4, 4)),
+    "log_scales": np.zeros((4, 3)),
+    "logit_opacities": np.zeros(4),
+    "sh": np.zeros((4, 1, 3)),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("means", (4, 2)),
+        ("means", (4,)),
+        ("means", (5, 3)),  # then all others are one short
+        ("quats", (4, 3)),
+        ("quats", (3, 4)),
+        ("log_scales", (4,)),
+        ("log_scales", (4, 1)),
+        ("logit_opacities", (4, 2)),
+        ("logit_opacities", (3,)),
+        ("sh", (4, 3)),
+        ("sh", (4, 1, 4)),
+        ("sh", (3, 1, 3)),
+    ],
+)
+def test_shapes_of_gaussians(name, shape):
+    with pytest.raises(InputError, match="quats" if shape == (5, 3) else name):
+        gsjax.make_gaussians(**{**GOOD, name: np.zeros(shape)})
+
+
+def test_other_errors_of_gaussians():
+    with pytest.raises(ValueError, match="5 spherical-harmonic"):
+        gsjax.make_gaussians(**{**GOOD, "sh": np.zeros((4, 5, 3))})
+    with pytest.raises(InputError, match="means is complex"):
+        gsjax.make_gaussians(**{**GOOD, "means": np.zeros((4, 3), complex)})
+    with pytest.raises(InputError, match="capacity 3 cannot hold 4"):
+        gsjax.make_gaussians(**GOOD, capacity=3)
+    with pytest.raises(InputError, match="capacity 3 is below the present 4"):
+        gsjax.grow(gsjax.make_gaussians(**GOOD), 3)
+
+
+def test_opacities_may_be_a_column():
+    column = {**GOOD, "logit_opacities": np.arange(4.0)[:, None]}
+    flat = gsjax.make_gaussians(**column).params.logit_opacities
+    np.testing.assert_array_equal(flat, np.arange(4.0))
+
+
+EYE, K = np.eye(4), np.array([[50.0, 0, 8], [0, 50, 8], [0, 0, 1]])
+
+
+def put(matrix, place, value):
+    matrix = matrix.copy()
+    matrix[place] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"width": 0}, "width"),
+        ({"height": -3}, "height"),
+        ({"width": 8.5}, "width"),
+        ({"model": "fisheye"}, "unknown camera model 'fisheye'"),
+        ({"viewmat": np.eye(3)}, "viewmat"),
+        ({"viewmat": np.zeros((2, 3, 4, 4))}, "viewmat"),
+        ({"viewmat": EYE.T + put(0 * EYE, (3, 0), 1)}, "transposed"),
+        ({"viewmat": put(EYE, (0, 3), np.nan)}, "viewmat"),
+        ({"viewmat": put(EYE, (0, 0), np.inf)}, "viewmat"),
+        ({"K": np.eye(4)}, "K"),
+        ({"K": np.zeros((2, 3, 3))}, "K"),
+        ({"K": put(K, (0, 2), np.nan)}, "K"),
+        ({"K": put(K, (0, 0), 0.0)}, "focal"),
+        ({"K": put(K, (1, 1), -50.0)}, "focal"),
+        ({"near": 0.0}, "near"),
+        ({"near": np.nan}, "near"),
+        ({"near": [0.1, 0.2]}, "near"),
+        ({"near": 5.0, "far": 4.0}, "far"),
+        ({"far": np.nan}, "far"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_cameras(changes, named):
+    good = {"viewmat": EYE, "K": K, "width": 16, "height": 16}
+    gsjax.make_camera(**good)
+    with pytest.raises(InputError, match=named):
+        gsjax.make_camera(**{**good, **changes})
+
+
+def test_a_batch_needs_one_size():
+    with pytest.raises(InputError, match="one image size and model; found 2"):
+        gsjax.stack_cameras([camera_of(8, 8), camera_of(8, 9)])
+    with pytest.raises(InputError, match="found 0"):
+        gsjax.stack_cameras([])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("alpha_cut", v) for v in (0.0, 1.0, -0.1, np.nan)),
+        *(("alpha_cap", v) for v in (1e-3, 1.1, np.nan)),
+        *(("stop", v) for v in (-1e-4, 1.0, np.nan)),
+        ("stop_rule", "never"),
+        *(("dilation", v) for v in (-0.1, np.inf, np.nan)),
+        *(("outputs", v) for v in ((), ("rgb", "normal"), ["rgb"], "rgb")),
+        ("tile_size", 0),
+        ("chunk_size", 0),
+        ("tiles_per_step", 0),
+        *(("pair_capacity", v) for v in (0, -5, 2**30)),
+        ("visible_capacity", 0),
+        ("rungs", 0),
+        ("devices", 0),
+    ],
+    ids=str,
+)
+def test_settings(name, value):
+    with pytest.raises(InputError, match=rf"RasterConfig\.{name} = "):
+        RasterConfig(**{name: value})
+    with pytest.raises(InputError, match=name):
+        RasterConfig.accurate().replace(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("named", "kwargs"),
+    [
+        ("features", {"features": jnp.zeros((COUNT + 1, 3))}),
+        ("features", {"features": jnp.zeros(COUNT)}),
+        ("probe", {"probe": jnp.zeros((COUNT, 3))}),
+        ("probe", {"probe": jnp.zeros((1, COUNT, 2))}),
+        ("abs_probe", {"abs_probe": jnp.zeros((COUNT, 2))}),  # without absgrad
+        ("abs_probe", {"config": COMPAT.replace(absgrad=True)}),
+        ("background", {"background": np.zeros(4)}),
+        ("background", {"background": np.zeros((3, 3))}),
+        ("background", {"background": np.zeros((HEIGHT, WIDTH, 3))}),
+    ],
+    ids=str,
+)
+def test_arguments_of_render(named, kwargs):
+    kwargs = {"config": COMPAT, **kwargs}
+    config = kwargs.pop("config")
+    with pytest.raises(InputError, match=named):
+        jax.eval_shape(
+            lambda g, c: gsjax.render(g, c, config, **kwargs), *scene_of("random")
+        )
+
+
+def spoilt(gaussians, value):
+    """One slot spoilt in each single number of the parameters: (scene, slots)."""
+    fields = vars(gaussians.params)
+    slots, out = {}, {name: np.array(array) for name, array in fields.items()}
+    places = iter(range(0, COUNT, 2))
+    for name, array in out.items():
+        for entry in np.ndindex(array.shape[1:]):
+            slot = next(places, None)
+            if slot is not None:
+                array[slot, *entry] = value
+                slots[slot] = f"{name}{list(entry)}"
+    params = gsjax.GaussianParams(**{k: jnp.asarray(v) for k, v in out.items()})
+    return gaussians.replace(params=params), slots
+
+
+@on_cpu
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_vanishes(value, dtype):
+    """In every one of the 59 numbers: the image is that without the Gaussian."""
+    gaussians, camera = cast(scene_of("random"), dtype)
+    scene, slots = spoilt(gaussians, value)
+    assert len(slots) == 59
+    keep = np.ones(COUNT, bool)
+    keep[list(slots)] = False
+    wanted, wanted_grads = loss_and_gradients(gsjax.select(gaussians, keep), camera)
+    out, grads = loss_and_gradients(scene, camera)
+    assert_not_empty(wanted.alpha)
+    assert (wanted.radii[keep] > 0).any()
+    everything, _ = loss_and_gradients(gaussians, camera)
+    assert np.abs(everything.rgb - wanted.rgb).max() > 0.05
+    for slot, entry in slots.items():
+        assert out.radii[slot] == 0, entry
+    for name in (*ALL, "radii"):
+        np.testing.assert_array_equal(getattr(out, name), getattr(wanted, name))
+    for a, b in zip(jax.tree.leaves(grads), jax.tree.leaves(wanted_grads)):
+        np.testing.assert_array_equal(a, b)
+        assert np.isfinite(a).all()
+        assert np.any(a != 0)
+
+
+def extremes(gaussians, camera):
+    """Wild but finite values, and depths at the edges, one slot each."""
+    p = {name: np.array(array) for name, array in vars(gaussians.params).items()}
+    viewmat = np.asarray(camera.viewmat)
+    slot = iter(range(COUNT))
+    wanted = {}
+
+    def at_depth(z, visible=None):
+        i = next(slot)
+        point = np.array([0.02, 0.01, z]) if np.isfinite(z) else [0, 0, z]
+        p["means"][i] = viewmat[:3, :3].T @ (point - viewmat[:3, 3])
+        wanted[i] = visible
+
+    for value in (-200, -50, 0, 40, 88, 120, 700, -1e30, 1e30):
+        p["log_scales"][next(slot)] = value
+        p["log_scales"][next(slot), 1] = value
+    for size, seen in ((0.0, False), (1e-23, True), (1e-30, None), (1e20, True)):
+        i = next(slot)
+        p["means"][i] = p["means"][100]
+        p["logit_opacities"][i], p["log_scales"][i] = 2, -1
+        p["quats"][i] = size * np.array([0.3, -0.2, 0.1, 0.5])
+        wanted[i] = seen
+    for value in (1e30, -1e30, 1e10, 1e18):
+        p["means"][next(slot)] = value
+        p["means"][next(slot), 0] = value
+    for value in (-1e30, -200, 200, 1e30):
+        p["logit_opacities"][next(slot)] = value
+    p["sh"][next(slot)] = 1e30
+    p["sh"][next(slot)] = -1e30
+    near = float(camera.near)
+    for z in (-1.0, 0.0, 1e-30, near * 0.99):
+        at_depth(z, visible=False)
+    for factor in (1 - 1e-6, 1, 1 + 1e-6):
+        at_depth(near * factor)
+    for z in (1e10, 2e10, 1e25):
+        at_depth(z, visible=False)
+    params = gsjax.GaussianParams(**{k: jnp.asarray(v) for k, v in p.items()})
+    return gaussians.replace(params=params), wanted, next(slot)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_wild_values_stay_finite(dtype):
+    gaussians, camera = cast(scene_of("random"), dtype)
+    scene, wanted, used = extremes(gaussians, camera)
+    out, grads = loss_and_gradients(scene, camera)
+    assert not out.overflowed
+    assert used > 40
+    for name in ("alpha", "depth", "median_depth", "radii"):
+        assert np.isfinite(getattr(out, name)).all(), name
+    for leaf in jax.tree.leaves(grads):
+        assert np.isfinite(leaf).all()
+    for slot, visible in wanted.items():
+        if visible is not None:
+            assert (out.radii[slot] > 0) == visible, slot
+    unseen = np.asarray(out.radii == 0)
+    for leaf in jax.tree.leaves(grads[0]):
+        assert (leaf[unseen] == 0).all()
+
+
+def test_a_camera_that_is_not_finite_draws_nothing_under_jit():
+    """Outside jit it cannot be made; under jit it cannot raise."""
+    gaussians, camera = scene_of("random")
+    for spoilt_camera in (
+        gsjax.Camera(**{**vars(camera), "viewmat": camera.viewmat * np.nan}),
+        gsjax.Camera(**{**vars(camera), "near": camera.near * np.nan}),
+    ):
+        out = render(gaussians, spoilt_camera, COMPAT, BACKGROUND)
+        np.testing.assert_array_equal(
+            out.rgb, np.broadcast_to(BACKGROUND, out.rgb.shape)
+        )
+        assert out.demand.visible == 0
+
+
+def empty_scenes():
+    gaussians, camera = scene_of("random")
+    none = {
+        name: np.asarray(array)[:0] for name, array in vars(gaussians.params).items()
+    }
+    behind = gsjax.Camera(**{**vars(camera), "near": camera.far / 2})
+    return {
+        "no Gaussians": (gsjax.make_gaussians(**none, capacity=COUNT), camera),
+        "none active": (gsjax.select(gaussians, jnp.zeros(COUNT, bool)), camera),
+        "all culled": (gaussians, behind),
+        "all transparent": (
+            gaussians.replace(
+                params=gaussians.params.replace(logit_opacities=jnp.full(COUNT, -30.0))
+            ),
+            camera,
+        ),
+    }
+
+
+@pytest.mark.parametrize("kind", empty_scenes())
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_an_empty_scene_is_exactly_the_background(kind, dtype):
+    gaussians, camera, background = cast((*empty_scenes()[kind], BACKGROUND), dtype)
+    out = render(gaussians, camera, COMPAT, background)
+    assert out.rgb.shape == (HEIGHT, WIDTH, 3)
+    np.testing.assert_array_equal(out.rgb, np.broadcast_to(background, out.rgb.shape))
+    for name in ("alpha", "depth", "median_depth", "radii"):
+        assert (getattr(out, name) == 0).all(), name
+    assert out.demand.pairs == out.demand.visible == 0
+    assert not out.overflowed
+    _, grads = loss_and_gradients(gaussians, camera)
+    for leaf in jax.tree.leaves(grads):
+        assert (leaf == 0).all()
+
+
+def test_no_slot_is_still_a_scene():
+    """The default capacity of no Gaussians is 1, and a 1 × 1 image is an image."""
+    none = {name: array[:0] for name, array in GOOD.items()}
+    gaussians = gsjax.make_gaussians(**none)
+    assert gaussians.capacity == 1
+    assert gsjax.num_active(gaussians) == 0
+    out = render(gaussians, camera_of(1, 1), COMPAT, BACKGROUND)
+    np.testing.assert_array_equal(out.rgb[0, 0], BACKGROUND)
