@@ -19,6 +19,18 @@ class CapacityError(GsjaxError, RuntimeError):
     exit_code = 3
 
 
+class SfmError(GsjaxError, RuntimeError):
+    """Structure from motion found no cameras, or too few; says how many and why."""
+
+    exit_code = 4
+
+
+class DivergedError(GsjaxError, RuntimeError):
+    """Training has left the finite numbers; says when, and what to try."""
+
+    exit_code = 5
+
+
 class MissingExtraError(GsjaxError, ImportError):
     """An optional package is absent; carries the line that installs it."""
 

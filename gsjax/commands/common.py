@@ -1,0 +1,72 @@
+"""What the commands share: their base, and the values of their options.
+
+A command is a dataclass of its options with `run`, which returns the exit code. What
+is heavy to import is imported there.
+"""
+
+import contextlib
+import re
+from dataclasses import dataclass
+
+from gsjax.errors import GsjaxError
+
+_KINDS = ("rgb", "alpha", "depth")
+
+
+class UsageError(GsjaxError):
+    """An option has a value that it cannot have."""
+
+    exit_code = 2
+
+
+@dataclass(kw_only=True)
+class Command:
+    debug: bool = False
+    """Show the whole traceback of an error."""
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height of ``800x600``.
+
+    Raises:
+      UsageError: if it is not that.
+    """
+    match = re.fullmatch(r"([0-9]{1,6})[x×X]([0-9]{1,6})", text)
+    if match is None or min(int(match[1]), int(match[2])) < 1:
+        raise UsageError(f"--size {text!r}: WIDTHxHEIGHT in pixels is wanted: 800x600")
+    return int(match[1]), int(match[2])
+
+
+def parse_kinds(text: str) -> tuple[str, ...]:
+    """The kinds of image in ``rgb,depth``, each once.
+
+    Raises:
+      UsageError: if one is unknown.
+    """
+    kinds = tuple(dict.fromkeys(text.split(",")))
+    if not set(kinds) <= set(_KINDS):
+        raise UsageError(
+            f"--what {text!r}: of {', '.join(_KINDS)}, one or several with commas"
+        )
+    return kinds
+
+
+def parse_background(text: str) -> tuple[float, ...]:
+    """The colour ``R,G,B``.
+
+    Raises:
+      UsageError: if it is not three numbers.
+    """
+    number = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,2})?"
+    if not re.fullmatch(rf"{number}(,{number}){{2}}", text):
+        raise UsageError(f"--background {text!r}: R,G,B is wanted, e.g. 1,1,1")
+    return tuple(float(value) for value in text.split(","))
+
+
+def use_all_cores() -> None:
+    """Give JAX a device for each core, as `gsjax.use_all_cores`."""
+    from gsjax import devices
+
+    # Called from a program in which JAX has started, its devices are used.
+    with contextlib.suppress(RuntimeError):
+        devices.use_all_cores()
