@@ -13,8 +13,7 @@ import math
 import os
 import secrets
 import stat
-from collections.abc import Iterator, Mapping
-from itertools import islice
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
@@ -25,9 +24,9 @@ import numpy as np
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.io.ply_header import Header, check_properties, check_size, read_header, warn
+from gsjax.io.ply_rows import CHUNK_ROWS, read_rows
 
 _NORMALS = ("nx", "ny", "nz")
-_CHUNK_ROWS = 1 << 14
 # Exporters write ±inf for opacities of exactly 0 and 1; the range of `logit`.
 _MAX_LOGIT = math.log((1 - 2.0**-24) / 2.0**-24)
 
@@ -101,8 +100,6 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
     dtype = np.dtype(jnp.result_type(float)) if wide else np.dtype(np.float32)
     fields = _allocate(header.vertex.rows, bases, dtype)
     views = _views(fields)
-    file.seek(header.body)
-    read_rows = _binary_rows if header.order else _ascii_rows
     start = 0
     with np.errstate(over="ignore", invalid="ignore"):  # _check_values finds them
         for size, columns in read_rows(file, header):
@@ -110,54 +107,6 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
                 view[start : start + size] = columns[name]
             start += size
     return fields
-
-
-def _binary_rows(file: BinaryIO, header: Header) -> Iterator[tuple[int, np.ndarray]]:
-    """(rows, columns by name) in pieces; ``file`` stands at the body."""
-    vertex, order = header.vertex, header.order
-    dtype = np.dtype([(name, f"{order}{kind}") for name, kind in vertex.types.items()])
-    file.seek(sum(e.rows * e.least_bytes(order) for e in header.before), os.SEEK_CUR)
-    for start in range(0, vertex.rows, _CHUNK_ROWS):
-        size = min(_CHUNK_ROWS, vertex.rows - start)
-        data = file.read(size * dtype.itemsize)
-        if len(data) < size * dtype.itemsize:
-            raise InputError(
-                f"{header.path}: the file became shorter while it was read, at vertex "
-                f"{start}; wait until it is complete"
-            )
-        yield size, np.frombuffer(data, dtype)
-
-
-def _ascii_rows(
-    file: BinaryIO, header: Header
-) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """(rows, columns by name) in pieces; ``file`` stands at the body."""
-    path, vertex = header.path, header.vertex
-    offset, line = header.body, b"\n"
-    for line in islice(file, sum(element.rows for element in header.before)):
-        offset += len(line)
-    for start in range(0, vertex.rows, _CHUNK_ROWS):
-        size = min(_CHUNK_ROWS, vertex.rows - start)
-        table = np.empty((size, len(vertex.types)))
-        for row in range(size):
-            line = file.readline()
-            words = line.split()
-            where = f"{path}: vertex {start + row} (byte {offset})"
-            if len(words) != len(vertex.types):
-                raise InputError(
-                    f"{where}: found {len(words)} values, {len(vertex.types)} are "
-                    "wanted; the file is truncated or damaged"
-                )
-            try:
-                table[row] = [float(word) for word in words]
-            except ValueError as error:
-                raise InputError(f"{where}: {str(error)[:80]}; pass numbers") from error
-            offset += len(line)
-        yield size, dict(zip(vertex.types, table.T))
-    if not line.endswith((b"\n", b"\r")):
-        warn(f"{path}: the last line has no end; its last value may be truncated")
-    if not header.after and any(extra.strip() for extra in file):
-        warn(f"{path}: text after the last element (byte {offset}) is ignored")
 
 
 def _check_values(
@@ -262,8 +211,8 @@ def _write_body(file: BinaryIO, gaussians: Gaussians) -> int:
     lines += [f"property float {name}" for name in names]
     file.write("\n".join([*lines, "end_header", ""]).encode())
     nonfinite = 0
-    for start in range(0, len(slots), _CHUNK_ROWS):
-        chosen = slots[start : start + _CHUNK_ROWS]
+    for start in range(0, len(slots), CHUNK_ROWS):
+        chosen = slots[start : start + CHUNK_ROWS]
         table = np.zeros((len(chosen), len(names)), "<f4")
         with np.errstate(over="ignore"):
             for column, name in enumerate(names):

@@ -1,0 +1,128 @@
+"""COLMAP models as scenes: cameras, poses and points of a structure from motion.
+
+The files are read by us, not by pycolmap: that hangs on, or silently accepts, files
+that are truncated (measured with 4.2.1).
+"""
+
+import warnings
+from os import PathLike
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+
+from gsjax.errors import InputError
+from gsjax.scene import colmap_binary, colmap_text
+from gsjax.scene.colmap_model import (
+    ColmapCamera,
+    ColmapImage,
+    ColmapPoints,
+    viewmat_of,
+)
+from gsjax.scene.image_files import find_files, find_mask, image_folder
+from gsjax.scene.types import Scene, View
+
+_PLACES = ("sparse/0", "sparse", ".")
+
+
+class ColmapModel(NamedTuple):
+    """A model as it stands in its files; rigs.bin and frames.bin are not needed."""
+
+    cameras: dict[int, ColmapCamera]
+    images: list[ColmapImage]
+    points: ColmapPoints
+
+
+def find_colmap(folder: Path) -> Path | None:
+    """Where the model of a dataset lies: sparse/0, sparse or the folder itself."""
+    for place in _PLACES:
+        if any(
+            (folder / place / f"cameras.{form}").exists() for form in ("bin", "txt")
+        ):
+            return folder / place if place != "." else folder
+    return None
+
+
+def read_colmap(folder: Path) -> ColmapModel:
+    """Read the cameras, images and points3D files of a folder, .bin before .txt.
+
+    Raises:
+      InputError: on a missing, truncated or damaged file, on values that cannot be,
+        or on an image of a camera that is not there. A missing points3D is warned of.
+    """
+    path, reader = _file(folder, "cameras")
+    cameras = reader.read_cameras(path)
+    path, reader = _file(folder, "images")
+    images = reader.read_images(path)
+    if not images:
+        raise InputError(f"{path}: the model has no image; choose another one")
+    for image in images:
+        if image.camera not in cameras:
+            raise InputError(
+                f"{path}: image {image.name!r} is of camera {image.camera}, which the "
+                f"{len(cameras)} cameras of {folder} do not have; the files are not of "
+                "one model"
+            )
+    try:
+        path, reader = _file(folder, "points3D")
+    except InputError as error:
+        warnings.warn(f"{error}; the scene has no points", UserWarning, stacklevel=2)
+        return ColmapModel(cameras, images, _no_points())
+    return ColmapModel(cameras, images, reader.read_points(path))
+
+
+def _file(folder: Path, name: str) -> tuple[Path, ModuleType]:
+    for suffix, reader in ((".bin", colmap_binary), (".txt", colmap_text)):
+        path = folder / (name + suffix)
+        if path.exists():
+            return path, reader
+    raise InputError(
+        f"{folder}: neither {name}.bin nor {name}.txt is there; a COLMAP model has "
+        "cameras, images and points3D"
+    )
+
+
+def _no_points() -> ColmapPoints:
+    return ColmapPoints(
+        ids=np.zeros(0, np.uint64),
+        xyz=np.zeros((0, 3)),
+        colors=np.zeros((0, 3), np.uint8),
+        errors=np.zeros(0),
+        track_lengths=np.zeros(0, np.int64),
+    )
+
+
+def load_colmap(
+    folder: Path,
+    *,
+    images: str | PathLike[str] | None = None,
+    skip_missing: bool = False,
+    factor: int | None = None,
+) -> Scene:
+    """The scene of a dataset that has a COLMAP model; see `load_dataset`."""
+    place = find_colmap(folder)
+    if place is None:
+        raise InputError(f"{folder}: no cameras.bin or cameras.txt in {_PLACES}")
+    model = read_colmap(place)
+    root = image_folder(folder, images, factor)
+    names = [image.name for image in model.images]
+    files = find_files(place, root, names, skip_missing=skip_missing)
+    views = []
+    for image in model.images:
+        if image.name not in files:
+            continue
+        camera = model.cameras[image.camera]
+        view = View(
+            name=image.name,
+            image=files[image.name],
+            viewmat=viewmat_of(image.quat, image.translation),
+            K=camera.K,
+            width=camera.width,
+            height=camera.height,
+            lens=camera.lens,
+            mask=find_mask(folder / "masks", image.name),
+        )
+        views.append(view)
+    points = model.points
+    return Scene(place, "colmap", tuple(views), points.xyz, points.colors)

@@ -1,0 +1,168 @@
+"""COLMAP's binary files, read strictly: cameras.bin, images.bin, points3D.bin.
+
+Little-endian, without padding. What a file declares is held against its size before
+anything is allocated, and a file is used whole or not at all.
+"""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from gsjax.errors import InputError
+from gsjax.scene.colmap_model import (
+    MAX_NAME_BYTES,
+    ColmapCamera,
+    ColmapImage,
+    ColmapPoints,
+    kind_of,
+    make_colmap_camera,
+    make_colmap_image,
+    sorted_points,
+)
+
+_COUNT = struct.Struct("<Q")
+_CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters
+_IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, camera; then the name
+_POINT_2D_BYTES = 24  # x, y as float64, id of the point as int64
+_POINT = np.dtype(
+    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")]
+)
+_TRACK_BYTES = 8  # image and index of the observation, uint32 each
+
+
+class _Data:
+    """The bytes of a file and how far they are read."""
+
+    def __init__(self, path: Path, least: int, records: str):
+        try:
+            self.bytes = path.read_bytes()
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot be read: {error.strerror or error}; check the path "
+                "and its permissions"
+            ) from error
+        self.path, self.offset = path, 0
+        self.size = len(self.bytes)
+        (self.count,) = self.take(_COUNT, "the count")
+        if self.count * least > self.size - self.offset:
+            raise InputError(
+                f"{path}: byte 0: the count says {self.count} {records} of at least "
+                f"{least} bytes each, {self.size - self.offset} bytes follow; the file "
+                "is truncated or damaged: export or copy it again"
+            )
+
+    def take(self, form: struct.Struct, what: str) -> tuple:
+        start = self.offset
+        self.skip(form.size, what)
+        return form.unpack_from(self.bytes, start)
+
+    def skip(self, size: int, what: str) -> None:
+        if size > self.size - self.offset:
+            raise self.truncated(size, what)
+        self.offset += size
+
+    def truncated(self, size: int, what: str) -> InputError:
+        return InputError(
+            f"{self.path}: byte {self.offset}: {what} takes {size} bytes, "
+            f"{self.size - self.offset} are left of {self.size}; the file is truncated "
+            "or damaged: export or copy it again"
+        )
+
+    def finish(self, records: str) -> None:
+        if self.offset != self.size:
+            raise InputError(
+                f"{self.path}: {self.size - self.offset} bytes follow the last of "
+                f"{self.count} {records} (from byte {self.offset}); the count or the "
+                "file is damaged: export or copy it again"
+            )
+
+
+def read_cameras(path: Path) -> dict[int, ColmapCamera]:
+    """Cameras of a cameras.bin, by id."""
+    data = _Data(path, _CAMERA.size, "cameras")
+    cameras: dict[int, ColmapCamera] = {}
+    for index in range(data.count):
+        where = f"{path}: camera {index} (byte {data.offset})"
+        identity, number, *size = data.take(_CAMERA, f"camera {index}")
+        kind = kind_of(where, number)
+        form = struct.Struct(f"<{kind.size}d")
+        params = data.take(form, f"{kind.name} camera {index}")
+        if identity in cameras:
+            raise InputError(f"{where}: the id {identity} is that of another camera")
+        cameras[identity] = make_colmap_camera(where, kind, (size[0], size[1]), params)
+    data.finish("cameras")
+    return cameras
+
+
+def read_images(path: Path) -> list[ColmapImage]:
+    """Images of an images.bin, in its order; their 2D points are skipped."""
+    data = _Data(path, _IMAGE.size + 1 + _COUNT.size, "images")
+    images: list[ColmapImage] = []
+    identities: set[int] = set()
+    for index in range(data.count):
+        where = f"{path}: image {index} (byte {data.offset})"
+        identity, *pose, camera = data.take(_IMAGE, f"image {index}")
+        name = _name(data, where)
+        (points,) = data.take(_COUNT, f"the number of 2D points of image {index}")
+        data.skip(points * _POINT_2D_BYTES, f"the {points} 2D points of image {index}")
+        if identity in identities:
+            raise InputError(f"{where}: the id {identity} is that of another image")
+        identities.add(identity)
+        images.append(make_colmap_image(where, name, camera, tuple(pose)))
+    data.finish("images")
+    return images
+
+
+def _name(data: _Data, where: str) -> str:
+    limit = data.offset + MAX_NAME_BYTES + 1
+    end = data.bytes.find(b"\0", data.offset, limit)
+    if end < 0:
+        raise InputError(
+            f"{where}: its name (byte {data.offset}) has no end within "
+            f"{MAX_NAME_BYTES} bytes; the file is truncated or damaged"
+        )
+    raw = data.bytes[data.offset : end]
+    data.offset = end + 1
+    try:
+        return raw.decode()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{where}: its name {raw[:80]!r} is not UTF-8") from error
+
+
+def read_points(path: Path) -> ColmapPoints:
+    """Points of a points3D.bin, sorted by id; of the tracks only the length."""
+    data = _Data(path, _POINT.itemsize, "points")
+    starts = _point_starts(data)
+    data.finish("points")
+    # One gather of the fixed part of all records: [M, 51] bytes.
+    raw = np.frombuffer(data.bytes, np.uint8)
+    table = np.empty((data.count, _POINT.itemsize), np.uint8)
+    piece = 1 << 18
+    for first in range(0, data.count, piece):
+        rows = starts[first : first + piece, None] + np.arange(_POINT.itemsize)
+        table[first : first + piece] = raw[rows]
+    points = table.view(_POINT)[:, 0]
+    fields = (points[name] for name in ("id", "xyz", "rgb", "error", "n"))
+    identities, xyz, rgb, errors, lengths = (np.ascontiguousarray(f) for f in fields)
+    lengths = lengths.astype(np.int64)
+    return sorted_points(str(path), ColmapPoints(identities, xyz, rgb, errors, lengths))
+
+
+def _point_starts(data: _Data) -> np.ndarray:
+    """[M] where each record starts: a chain of lengths, walked in plain Python."""
+    content, size = data.bytes, data.size
+    unpack, fixed, length_at = _COUNT.unpack_from, _POINT.itemsize, _POINT.itemsize - 8
+    starts = np.empty(data.count, np.int64)
+    at = data.offset
+    for index in range(data.count):
+        starts[index] = at
+        end = at + fixed
+        if end <= size:
+            end += _TRACK_BYTES * unpack(content, at + length_at)[0]
+        if end > size:
+            data.offset = at
+            raise data.truncated(end - at, f"point {index}")
+        at = end
+    data.offset = at
+    return starts

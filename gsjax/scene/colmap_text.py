@@ -1,0 +1,178 @@
+"""COLMAP's text files, read strictly: cameras.txt, images.txt, points3D.txt."""
+
+import re
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from gsjax.errors import InputError
+from gsjax.scene.colmap_model import (
+    MAX_NAME_BYTES,
+    ColmapCamera,
+    ColmapImage,
+    ColmapPoints,
+    kind_of,
+    make_colmap_camera,
+    make_colmap_image,
+    sorted_points,
+)
+
+_UINT32, _UINT64 = (1 << 32) - 1, (1 << 64) - 1
+
+
+def _lines(path: Path) -> Iterator[tuple[str, str]]:
+    """(where, line) of all lines, comments and blank ones too, without their ends."""
+    number = 0
+    try:
+        with path.open(encoding="utf-8") as file:
+            for number, line in enumerate(file, 1):
+                yield f"{path}: line {number}", line.strip()
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read: {error.strerror or error}; check the path and "
+            "its permissions"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: after line {number}: not UTF-8 text; the file is damaged, or a "
+            "binary one with the wrong suffix"
+        ) from error
+
+
+def _is_record(line: str) -> bool:
+    return bool(line) and not line.startswith("#")
+
+
+def _whole(where: str, what: str, text: str, most: int) -> int:
+    if re.fullmatch("[0-9]{1,20}", text) and int(text) <= most:
+        return int(text)
+    raise InputError(
+        f"{where}: {what} is {text[:40]!r}; a whole number from 0 to {most} is wanted"
+    )
+
+
+def _floats(where: str, texts: list[str]) -> tuple[float, ...]:
+    try:
+        return tuple(float(text) for text in texts)
+    except ValueError as error:
+        raise InputError(f"{where}: {str(error)[:80]}; pass numbers") from error
+
+
+def _words(where: str, line: str, least: int, wanted: str, split: int = -1):
+    words = line.split(maxsplit=split)
+    if len(words) < least:
+        raise InputError(
+            f"{where}: found {len(words)} values, {wanted} is wanted; the file is "
+            "truncated or damaged"
+        )
+    return words
+
+
+def read_cameras(path: Path) -> dict[int, ColmapCamera]:
+    """Cameras of a cameras.txt, by id."""
+    cameras: dict[int, ColmapCamera] = {}
+    for where, line in _lines(path):
+        if not _is_record(line):
+            continue
+        words = _words(where, line, 4, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
+        identity = _whole(where, "the camera id", words[0], _UINT32)
+        kind = kind_of(where, words[1])
+        size = (
+            _whole(where, "the width", words[2], _UINT64),
+            _whole(where, "the height", words[3], _UINT64),
+        )
+        params = _floats(where, words[4:])
+        if len(params) != kind.size:
+            raise InputError(
+                f"{where}: found {len(params)} parameters, {kind.name} has {kind.size}"
+            )
+        if identity in cameras:
+            raise InputError(f"{where}: the id {identity} is that of another camera")
+        cameras[identity] = make_colmap_camera(where, kind, size, params)
+    return cameras
+
+
+def read_images(path: Path) -> list[ColmapImage]:
+    """Images of an images.txt, in its order; their 2D points are skipped."""
+    images: list[ColmapImage] = []
+    identities: set[int] = set()
+    wanted = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+    declared, observations = None, False
+    for where, line in _lines(path):
+        if observations:  # a line of its own after each image, which may be empty
+            observations = False
+            if len(line.split()) % 3:
+                raise InputError(
+                    f"{where}: {len(line.split())} values; X Y POINT3D_ID of each 2D "
+                    "point, or an empty line, is wanted after an image"
+                )
+            continue
+        if not _is_record(line):
+            declared = _declared(line, "images", declared)
+            continue
+        words = _words(where, line, 10, wanted, 9)
+        identity = _whole(where, "the image id", words[0], _UINT32)
+        camera = _whole(where, "the camera id", words[8], _UINT32)
+        if identity in identities:
+            raise InputError(f"{where}: the id {identity} is that of another image")
+        if len(words[9].encode()) > MAX_NAME_BYTES:
+            raise InputError(f"{where}: a name of more than {MAX_NAME_BYTES} bytes")
+        identities.add(identity)
+        pose = _floats(where, words[1:8])
+        images.append(make_colmap_image(where, words[9], camera, pose))
+        observations = True
+    _compare(path, "images", len(images), declared)
+    return images
+
+
+def read_points(path: Path) -> ColmapPoints:
+    """Points of a points3D.txt, sorted by id; of the tracks only the length."""
+    identities, values, lengths = [], [], []
+    declared = None
+    for where, line in _lines(path):
+        if not _is_record(line):
+            declared = _declared(line, "points", declared)
+            continue
+        words = _words(where, line, 8, "POINT3D_ID X Y Z R G B ERROR TRACK")
+        if len(words) % 2:
+            raise InputError(
+                f"{where}: the track has {len(words) - 8} values; pairs of IMAGE_ID "
+                "POINT2D_IDX are wanted; the file is truncated or damaged"
+            )
+        identities.append(_whole(where, "the point id", words[0], _UINT64))
+        row = _floats(where, words[1:8])
+        if not all(0 <= value <= 255 and value % 1 == 0 for value in row[3:6]):
+            raise InputError(
+                f"{where}: colour {words[4:7]}; whole numbers from 0 to 255 are wanted"
+            )
+        values.append(row)
+        lengths.append((len(words) - 8) // 2)
+    _compare(path, "points", len(values), declared)
+    table = np.asarray(values, np.float64).reshape(-1, 7)
+    points = ColmapPoints(
+        ids=np.asarray(identities, np.uint64),
+        xyz=np.ascontiguousarray(table[:, :3]),
+        colors=table[:, 3:6].astype(np.uint8),
+        errors=table[:, 6].copy(),
+        track_lengths=np.asarray(lengths, np.int64),
+    )
+    return sorted_points(str(path), points)
+
+
+def _declared(line: str, records: str, before: int | None) -> int | None:
+    """The number of records that a comment of COLMAP states."""
+    found = re.match(rf"# *Number of {records}: *([0-9]{{1,18}})", line)
+    return int(found[1]) if found else before
+
+
+def _compare(path: Path, records: str, found: int, declared: int | None) -> None:
+    # A warning only: files edited by hand keep their first comment.
+    if declared is not None and declared != found:
+        warnings.warn(
+            f"{path}: a comment says {declared} {records}, {found} are there; the file "
+            "may be truncated",
+            UserWarning,
+            stacklevel=3,
+        )

@@ -1,0 +1,94 @@
+"""Datasets: photographs with known cameras, whatever program wrote them."""
+
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from os import PathLike
+from pathlib import Path
+
+from gsjax.errors import InputError
+from gsjax.scene.colmap import find_colmap, load_colmap
+from gsjax.scene.llff import load_llff
+from gsjax.scene.nerf import find_transforms, load_nerf
+from gsjax.scene.rebase import rebase
+from gsjax.scene.types import Scene
+
+
+def load_dataset(
+    path: str | PathLike[str],
+    *,
+    images: str | PathLike[str] | None = None,
+    skip_missing: bool = False,
+    factor: int | None = None,
+) -> Scene:
+    """Read cameras, points and the names of the photographs of a dataset.
+
+    What it is follows from what is there, in this order:
+
+    - a COLMAP model, .bin or .txt, in ``sparse/0``, ``sparse`` or the folder itself;
+      photographs in ``images``, masks (0 is left out) in ``masks``;
+    - ``transforms.json`` of nerfstudio or instant-ngp;
+    - ``transforms_train.json`` and ``transforms_test.json`` of NeRF's synthetic
+      scenes; another list (``transforms_val.json``) is read where ``path`` is the file;
+    - ``poses_bounds.npy`` of LLFF.
+
+    Photographs themselves are read by `gsjax.scene.photos`. A scene that lies far out
+    is moved near the origin of coordinates, see `gsjax.scene.rebase`.
+
+    Args:
+      path: folder of the dataset, or its .json or .npy file.
+      images: name of the folder of the photographs in the dataset, or a path; None for
+        ``images``, for a .json the folders in it.
+      skip_missing: leave out photographs that are listed but not there, with a
+        warning, instead of raising.
+      factor: read the smaller copies in ``images_2``, ``images_4``, …
+
+    Returns:
+      Views sorted by name.
+
+    Raises:
+      InputError: if nothing of this is there, or a file is missing, truncated,
+        damaged or not supported; the message names the file, what was found in it
+        and what to do.
+    """
+    path = Path(path)
+    nerf = partial(load_nerf, images=images, factor=factor, skip_missing=skip_missing)
+    llff = partial(load_llff, images=images, factor=factor)
+    if not path.exists():
+        raise InputError(f"{path}: does not exist; pass the folder of a dataset")
+    if not path.is_dir():
+        if path.suffix.lower() == ".json":
+            return _finished(nerf([path]))
+        if path.suffix.lower() == ".npy":
+            return _finished(llff(path))
+        raise InputError(f"{path}: pass the folder of a dataset, a .json or a .npy")
+    if find_colmap(path) is not None:
+        scene = load_colmap(
+            path, images=images, factor=factor, skip_missing=skip_missing
+        )
+        return _finished(scene)
+    lists = find_transforms(path)
+    if lists:
+        return _finished(nerf(lists))
+    if (path / "poses_bounds.npy").exists():
+        return _finished(llff(path / "poses_bounds.npy"))
+    names = sorted(entry.name for entry in path.iterdir())
+    raise InputError(
+        f"{path}: no dataset is known by its content ({', '.join(names[:12]) or 'none'}"
+        "); sparse/0 of COLMAP, transforms.json, transforms_train.json or "
+        "poses_bounds.npy is wanted; for photographs alone run `gsjax sfm` first"
+    )
+
+
+def _finished(scene: Scene) -> Scene:
+    """Views sorted, names unique, coordinates near 0."""
+    views = sorted(scene.views, key=lambda view: view.name)
+    if not views:
+        raise InputError(f"{scene.source}: no view is left; at least 1 is wanted")
+    for before, after in pairwise(views):
+        if before.name == after.name:
+            raise InputError(
+                f"{scene.source}: the photograph {after.name!r} is listed more than "
+                "once; remove all but one"
+            )
+    return rebase(replace(scene, views=tuple(views)))

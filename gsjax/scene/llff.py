@@ -1,0 +1,119 @@
+"""LLFF's `poses_bounds.npy`: one row a photograph, in the order of their names.
+
+A row has 17 numbers: a 3 × 5 matrix (camera → world rotation with axes down, right,
+back; the camera's position; image height, width and focal length in px), then the
+nearest and farthest depth, which are not used.
+"""
+
+import ast
+import re
+import struct
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from gsjax.errors import InputError
+from gsjax.scene.colmap_model import MAX_COORDINATE, MAX_SIDE
+from gsjax.scene.image_files import SUFFIXES, image_folder
+from gsjax.scene.transforms_fields import rigid
+from gsjax.scene.types import Scene, View
+
+_COLUMNS = 17
+
+
+def load_llff(
+    path: Path,
+    *,
+    images: str | PathLike[str] | None = None,
+    factor: int | None = None,
+) -> Scene:
+    """The scene of a `poses_bounds.npy` and the folder beside it.
+
+    Raises:
+      InputError: if the file is no such array, is truncated, has poses that are none,
+        or the number of photographs is not that of its rows.
+    """
+    table = read_poses(path)
+    root = image_folder(path.parent, images, factor)
+    files = sorted(p for p in root.iterdir() if p.suffix.lower() in SUFFIXES)
+    if len(files) != len(table):
+        raise InputError(
+            f"{path}: {len(table)} rows, but {root} has {len(files)} photographs; as "
+            "rows have no names, the photographs must be exactly those of the rows"
+        )
+    views = [
+        _view(f"{path}: row {index}", row, file)
+        for index, (row, file) in enumerate(zip(table, files))
+    ]
+    return Scene(path, "llff", tuple(views))
+
+
+def _view(where: str, row: np.ndarray, file: Path) -> View:
+    if not (np.abs(row) < MAX_COORDINATE).all():
+        raise InputError(f"{where}: values that are no finite numbers: {row.tolist()}")
+    matrix = row[:15].reshape(3, 5)
+    height, width, focal = matrix[:, 4].tolist()
+    sides = (width, height)
+    if not all(1 <= v <= MAX_SIDE and v % 1 == 0 for v in sides) or not focal > 0:
+        raise InputError(
+            f"{where}: height {height:g}, width {width:g}, focal length {focal:g}; "
+            "whole sizes ≥ 1 and a focal length above 0 are wanted"
+        )
+    # Down, right, back → right, down, forward.
+    block = matrix[:, [1, 0, 2]] * (1, 1, -1)
+    rotation, _ = rigid(where, block)
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ matrix[:, 3]
+    K = np.asarray([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return View(file.name, file, viewmat, K, int(width), int(height))
+
+
+def read_poses(path: Path) -> np.ndarray:
+    """[N, 17] float64 of a .npy file, which is held against its size first."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read: {error.strerror or error}; check the path and "
+            "its permissions"
+        ) from error
+    order, rows, fortran, start = _header(path, data)
+    wanted = rows * _COLUMNS * order.itemsize
+    if len(data) - start != wanted:
+        raise InputError(
+            f"{path}: {len(data) - start} bytes follow the header, {rows} × {_COLUMNS} "
+            f"numbers take {wanted}; the file is truncated or damaged: export or copy "
+            "it again"
+        )
+    values = np.frombuffer(data, order, offset=start).astype(np.float64)
+    shape = (rows, _COLUMNS)
+    return values.reshape(shape, order="F" if fortran else "C")
+
+
+def _header(path: Path, data: bytes) -> tuple[np.dtype, int, bool, int]:
+    """Type, rows, order and start of the body."""
+    wide = data[6:7] in (b"\2", b"\3")
+    form, start = ("<I", 12) if wide else ("<H", 10)
+    if not data.startswith(b"\x93NUMPY") or len(data) < start:
+        raise InputError(
+            f"{path}: starts with {data[:8]!r}, which is no .npy file; an array of "
+            f"[N, {_COLUMNS}] numbers is wanted"
+        )
+    (length,) = struct.unpack_from(form, data, 8)
+    text = data[start : start + min(length, 10_000)].decode("latin-1")
+    found = {
+        key: re.search(rf"'{key}': *({value})", text)
+        for key, value in (
+            ("descr", "'[<>]f[48]'"),
+            ("fortran_order", "True|False"),
+            ("shape", rf"\( *[0-9]{{1,9}} *, *{_COLUMNS} *,? *\)"),
+        )
+    }
+    if start + length > len(data) or not all(found.values()):
+        raise InputError(
+            f"{path}: the header {text[:120]!r} is not that of [N, {_COLUMNS}] float32 "
+            "or float64 numbers; the file is truncated, damaged or another one"
+        )
+    descr, fortran, shape = (ast.literal_eval(m[1]) for m in found.values() if m)
+    return np.dtype(descr), shape[0], fortran, start + length

@@ -1,0 +1,178 @@
+"""`transforms.json` as a scene: NeRF's synthetic scenes, instant-ngp and nerfstudio.
+
+``applied_transform`` is not undone: as nerfstudio has it, it tells what was done to
+poses and points already, so that both are in one frame as they stand.
+"""
+
+from os import PathLike
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from gsjax.errors import InputError
+from gsjax.io.point_cloud import read_point_cloud
+from gsjax.scene.image_files import check_factor, find_files, inside
+from gsjax.scene.image_header import image_size
+from gsjax.scene.transforms_fields import (
+    Frame,
+    first_number,
+    focal_lengths,
+    model_of,
+    pose_of,
+    read_frames,
+    shown,
+    size_of,
+    text_of,
+    warn_of_scaled,
+)
+from gsjax.scene.types import Lens, Scene, View
+
+_PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+_FISHEYE = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
+# The order of nerfstudio's distortion_params, which a frame may have.
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_SPLITS = {"transforms_train": "train", "transforms_test": "test"}
+
+
+def find_transforms(folder: Path) -> list[Path]:
+    """The camera lists of a folder: one for all, or NeRF's train and test lists."""
+    if (folder / "transforms.json").exists():
+        return [folder / "transforms.json"]
+    paths = [folder / f"{stem}.json" for stem in _SPLITS]
+    return [path for path in paths if path.exists()]
+
+
+def load_nerf(
+    paths: list[Path],
+    *,
+    images: str | PathLike[str] | None = None,
+    skip_missing: bool = False,
+    factor: int | None = None,
+) -> Scene:
+    """The scene of camera lists in one folder; see `load_dataset`."""
+    check_factor(factor)
+    folder = paths[0].parent
+    views: list[View] = []
+    lists = [read_frames(path) for path in paths]
+    for path, frames in zip(paths, lists):
+        names = [_file_path(frame, images, factor) for frame in frames]
+        files = find_files(path, folder, names, skip_missing=skip_missing)
+        splits = _splits(path, frames)
+        scaled: list[tuple[int, float]] = []
+        for index, (frame, name) in enumerate(zip(frames, names)):
+            if name not in files:
+                continue
+            viewmat, scale = pose_of(frame)
+            if scale != 1:
+                scaled.append((index, scale))
+            views.append(_view(frame, files[name], folder, viewmat, splits[index]))
+        warn_of_scaled(path, scaled)
+    points, colors = _points(lists[0][0], folder)
+    source = paths[0] if len(paths) == 1 else folder
+    return Scene(source, "transforms", tuple(views), points, colors)
+
+
+def _file_path(
+    frame: Frame, images: str | PathLike[str] | None, factor: int | None
+) -> str:
+    """Where the photograph of a frame lies in the folder, by its list or as asked."""
+    name = text_of(frame, "file_path")
+    if not name:
+        raise InputError(f"{frame.where}: file_path is {shown(name)}; text is wanted")
+    path = inside(frame.where, name)
+    if images is not None or (factor is not None and factor > 1):
+        # As nerfstudio: smaller copies lie in a folder of their own, images_4.
+        first = "images" if images is None else str(images)
+        suffix = f"_{factor}" if factor is not None and factor > 1 else ""
+        path = PurePosixPath(first + suffix, path.name)
+    return str(path)
+
+
+def _splits(path: Path, frames: list[Frame]) -> list[str | None]:
+    """The split of each frame: by nerfstudio's lists of names, or by NeRF's files."""
+    named: dict[str, str] = {}
+    # A test list wins over a validation list, and that over nothing.
+    for key, split in (("val", "test"), ("train", "train"), ("test", "test")):
+        names = frames[0].sources[1].get(f"{key}_filenames")
+        if names is not None and not isinstance(names, list):
+            raise InputError(f"{path}: {key}_filenames is {shown(names)}; a list")
+        named |= {str(name): split for name in names or ()}
+    other = _SPLITS.get(path.stem)
+    return [named.get(str(text_of(frame, "file_path")), other) for frame in frames]
+
+
+def _view(
+    frame: Frame, file: Path, folder: Path, viewmat: np.ndarray, split: str | None
+) -> View:
+    lens = _lens(frame)
+    # The size of the file is that of the camera unless the list says otherwise.
+    width, height = size_of(frame) or image_size(file)
+    model = "fisheye" if lens is not None and lens.kind == "fisheye" else "pinhole"
+    fx, fy = focal_lengths(frame, width, height, model)
+    cx, cy = first_number(frame, "cx"), first_number(frame, "cy")
+    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
+    mask = text_of(frame, "mask_path")
+    if mask is not None and not (folder / inside(frame.where, mask)).is_file():
+        raise InputError(f"{frame.where}: mask_path {mask!r}: no such file in {folder}")
+    return View(
+        name=file.relative_to(folder).as_posix(),
+        image=file,
+        viewmat=viewmat,
+        K=np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64),
+        width=width,
+        height=height,
+        lens=lens,
+        mask=None if mask is None else folder / inside(frame.where, mask),
+        split=split,
+    )
+
+
+def _lens(frame: Frame) -> Lens | None:
+    model = model_of(frame)
+    if model not in (*_PERSPECTIVE, *_FISHEYE):
+        raise InputError(
+            f"{frame.where}: camera_model {model!r} is not supported; undistort the "
+            f"photographs to a pinhole first; supported: "
+            f"{', '.join((*_PERSPECTIVE, *_FISHEYE))}"
+        )
+    k1, k2, k3, k4, p1, p2 = _coefficients(frame)
+    if model in _FISHEYE:
+        if p1 or p2:
+            raise InputError(
+                f"{frame.where}: a fisheye has no p1, p2; found {p1}, {p2}"
+            )
+        return Lens("fisheye", (k1, k2, k3, k4))
+    if not any((k1, k2, k3, k4, p1, p2)):
+        return None
+    # As nerfstudio and instant-ngp, which read no rational denominator.
+    higher = {key: first_number(frame, key) for key in ("k5", "k6")} | {"k4": k4}
+    if any(higher.values()):
+        raise InputError(
+            f"{frame.where}: {', '.join(k for k, v in higher.items() if v)} of a lens "
+            "that is no fisheye is not supported; undistort the photographs first"
+        )
+    return Lens("radial_tangential", (k1, k2, p1, p2, k3))
+
+
+def _coefficients(frame: Frame) -> list[float]:
+    """k1 k2 k3 k4 p1 p2; those that are missing are 0."""
+    given = frame.sources[0].get("distortion_params")
+    if given is None:
+        return [first_number(frame, key) or 0.0 for key in _COEFFICIENTS]
+    if not isinstance(given, list) or len(given) != len(_COEFFICIENTS):
+        raise InputError(
+            f"{frame.where}: distortion_params is {shown(given)}; the numbers "
+            f"{' '.join(_COEFFICIENTS)} are wanted"
+        )
+    named = Frame(frame.where, (dict(zip(_COEFFICIENTS, given)), {}))
+    return [first_number(named, key) or 0.0 for key in _COEFFICIENTS]
+
+
+def _points(frame: Frame, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Points [M, 3] and colours of `ply_file_path`, if the file names one."""
+    path = frame.sources[1].get("ply_file_path")
+    if path is None:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    if not isinstance(path, str):
+        raise InputError(f"{frame.where}: ply_file_path is {shown(path)}; text")
+    return read_point_cloud(folder / inside(f"{folder}: ply_file_path", path))

@@ -1,0 +1,227 @@
+"""Photographs: files → undistorted, scaled pixels with the camera that goes with them.
+
+OpenCV decodes and is loaded when first needed. EXIF orientation is ignored, as
+COLMAP ignores it: the camera is that of the pixels as they are stored.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from gsjax.errors import InputError
+from gsjax.images import opencv
+from gsjax.scene.image_header import check_image
+from gsjax.scene.types import Lens, Photo, View
+from gsjax.scene.undistort import undistortion_maps
+
+# Sizes that differ from the camera's by rounding only: 1 px a side and this much.
+_ASPECT_TOLERANCE = 0.01
+_MAX_REMAP = 32766  # of cv2.remap
+Filter = Callable[[np.ndarray], np.ndarray]
+
+
+def load_photo(view: View, max_size: int | None = None) -> Photo:
+    """Read a photograph, undo its lens, leave out its mask, make it small enough.
+
+    16 bits are rounded to 8, grey becomes RGB. The ideal pinhole keeps focal lengths
+    and principal point; pixels that the lens did not see are not valid, nor is any
+    pixel to which one that is masked or was not seen contributes.
+
+    Args:
+      view: which photograph.
+      max_size: longest side in px; larger ones are averaged down. None for as it is.
+
+    Raises:
+      InputError: if the file cannot be read, is no image, is truncated or too large,
+        has not the aspect ratio of the camera, or max_size is below 1.
+    """
+    if max_size is not None and max_size < 1:
+        raise InputError(f"max_size {max_size}: at least 1 px is wanted")
+    stored = _decode(view.image)
+    pixels, alpha = _to_rgb(view.image, stored)
+    height, width = pixels.shape[:2]
+    K = _scaled(view.K, *_ratio(view, width, height))
+    invalid = None if view.mask is None else _masked(view.mask, width, height)
+    if view.lens is not None:
+        pixels, alpha, invalid = _undistorted(view.lens, K, pixels, alpha, invalid)
+    if max_size is not None and max(width, height) > max_size:
+        scale = max_size / max(width, height)
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        shrink = partial(opencv().resize, dsize=size, interpolation=opencv().INTER_AREA)
+        pixels, alpha = _filtered(shrink, pixels, alpha)
+        if invalid is not None:
+            invalid = shrink(invalid.astype(np.float32)) > 0
+        K = _scaled(K, size[0] / width, size[1] / height)
+    valid = None if invalid is None or not invalid.any() else ~invalid
+    return Photo(pixels, alpha, valid, K)
+
+
+def load_photos(
+    views: Sequence[View],
+    max_size: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Photo]:
+    """`load_photo` of all views, on all cores, in their order.
+
+    Args:
+      views: which photographs.
+      max_size: longest side in px, or None.
+      progress: called with (how many are done, how many there are) after each.
+
+    Raises:
+      InputError: on the first photograph that `load_photo` refuses.
+    """
+    workers = min(32, os.cpu_count() or 1)
+    photos: list[Photo] = []
+    with ThreadPoolExecutor(workers) as pool:
+        tasks = [pool.submit(load_photo, view, max_size) for view in views]
+        try:
+            for task in tasks:
+                photos.append(task.result())
+                if progress is not None:
+                    progress(len(photos), len(tasks))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return photos
+
+
+def _decode(path: Path, *, grey: bool = False) -> np.ndarray:
+    """Pixels as stored, in OpenCV's order of channels."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read: {error.strerror or error}; check the path and "
+            "its permissions"
+        ) from error
+    check_image(path, data)
+    cv2 = opencv()
+    flags = cv2.IMREAD_UNCHANGED  # does not rotate
+    if grey:
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise InputError(f"{path}: cannot be decoded: {str(error)[:120]}") from error
+    if pixels is None:
+        raise InputError(
+            f"{path}: cannot be decoded: the image is truncated, damaged or of a kind "
+            "that OpenCV does not read; convert it to PNG or JPEG"
+        )
+    return pixels
+
+
+def _to_rgb(path: Path, stored: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """RGB and alpha, both uint8."""
+    if stored.dtype == np.uint16:
+        # Nearest of 255·v/65535 = v/257; 257 is odd, so that there are no ties.
+        stored = ((stored.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if stored.dtype != np.uint8:
+        raise InputError(
+            f"{path}: pixels of {stored.dtype}; 8 or 16 bits are wanted: convert the "
+            "photograph to PNG or JPEG"
+        )
+    channels = 1 if stored.ndim == 2 else stored.shape[2]
+    if channels == 1:
+        return np.repeat(stored.reshape(*stored.shape[:2], 1), 3, axis=2), None
+    if channels == 2:
+        return np.repeat(stored[..., :1], 3, axis=2), stored[..., 1].copy()
+    pixels = np.ascontiguousarray(stored[..., 2::-1])
+    return pixels, stored[..., 3].copy() if channels == 4 else None
+
+
+def _ratio(view: View, width: int, height: int) -> tuple[float, float]:
+    """Size of the file over the size that the camera is for."""
+    sx, sy = width / view.width, height / view.height
+    # Rounding moves either side by up to 1 px.
+    tolerance = _ASPECT_TOLERANCE + 1 / width + 1 / height
+    if abs(np.log(sx / sy)) > tolerance:
+        turned = abs(np.log(width / view.height * view.width / height)) <= tolerance
+        remedy = "it was rotated: keep the photographs that the cameras are of"
+        raise InputError(
+            f"{view.image}: {width} × {height} px, but its camera is for {view.width} "
+            f"× {view.height}; "
+            + (remedy if turned else "one of the same aspect ratio is wanted")
+        )
+    return sx, sy
+
+
+def _scaled(K: np.ndarray, sx: float, sy: float) -> np.ndarray:
+    """Intrinsics of an image whose sides are ``sx`` and ``sy`` times as long."""
+    return np.asarray(K, np.float64) * np.asarray([[sx], [sy], [1.0]])
+
+
+def _masked(path: Path, width: int, height: int) -> np.ndarray:
+    """[H, W] bool: where the mask is 0."""
+    mask = _decode(path, grey=True)
+    if mask.shape != (height, width):
+        rows = (np.arange(height) + 0.5) * (mask.shape[0] / height)
+        columns = (np.arange(width) + 0.5) * (mask.shape[1] / width)
+        mask = mask[rows.astype(int)[:, None], columns.astype(int)]
+    return mask == 0
+
+
+def _filtered(
+    filter_: Filter, pixels: np.ndarray, alpha: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Interpolate colours, weighted by their opacity where the image has one."""
+    if alpha is None:
+        return filter_(pixels), None
+    weight = alpha.astype(np.float32)
+    mean = filter_(weight)[..., None]
+    colors = filter_(pixels * weight[..., None])
+    mean_or_1 = np.where(mean > 0, mean, 1)
+    colors = np.where(mean > 0, colors / mean_or_1, filter_(pixels))
+    clipped = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
+    return clipped, np.clip(np.rint(mean[..., 0]), 0, 255).astype(np.uint8)
+
+
+_maps_lock = threading.Lock()
+
+
+@lru_cache(maxsize=2)
+def _maps(lens: Lens, values: tuple[float, ...], width: int, height: int):
+    return undistortion_maps(lens, np.reshape(values, (3, 3)), width, height)
+
+
+def _undistorted(
+    lens: Lens,
+    K: np.ndarray,
+    pixels: np.ndarray,
+    alpha: np.ndarray | None,
+    invalid: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    height, width = pixels.shape[:2]
+    if max(width, height) > _MAX_REMAP:
+        raise InputError(
+            f"a photograph of {width} × {height} px; at most {_MAX_REMAP} px a side "
+            "are undistorted: make it smaller"
+        )
+    with _maps_lock:  # one thread computes what the others then find
+        map_x, map_y, seen = _maps(lens, tuple(K.ravel().tolist()), width, height)
+    cv2 = opencv()
+    remap = partial(
+        cv2.remap,
+        map1=map_x,
+        map2=map_y,
+        interpolation=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    pixels, alpha = _filtered(remap, pixels, alpha)
+    if invalid is None:
+        return pixels, alpha, ~seen
+    touched = remap(invalid.astype(np.float32)) > 1 / 64
+    return pixels, alpha, touched | ~seen
+
+
+def undistorted_view(view: View, photo: Photo) -> View:
+    """The view of a loaded photograph: its K and size, and no lens."""
+    height, width = photo.pixels.shape[:2]
+    return replace(view, K=photo.K, width=width, height=height, lens=None)
