@@ -9,7 +9,9 @@ from gsjax.errors import InputError
 from gsjax.scene.transforms import CameraEntry
 
 
-def transforms_json(entries: Sequence[CameraEntry]) -> str:
+def transforms_json(
+    entries: Sequence[CameraEntry], *, ply_file_path: str | None = None
+) -> str:
     """Text of a `transforms.json` with one frame per camera.
 
     What all cameras share (intrinsics, size, lens) stands at the top, the rest in the
@@ -17,6 +19,7 @@ def transforms_json(entries: Sequence[CameraEntry]) -> str:
 
     Args:
       entries: names and single (unbatched) cameras.
+      ply_file_path: name of a point cloud beside the file, as nerfstudio has it.
 
     Raises:
       InputError: if a camera is a batch.
@@ -29,6 +32,8 @@ def transforms_json(entries: Sequence[CameraEntry]) -> str:
         and all(frame[key] == value for frame in frames)
     }
     frames = [{k: v for k, v in f.items() if k not in shared} for f in frames]
+    if ply_file_path is not None:
+        shared["ply_file_path"] = ply_file_path
     return json.dumps({**shared, "frames": frames}, indent=1, allow_nan=False) + "\n"
 
 
