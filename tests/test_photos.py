@@ -1,0 +1,423 @@
+"""Photographs: pixels as stored, lenses undone, sizes, masks, and what is refused."""
+
+import contextlib
+import struct
+import time
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from captures import save_photo
+
+from gsjax.errors import InputError
+from gsjax.scene.image_header import MAX_PIXELS, check_image, image_size
+from gsjax.scene.photos import load_photo, load_photos, undistorted_view
+from gsjax.scene.types import Lens, View
+from gsjax.scene.undistort import distort
+
+RNG = np.random.default_rng(0)
+NOISE = RNG.integers(0, 256, (24, 32, 3)).astype(np.uint8)
+
+
+def view_of(path: Path, width=32, height=24, K=None, **more) -> View:
+    if K is None:
+        K = np.asarray([[40.0, 0, 15.5], [0, 42.0, 12.25], [0, 0, 1]])
+    return View(path.name, path, np.eye(4), K, width, height, **more)
+
+
+# --- pixels ---
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".bmp", ".webp", ".jpg"])
+def test_rgb_as_stored(tmp_path, suffix):
+    smooth = cv2.resize(NOISE[:4, :5], (32, 24), interpolation=cv2.INTER_CUBIC)
+    path = save_photo(tmp_path / f"a{suffix}", smooth)
+    assert image_size(path) == (32, 24)
+    photo = load_photo(view_of(path))
+    error = np.abs(photo.pixels.astype(int) - smooth).mean()
+    assert error <= (6 if suffix in (".jpg", ".webp") else 0)
+    assert photo.alpha is None
+    assert photo.valid is None
+    assert photo.pixels.flags.c_contiguous
+    np.testing.assert_array_equal(photo.K, view_of(path).K)
+
+
+def test_grey_and_16_bits(tmp_path):
+    photo = load_photo(view_of(save_photo(tmp_path / "a.png", NOISE[..., 0])))
+    np.testing.assert_array_equal(photo.pixels, np.repeat(NOISE[..., :1], 3, 2))
+    deep = np.linspace(0, 65535, 24 * 32 * 3).reshape(24, 32, 3).astype(np.uint16)
+    photo = load_photo(view_of(save_photo(tmp_path / "b.png", deep)))
+    wanted = np.rint(deep / 65535 * 255).astype(np.uint8)
+    np.testing.assert_array_equal(photo.pixels, wanted)
+    assert photo.pixels.dtype == np.uint8
+
+
+def test_alpha_is_kept(tmp_path):
+    rgba = np.dstack([NOISE, NOISE[..., 1]])
+    photo = load_photo(view_of(save_photo(tmp_path / "a.png", rgba)))
+    np.testing.assert_array_equal(photo.pixels, NOISE)
+    np.testing.assert_array_equal(photo.alpha, NOISE[..., 1])
+
+
+def with_orientation(jpeg: bytes, orientation: int) -> bytes:
+    tiff = b"II*\0" + struct.pack("<IHHHII", 8, 1, 0x112, 3, 1, orientation)
+    exif = b"Exif\0\0" + tiff + bytes(4)
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
+
+
+def test_orientation_is_ignored(tmp_path):
+    path = save_photo(tmp_path / "a.jpg")
+    plain = load_photo(view_of(path)).pixels
+    path.write_bytes(with_orientation(path.read_bytes(), 6))
+    assert cv2.imread(str(path)).shape == (32, 24, 3)  # which is what must not happen
+    np.testing.assert_array_equal(load_photo(view_of(path)).pixels, plain)
+    assert image_size(path) == (32, 24)
+
+
+# --- sizes ---
+
+
+def test_intrinsics_follow_the_file(tmp_path):
+    path = save_photo(tmp_path / "a.png", NOISE)
+    K = np.asarray([[160.0, 0, 62], [0, 168.0, 49], [0, 0, 1]])
+    photo = load_photo(view_of(path, 128, 97, K))  # images_4: 97 / 4 = 24.25
+    wanted = K * [[32 / 128], [24 / 97], [1]]
+    np.testing.assert_allclose(photo.K, wanted, rtol=1e-15)
+
+
+def dot_image(u, v, width=120, height=90, sigma=2.0):
+    """A dot at (u, v), pixel centres at + 0.5."""
+    x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
+    column = np.exp(-((y - v) ** 2) / (2 * sigma**2))
+    row = np.exp(-((x - u) ** 2) / (2 * sigma**2))
+    return np.rint(255 * column[:, None] * row).astype(np.uint8)
+
+
+def centroid(image, u, v, reach=7):
+    """Of the dot near (u, v)."""
+    x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in image.shape[::-1]))
+    weight = image * (np.hypot(x - u, y - v) < reach).astype(float)
+    return (weight * x).sum() / weight.sum(), (weight * y).sum() / weight.sum()
+
+
+def peak(image, u, v, reach=7):
+    """Of the dot near (u, v): a parabola through its logarithm.
+
+    The lens maps a peak onto the peak, whereas it moves the centroid of what it bends.
+    """
+    x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in image.shape[::-1]))
+    near = np.hypot(x - u, y - v) < reach
+    near &= image > 0.6 * image[near].max()
+    x, y, weight = x[near] - u, y[near] - v, image[near]
+    terms = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], -1)
+    target = weight * np.log(weight)
+    a, b, c, d, e, _ = np.linalg.lstsq(terms * weight[:, None], target)[0]
+    return np.linalg.solve([[2 * a, b], [b, 2 * c]], [-d, -e]) + (u, v)
+
+
+@pytest.mark.parametrize("max_size", [119, 60, 47, 30])
+def test_downscaling_moves_nothing(tmp_path, max_size):
+    path = save_photo(tmp_path / "a.png", dot_image(71.3, 40.6, sigma=6))
+    photo = load_photo(view_of(path, 120, 90), max_size)
+    height, width = photo.pixels.shape[:2]
+    assert max(width, height) == max_size
+    assert abs(width / height - 120 / 90) < 0.05
+    sx, sy = width / 120, height / 90
+    np.testing.assert_allclose(photo.K, view_of(path).K * [[sx], [sy], [1]], rtol=1e-15)
+    found = centroid(photo.pixels[..., 0].astype(float), 71.3 * sx, 40.6 * sy, 99)
+    np.testing.assert_allclose(found, (71.3 * sx, 40.6 * sy), atol=0.02)
+
+
+def test_downscaling_averages(tmp_path):
+    path = save_photo(tmp_path / "a.png", NOISE)
+    photo = load_photo(view_of(path), 8)
+    mean = NOISE.reshape(6, 4, 8, 4, 3).mean((1, 3))
+    assert np.abs(photo.pixels - mean).max() <= 0.5 + 1e-6
+
+
+def test_transparent_colours_do_not_bleed(tmp_path):
+    rgba = np.zeros((24, 32, 4), np.uint8)
+    rgba[..., 0] = 255  # red and transparent
+    rgba[::2] = (0, 200, 0, 255)
+    path = save_photo(tmp_path / "a.png", rgba)
+    photo = load_photo(view_of(path), 16)
+    assert (photo.pixels == (0, 200, 0)).all()
+    assert set(np.unique(photo.alpha)) <= {127, 128}
+
+
+def test_max_size_is_checked(tmp_path):
+    path = save_photo(tmp_path / "a.png", NOISE)
+    assert load_photo(view_of(path), 1).pixels.shape == (1, 1, 3)
+    assert load_photo(view_of(path), 32).pixels.shape == (24, 32, 3)
+    with pytest.raises(InputError, match="max_size 0: at least 1"):
+        load_photo(view_of(path), 0)
+
+
+# --- lenses ---
+
+LENSES = {
+    "barrel": Lens("radial_tangential", (-0.12, 0.02, 0.003, -0.002)),
+    "pincushion": Lens("radial_tangential", (0.15, 0.05, -0.002, 0.004, 0.01)),
+    "rational": Lens(
+        "radial_tangential", (0.3, 0.1, 0.001, 0.002, 0.02, 0.35, 0.1, 0.01)
+    ),
+    "fisheye": Lens("fisheye", (0.05, -0.02, 0.01, -0.003)),
+    "equidistant": Lens("fisheye", (0.0, 0.0, 0.0, 0.0)),
+}
+WIDE = np.asarray([[110.0, 0, 118.5], [0, 115.0, 93.25], [0, 0, 1]])
+WIDE_SIZE = (240, 180)
+
+
+def through_lens(lens, x, y):
+    """OpenCV's projection of points (x, y, 1), pixel centres at + 0.5."""
+    points = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 1, 3)
+    zero, coefficients = np.zeros(3), np.asarray(lens.coefficients)
+    K = WIDE - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    if lens.kind == "fisheye":
+        found, _ = cv2.fisheye.projectPoints(points, zero, zero, K, coefficients)
+    else:
+        found, _ = cv2.projectPoints(points, zero, zero, K, coefficients)
+    return found.reshape(-1, 2) + 0.5
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_distortion_is_that_of_opencv(lens):
+    x, y = RNG.uniform(-0.9, 0.9, (2, 500))
+    ours = np.stack(distort(lens, x, y), -1) * (110, 115) + (118.5, 93.25)
+    np.testing.assert_allclose(ours, through_lens(lens, x, y), atol=1e-9)
+    centre = distort(lens, np.zeros(1), np.zeros(1))
+    np.testing.assert_array_equal(centre, np.zeros((2, 1)))
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_points_fall_where_a_pinhole_puts_them(tmp_path, lens, report):
+    wanted = np.stack(np.meshgrid([25.3, 80, 119, 171.7, 215], [20, 61.4, 155.2]), -1)
+    wanted = wanted.reshape(-1, 2)
+    x, y = ((wanted - WIDE[:2, 2]) / np.diag(WIDE)[:2]).T
+    seen = through_lens(lens, x, y)
+    inside = (seen > 8).all(1) & (seen < np.asarray(WIDE_SIZE) - 8).all(1)
+    assert inside.sum() >= 9
+    image = np.zeros(WIDE_SIZE[::-1], np.uint8)
+    for u, v in seen[inside]:
+        image = np.maximum(image, dot_image(u, v, *WIDE_SIZE))
+    path = save_photo(tmp_path / "a.png", image)
+    photo = load_photo(view_of(path, *WIDE_SIZE, WIDE, lens=lens))
+    np.testing.assert_array_equal(photo.K, WIDE)
+    found = [peak(photo.pixels[..., 0].astype(float), *p) for p in wanted[inside]]
+    error = np.hypot(*(np.asarray(found) - wanted[inside]).T).max()
+    moved = np.hypot(*(seen - wanted)[inside].T).max()
+    assert moved > 3
+    report("undistorted points, px", error, 0.1)
+    assert error <= 0.1
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_valid_is_what_the_lens_saw(tmp_path, lens):
+    path = save_photo(tmp_path / "a.png", np.full(WIDE_SIZE[::-1], 200, np.uint8))
+    photo = load_photo(view_of(path, *WIDE_SIZE, WIDE, lens=lens))
+    x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in WIDE_SIZE))
+    xn, yn = (x - WIDE[0, 2]) / 110, (y - WIDE[1, 2]) / 115
+    seen = through_lens(lens, xn.ravel(), yn.ravel())
+    margin = np.minimum(seen - 0.5, np.asarray(WIDE_SIZE) - 0.5 - seen).min(1)
+    margin = margin.reshape(x.shape)
+    valid = np.ones(x.shape, bool) if photo.valid is None else photo.valid
+    assert valid[margin > 0.05].all()
+    assert not valid[margin < -0.05].any()
+    assert (photo.pixels[valid] == 200).all()
+    assert valid.mean() > 0.5
+
+
+def test_past_the_fold_nothing_is_valid(tmp_path):
+    # r(1 − 0.5 r²) turns back at r = 0.816, where it reaches 0.544: all of the wider
+    # field would be shown again, mirrored.
+    lens = Lens("radial_tangential", (-0.5, 0.0, 0.0, 0.0))
+    path = save_photo(tmp_path / "a.png", np.full(WIDE_SIZE[::-1], 200, np.uint8))
+    photo = load_photo(view_of(path, *WIDE_SIZE, WIDE, lens=lens))
+    x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in WIDE_SIZE))
+    radius = np.hypot((x - WIDE[0, 2]) / 110, (y - WIDE[1, 2]) / 115)
+    assert photo.valid is not None
+    fold = np.sqrt(2 / 3)
+    assert photo.valid[radius < fold - 1e-3].all()
+    assert not photo.valid[radius > fold + 1e-3].any()
+
+
+def test_lens_of_a_smaller_copy(tmp_path):
+    lens = LENSES["barrel"]
+    path = save_photo(tmp_path / "a.png", np.full((90, 120), 200, np.uint8))
+    half = load_photo(view_of(path, *WIDE_SIZE, WIDE, lens=lens))
+    np.testing.assert_allclose(half.K, WIDE * [[0.5], [0.5], [1]])
+    K, small = WIDE * [[0.5], [0.5], [1]], view_of(path, 120, 90, lens=lens)
+    same = load_photo(View(small.name, path, np.eye(4), K, 120, 90, lens))
+    np.testing.assert_array_equal(half.pixels, same.pixels)
+
+
+def test_undistorted_view(tmp_path):
+    path = save_photo(tmp_path / "a.png", np.full(WIDE_SIZE[::-1], 200, np.uint8))
+    view = view_of(path, *WIDE_SIZE, WIDE, lens=LENSES["fisheye"])
+    photo = load_photo(view, 60)
+    ideal = undistorted_view(view, photo)
+    assert (ideal.width, ideal.height, ideal.lens) == (60, 45, None)
+    np.testing.assert_array_equal(ideal.K, photo.K)
+
+
+@pytest.mark.parametrize("lens", [Lens("fisheye", (0.1,)), Lens("mirror", (0.0,) * 4)])
+def test_unknown_lenses(tmp_path, lens):
+    path = save_photo(tmp_path / "a.png", NOISE)
+    with pytest.raises(InputError, match=r"lens '.*' with . coefficients; wanted"):
+        load_photo(view_of(path, lens=lens))
+
+
+# --- masks ---
+
+
+def test_masks(tmp_path):
+    path = save_photo(tmp_path / "a.png", NOISE)
+    mask = np.full((24, 32), 255, np.uint8)
+    mask[3, 7] = 0
+    mask[10:, 20:] = 0
+    mask[0, 0] = 1  # not 0, so not left out
+    view = view_of(path, mask=save_photo(tmp_path / "m.png", mask))
+    photo = load_photo(view)
+    np.testing.assert_array_equal(photo.valid, mask > 0)
+    np.testing.assert_array_equal(photo.pixels, NOISE)
+    # A pixel is valid if all that contribute to it are.
+    small = load_photo(view, 8).valid
+    np.testing.assert_array_equal(small, (mask > 0).reshape(6, 4, 8, 4).all((1, 3)))
+    # Masks of another size: nearest.
+    twice = save_photo(tmp_path / "m2.png", np.kron(mask, np.ones((2, 2), np.uint8)))
+    photo = load_photo(view_of(path, mask=twice))
+    np.testing.assert_array_equal(photo.valid, mask > 0)
+    white = save_photo(tmp_path / "m3.png", np.full((24, 32), 255, np.uint8))
+    assert load_photo(view_of(path, mask=white)).valid is None
+
+
+def test_mask_through_a_lens(tmp_path):
+    lens = LENSES["pincushion"]
+    image = np.full(WIDE_SIZE[::-1], 200, np.uint8)
+    image[60:80, 150:170] = 0
+    path = save_photo(tmp_path / "a.png", image)
+    photo = load_photo(view_of(path, *WIDE_SIZE, WIDE, lens=lens, mask=path))
+    assert photo.valid is not None
+    assert (photo.pixels[photo.valid] == 200).all()  # nothing of the hole leaks
+    dark = (photo.pixels[..., 0] == 0).sum()
+    hidden = (~photo.valid & (photo.pixels[..., 0] < 200)).sum()
+    assert dark > 200
+    assert hidden < 2 * dark
+
+
+# --- many ---
+
+
+def test_many_in_order(tmp_path):
+    views = []
+    for index in range(12):
+        pixels = np.full((24, 32, 3), 20 * index, np.uint8)
+        views.append(view_of(save_photo(tmp_path / f"{index}.png", pixels)))
+    calls = []
+    photos = load_photos(views, 16, progress=lambda done, of: calls.append((done, of)))
+    assert [int(photo.pixels[0, 0, 0]) for photo in photos] == [*range(0, 240, 20)]
+    assert calls == [(n, 12) for n in range(1, 13)]
+    views[7].image.unlink()
+    with pytest.raises(InputError, match=r"7\.png: cannot be read: No such file"):
+        load_photos(views)
+    assert load_photos([]) == []
+
+
+# --- what is refused ---
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tiff", ".bmp"])
+def test_truncated(tmp_path, suffix):
+    path = save_photo(tmp_path / f"a{suffix}", NOISE)
+    data = path.read_bytes()
+    for length in [*range(0, len(data) - 1, 61), len(data) - 2]:
+        path.write_bytes(data[:length])
+        with pytest.raises(InputError, match=rf"a\{suffix}: "):
+            load_photo(view_of(path))
+
+
+def test_thumbnail_does_not_hide_truncation(tmp_path):
+    # An EXIF thumbnail is a JPEG of its own, with an end marker of its own.
+    path = save_photo(tmp_path / "a.jpg", NOISE)
+    data = path.read_bytes()
+    inner = b"\xff\xe1" + struct.pack(">H", len(data) + 2) + data
+    path.write_bytes(data[:2] + inner + data[2:])
+    assert load_photo(view_of(path)).pixels.shape == (24, 32, 3)
+    path.write_bytes(data[:2] + inner + data[2:-9])
+    with pytest.raises(InputError, match="no end-of-image marker"):
+        load_photo(view_of(path))
+
+
+def png_of(width, height, extra=b"", color=2) -> bytes:
+    def chunk(kind, body):
+        return (
+            struct.pack(">I", len(body))
+            + kind
+            + body
+            + struct.pack(">I", zlib.crc32(kind + body))
+        )
+
+    head = struct.pack(">IIBBBBB", width, height, 8, color, 0, 0, 0)
+    body = zlib.compress(bytes(1000)) + extra
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        [chunk(b"IHDR", head), chunk(b"IDAT", body), chunk(b"IEND", b"")]
+    )
+
+
+def test_bombs(tmp_path):
+    path = tmp_path / "a.png"
+    start = time.perf_counter()
+    path.write_bytes(png_of(60_000, 60_000))
+    with pytest.raises(InputError, match=rf"60000 × 60000 px; at most {MAX_PIXELS}"):
+        load_photo(view_of(path))
+    path.write_bytes(png_of(15_000, 15_000))
+    with pytest.raises(InputError, match="15000 × 15000 px cannot fit"):
+        load_photo(view_of(path))
+    path.write_bytes(png_of(0, 5))
+    with pytest.raises(InputError, match="0 × 5 px"):
+        load_photo(view_of(path))
+    assert time.perf_counter() - start < 0.5
+
+
+@pytest.mark.parametrize("data", [b"", b"GIF89a", b"hello", b"\x89PNG\r\n\x1a\n"])
+def test_no_images(tmp_path, data):
+    path = tmp_path / "a.png"
+    path.write_bytes(data)
+    for read in (image_size, lambda p: load_photo(view_of(p))):
+        with pytest.raises(InputError, match=r"a\.png: (the file is empty|starts|the)"):
+            read(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        image_size(tmp_path)
+
+
+def test_damaged_bytes_do_not_crash(tmp_path):
+    rng = np.random.default_rng(1)
+    for suffix in (".png", ".jpg", ".webp", ".tiff", ".bmp"):
+        good = save_photo(tmp_path / f"a{suffix}", NOISE).read_bytes()
+        for _ in range(60):
+            data = bytearray(good)
+            for at in rng.integers(0, min(len(data), 300), 3):
+                data[at] = rng.integers(256)
+            with contextlib.suppress(InputError):
+                assert min(check_image(tmp_path, bytes(data))) >= 1
+
+
+@pytest.mark.parametrize(
+    ("size", "wanted"),
+    [((24, 32), "camera is for 24 × 32; it was rotated"), ((64, 24), "same aspect")],
+)
+def test_other_aspect_ratios(tmp_path, size, wanted):
+    path = save_photo(tmp_path / "a.png", NOISE)
+    with pytest.raises(InputError, match=rf"a\.png: 32 × 24 px.*{wanted}"):
+        load_photo(view_of(path, *size))
+
+
+def test_float_images(tmp_path):
+    path = tmp_path / "a.tiff"
+    done, data = cv2.imencode(".tiff", np.zeros((24, 32, 3), np.float32))
+    assert done
+    path.write_bytes(data.tobytes())
+    with pytest.raises(InputError, match=r"a\.tiff: pixels of float32"):
+        load_photo(view_of(path))
