@@ -13,6 +13,7 @@ import numpy as np
 from gsjax import images
 from gsjax.console import note, progress
 from gsjax.io import save
+from gsjax.movies import encode_animation
 from gsjax.raster.render import render_exact
 from gsjax.raster.types import RasterConfig, Render
 from gsjax.scene.synthetic import SyntheticScene, torus_knot_scene
@@ -72,7 +73,8 @@ def run_demo(folder: Path, settings: DemoSettings, *, overwrite: bool) -> DemoFi
     # Near is bright, as pictures of depth mostly are; 0 stays "nothing".
     shown = np.where(depth.pixels > 0, 65536 - depth.pixels.astype(np.int32), 0)
     images.write_file(files.depth, images.encode_png(shown.astype(np.uint16)))
-    images.write_file(files.turntable, images.encode_webp(frames, _TURN_SECONDS))
+    fps = len(frames) / _TURN_SECONDS
+    images.write_file(files.turntable, encode_animation(".webp", frames, fps))
     return files
 
 

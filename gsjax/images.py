@@ -1,4 +1,4 @@
-"""Images to files: what a render returns, as PNG, .npy and animation.
+"""Images to files: what a render returns, as PNG and .npy.
 
 OpenCV encodes and is loaded when first needed. Files are written beside their name
 and then renamed: they appear complete or not at all.
@@ -80,25 +80,6 @@ def encode_npy(image: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, np.asarray(image, np.float32), allow_pickle=False)
     return buffer.getvalue()
-
-
-def encode_webp(frames: Iterable[np.ndarray], seconds: float) -> bytes:
-    """Animated WebP of [H, W, 3] RGB uint8 frames that loops for ever.
-
-    Args:
-      frames: the pictures, all of one size.
-      seconds: how long all of them take.
-    """
-    cv2 = opencv()
-    animation = cv2.Animation()
-    animation.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
-    count = len(animation.frames)
-    animation.durations = [round(1000 * seconds / count)] * count
-    quality = [cv2.IMWRITE_WEBP_QUALITY, 90]
-    done, data = cv2.imencodeanimation(".webp", animation, quality)
-    if not done:
-        raise InputError("OpenCV cannot encode the animation as WebP")
-    return data.tobytes()
 
 
 def refuse_existing(paths: Iterable[Path], overwrite: bool) -> None:
