@@ -18,7 +18,7 @@ FLOORS = {
     0: ("errors", "numerics", "rotations", "sh", "devices"),
     1: ("gaussians", "cameras", "distortion"),
     2: ("raster", "densify", "losses", "metrics", "optim"),
-    3: ("io", "scene", "images", "movies", "sheets"),
+    3: ("io", "scene", "images", "movies", "sheets", "curves"),
 }  # what is not named here is a program, floor 4
 
 

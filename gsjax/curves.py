@@ -1,0 +1,141 @@
+"""Curves of a training as a picture: a plain line plot, drawn by OpenCV."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from gsjax import images
+from gsjax.errors import InputError
+from gsjax.sheets import put_text, text_width
+
+_PAPER, _INK, _GRID = (255, 255, 255), (70, 74, 82), (228, 230, 234)
+_COLORS = ((38, 98, 186), (214, 92, 52), (44, 142, 92), (142, 82, 168), (176, 138, 28))
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 18, 34, 40
+_FINE = 4  # bits of a pixel's fraction that OpenCV takes
+
+
+class Series(NamedTuple):
+    """A line: ``y`` over ``x``, of one length; what is not finite is left out."""
+
+    label: str
+    x: Sequence[float] | np.ndarray
+    y: Sequence[float] | np.ndarray
+
+
+def curves_png(
+    path: Path, series: Sequence[Series], *, title: str = "", x_label: str = "step"
+) -> None:
+    """Write `curves` to a PNG, in place of what may be there.
+
+    Raises:
+      InputError: as `curves`, or if the file cannot be written.
+    """
+    pixels = curves(series, title=title, x_label=x_label)
+    images.write_file(path, images.encode_png(pixels))
+
+
+def curves(
+    series: Sequence[Series],
+    *,
+    title: str = "",
+    x_label: str = "step",
+    size: tuple[int, int] = (720, 420),
+) -> np.ndarray:
+    """A plot [H, W, 3] uint8 of all series in one frame, with a legend.
+
+    Args:
+      series: what to draw; nothing finite in any of them gives an empty frame.
+      title: above the frame.
+      x_label: below it.
+      size: (width, height) in px, at least 200 × 120.
+
+    Raises:
+      InputError: if ``x`` and ``y`` differ in length, or the size is too small.
+    """
+    cv2 = images.opencv()
+    width, height = size
+    if width < 200 or height < 120:
+        raise InputError(f"size {size}: a plot has at least 200 × 120 px")
+    lines = [_points(line) for line in series]
+    finite = np.concatenate(
+        [np.zeros((0, 2)), *(p[np.isfinite(p).all(axis=1)] for p in lines)]
+    )
+    least, most = np.transpose([_range(finite[:, 0], 0.0), _range(finite[:, 1], 0.06)])
+    low, high = np.asarray([(_LEFT, height - _BOTTOM), (width - _RIGHT, _TOP)])
+
+    def place(points) -> np.ndarray:
+        return low + (points - least) / (most - least) * (high - low)
+
+    plot = np.full((height, width, 3), _PAPER, np.uint8)
+    for tick in _ticks(least[1], most[1], (height - _TOP - _BOTTOM) // 45):
+        y, text = round(place((0, tick))[1]), _number(tick)
+        cv2.line(plot, (_LEFT, y), (width - _RIGHT, y), _GRID, 1)
+        put_text(plot, text, (_LEFT - 8 - text_width(text), y + 4), _INK)
+    for tick in _ticks(least[0], most[0], (width - _LEFT - _RIGHT) // 90):
+        x, text = round(place((tick, 0))[0]), _number(tick)
+        cv2.line(plot, (x, _TOP), (x, low[1]), _GRID, 1)
+        put_text(plot, text, (x - text_width(text) // 2, low[1] + 16), _INK)
+    frame = np.asarray([(_LEFT, _TOP), low, (width - _RIGHT, low[1])], np.int32)
+    cv2.polylines(plot, [frame], False, _INK, 1)
+    for index, points in enumerate(lines):
+        gaps = np.flatnonzero(~np.isfinite(points).all(axis=1))
+        for piece in np.split(points, gaps):
+            at = place(piece[np.isfinite(piece).all(axis=1)]) * 2**_FINE
+            if len(at):
+                at, color = np.rint(at).astype(np.int32), _COLORS[index % len(_COLORS)]
+                cv2.polylines(plot, [at], False, color, 2, cv2.LINE_AA, _FINE)
+    put_text(plot, title, (_LEFT, 21), _INK, 0.5)
+    middle = (_LEFT + width - _RIGHT - text_width(x_label)) // 2
+    put_text(plot, x_label, (middle, height - 8), _INK)
+    _legend(plot, [line.label for line in series])
+    return plot
+
+
+def _points(line: Series) -> np.ndarray:
+    x, y = np.asarray(line.x, float), np.asarray(line.y, float)
+    if x.ndim != 1 or x.shape != y.shape:
+        raise InputError(
+            f"{line.label}: x is {x.shape}, y is {y.shape}; one length is wanted"
+        )
+    return np.stack([x, y], axis=1)
+
+
+def _range(values: np.ndarray, margin: float) -> tuple[float, float]:
+    """Least and greatest, a margin beyond; never empty."""
+    if not len(values):
+        return 0.0, 1.0
+    low, high = float(values.min()), float(values.max())
+    spread = high - low
+    if spread <= 1e-9 * max(abs(low), abs(high), 1e-300):
+        return low - 0.5 * (abs(low) or 1), high + 0.5 * (abs(high) or 1)
+    return low - margin * spread, high + margin * spread
+
+
+def _ticks(low: float, high: float, most: int) -> np.ndarray:
+    """Multiples of 1, 2 or 5 · 10^k within the range, about ``most`` of them."""
+    least = (high - low) / max(most, 1)
+    power = 10 ** np.floor(np.log10(least))
+    step = power * next((m for m in (1, 2, 5) if m * power >= least), 10)
+    return step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
+
+
+def _number(value: float) -> str:
+    """Short: 1500 is 1.5k; the rounding of the ticks is not shown."""
+    for size, letter in ((1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:.4g}{letter}"
+    return f"{value + 0.0:.4g}" if abs(value) > 1e-12 else "0"
+
+
+def _legend(plot: np.ndarray, labels: list[str]) -> None:
+    """Names in the colours of their lines, at the right above the frame."""
+    cv2 = images.opencv()
+    right = plot.shape[1] - _RIGHT
+    for index in reversed(range(len(labels))):
+        right -= text_width(labels[index])
+        put_text(plot, labels[index], (right, 21), _INK)
+        color = _COLORS[index % len(_COLORS)]
+        cv2.line(plot, (right - 22, 17), (right - 6, 17), color, 2, cv2.LINE_AA)
+        right -= 36

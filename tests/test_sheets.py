@@ -1,0 +1,140 @@
+"""Sheets and curves: sizes, what the cells hold, and values that are not finite."""
+
+import cv2
+import numpy as np
+import pytest
+
+import gsjax
+from gsjax.curves import Series, curves, curves_png
+from gsjax.sheets import MAGNIFIED, SheetRow, comparison, depth_colors
+
+WIDTH = 64
+
+
+def row(width=WIDTH, height=48, depth=True, name="a.png", **changes):
+    rng = np.random.default_rng(0)
+    truth = rng.integers(40, 200, (height, width, 3), np.uint8)
+    render = np.clip(truth / 255 + 0.05, 0, 1)
+    y, x = np.mgrid[:height, :width]
+    fields = {
+        "name": name,
+        "truth": truth,
+        "render": render,
+        "depth": np.where(x > 8, 1.0 + y / height, 0) if depth else None,
+    }
+    return SheetRow(**{**fields, **changes})
+
+
+def cells(sheet, count):
+    """The pictures of a sheet of one row, without margin and caption."""
+    each = np.split(sheet, count, axis=1)
+    return [cell[3:51, 3 : 3 + WIDTH].astype(int) for cell in each]
+
+
+def test_the_cells_are_the_pictures():
+    one = row()
+    sheet = comparison([one], width=WIDTH)
+    assert sheet.dtype == np.uint8
+    truth, render, error, depth = cells(sheet, 4)
+    np.testing.assert_array_equal(truth, one.truth)
+    np.testing.assert_allclose(render, 255 * one.render, atol=0.51)
+    np.testing.assert_allclose(error, MAGNIFIED * 0.05 * 255, atol=1)
+    assert (depth[:, :9] == depth[0, 0]).all()  # nothing there
+    near, far = depth[1, 20], depth[-2, 20]
+    assert near[0] > near[2] + 60  # red
+    assert far[2] > far[0]  # blue
+    assert sheet[52:66].max() > 120  # captions
+
+
+def test_rows_of_several_sizes_and_without_depth():
+    rows = [row(), row(128, 40), row(33, 70, depth=False, name="Ünï" + 90 * "x")]
+    sheet = comparison(rows, width=100)
+    heights = [round(100 * h / w) + 26 for w, h in ((64, 48), (128, 40), (33, 70))]
+    assert sheet.shape == (sum(heights), 4 * 106, 3)
+    assert comparison([row(depth=False)], width=100).shape == (101, 3 * 106, 3)
+    assert comparison([row(1, 1)], width=1).shape == (27, 28, 3)
+
+
+def test_what_is_not_finite_is_magenta():
+    one = row()
+    one.render[5:9, 10:20] = np.nan
+    one.render[20, 30, 1] = np.inf
+    one.depth[3, 40] = np.nan
+    _, render, error, depth = cells(comparison([one], width=WIDTH), 4)
+    for cell in (render, error):
+        found = (cell == (255, 0, 255)).all(axis=-1)
+        assert found[5:9, 10:20].all()
+        assert found[20, 30]
+        assert found.sum() == 41
+    np.testing.assert_array_equal(depth[3, 40], depth[0, 0])
+    everything = row(render=np.full((48, 64, 3), np.nan))
+    assert comparison([everything], width=WIDTH).shape[1] == 4 * 70
+
+
+def test_equal_pictures_and_empty_depth():
+    one = row(depth=False)
+    same = one._replace(render=one.truth, depth=np.zeros((48, 64)))
+    _, _, error, depth = cells(comparison([same], width=WIDTH), 4)
+    assert not error.any()
+    assert (depth == depth[0, 0]).all()
+    flat, near, far = depth_colors(np.full((4, 5), 2.0))
+    assert (flat == flat[0, 0]).all()
+    assert near == far == 2
+
+
+def test_sheets_that_are_refused():
+    with pytest.raises(gsjax.InputError, match="at least one row"):
+        comparison([])
+    with pytest.raises(gsjax.InputError, match=r"a.png: .* the render \(9, 9, 3\)"):
+        comparison([row(render=np.zeros((9, 9, 3)))])
+    with pytest.raises(gsjax.InputError, match="the depth is"):
+        comparison([row()._replace(depth=np.zeros((9, 9)))])
+    with pytest.raises(gsjax.InputError, match=r"\[H, W, 3\] is wanted"):
+        comparison([row(truth=np.zeros((48, 64)))])
+
+
+def inked(plot):
+    """Where the frame of a plot has a colour, not grey."""
+    inside = plot[40:-46, 66:-20].astype(int)
+    return np.ptp(inside, axis=-1) > 60
+
+
+def test_a_curve_goes_where_its_values_are():
+    x = np.arange(100)
+    ink = inked(curves([Series("up", x, 3.0 * x)], size=(400, 300)))
+    rows, columns = np.nonzero(ink)
+    assert ink.sum() > 300
+    assert np.corrcoef(rows, columns)[0, 1] < -0.999  # rows run downward
+    holed = 3.0 * x
+    holed[40:60] = np.nan
+    gap = inked(curves([Series("up", x, holed)], size=(400, 300)))
+    middle = gap.shape[1] // 2
+    assert not gap[:, middle - 20 : middle + 20].any()
+    assert gap.sum() > 0.6 * ink.sum()
+
+
+@pytest.mark.parametrize(
+    "series",
+    [
+        [],
+        [Series("none", [], [])],
+        [Series("nan", [0, 1], [np.nan, np.inf])],
+        [Series("one", [5], [7])],
+        [Series("flat", [0, 1, 2], [0, 0, 0])],
+        [Series("huge", [0, 1e9], [-1e30, 1e30]), Series("tiny", [3, 3], [1e-30, 0])],
+        [Series(f"line {i}", range(9), np.arange(9) * i) for i in range(12)],
+    ],
+)
+def test_curves_of_anything_are_a_picture(series):
+    plot = curves(series, title="title ×", size=(300, 200))
+    assert plot.shape == (200, 300, 3)
+    assert (plot < 128).any()
+
+
+def test_curves_file_and_refusals(tmp_path):
+    curves_png(tmp_path / "a.png", [Series("a", [0, 1], [1, 2])], title="a")
+    assert cv2.imread(str(tmp_path / "a.png")).shape == (420, 720, 3)
+    with pytest.raises(gsjax.InputError, match=r"a: x is \(1,\), y is \(2,\)"):
+        curves([Series("a", [0], [1, 2])])
+    with pytest.raises(gsjax.InputError, match="at least 200"):
+        curves([], size=(100, 100))
