@@ -144,6 +144,7 @@ def test_transparent_colours_do_not_bleed(tmp_path):
     path = save_photo(tmp_path / "a.png", rgba)
     photo = load_photo(view_of(path), 16)
     assert (photo.pixels == (0, 200, 0)).all()
+    assert photo.alpha is not None
     assert set(np.unique(photo.alpha)) <= {127, 128}
 
 

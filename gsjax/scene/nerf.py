@@ -31,6 +31,7 @@ _PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 _FISHEYE = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
 # The order of nerfstudio's distortion_params, which a frame may have.
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_UNUSED = "unused"
 _SPLITS = {"transforms_train": "train", "transforms_test": "test"}
 
 
@@ -60,7 +61,7 @@ def load_nerf(
         splits = _splits(path, frames)
         scaled: list[tuple[int, float]] = []
         for index, (frame, name) in enumerate(zip(frames, names)):
-            if name not in files:
+            if name not in files or splits[index] == _UNUSED:
                 continue
             viewmat, scale = pose_of(frame)
             if scale != 1:
@@ -91,9 +92,11 @@ def _file_path(
 def _splits(path: Path, frames: list[Frame]) -> list[str | None]:
     """The split of each frame: by nerfstudio's lists of names, or by NeRF's files."""
     named: dict[str, str] = {}
-    # A test list wins over a validation list, and that over nothing.
-    for key, split in (("val", "test"), ("train", "train"), ("test", "test")):
-        names = frames[0].sources[1].get(f"{key}_filenames")
+    top = frames[0].sources[1]
+    # Validation views stand in for test views where there are none, else are unused.
+    val = _UNUSED if top.get("test_filenames") else "test"
+    for key, split in (("val", val), ("train", "train"), ("test", "test")):
+        names = top.get(f"{key}_filenames")
         if names is not None and not isinstance(names, list):
             raise InputError(f"{path}: {key}_filenames is {shown(names)}; a list")
         named |= {str(name): split for name in names or ()}

@@ -1,8 +1,8 @@
 """Scenes that lie far out, brought near the origin of coordinates and back.
 
-In float32, coordinates of size c carry an error of c·2⁻²⁴; with the scene's spread s
-as the unit, an image is off by some 1e-5·c/s px (measured: 1.2 px at c/s = 1e5). At
-c/s = 100 that is 1e-3 px, the bar of the projection: from there on an axis is shifted.
+In float32 a coordinate of size c is off by up to c·2⁻²⁴. Seen from as far as the
+scene is wide, s, at a focal length of 1000 px, that is 1000·2⁻²⁴·c/s px: 1e-3 px, the
+bar of the projection, at c/s = 16. From there on an axis is shifted.
 """
 
 from dataclasses import replace
@@ -11,14 +11,17 @@ import numpy as np
 
 from gsjax.scene.types import Scene
 
-_FAR = 100.0
+_FAR = 16.0
+# A heuristic for scenes without points: what cameras look at is farther from them
+# than they are from each other.
+_VIEW_SPREAD = 8.0
 
 
 def rebase(scene: Scene) -> Scene:
     """The same scene with an `origin`, where float32 would be too coarse without.
 
     Axis by axis, the origin is the median of the camera centres, rounded to few bits,
-    if that is more than 100 times the spread of cameras and points away from 0. By
+    if that is more than 16 times the spread of cameras and points away from 0. By
     Sterbenz' lemma subtracting it is then exact in float64 for everything within half
     its distance, so that adding it again restores the coordinates bit for bit.
     """
@@ -48,6 +51,8 @@ def far_origin(centres: np.ndarray, points: np.ndarray) -> np.ndarray:
     spread = _spread(centres, middle)
     if len(points):
         spread = max(spread, _spread(points, middle))
+    else:
+        spread *= _VIEW_SPREAD
     # One camera alone has no spread; 1 world unit is then as good a guess as any.
     spread = spread or 1.0
     # A multiple of a power of two near the spread: few significant bits.

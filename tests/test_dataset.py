@@ -1,0 +1,214 @@
+"""Datasets as a whole: what is taken for what, far scenes, and splits."""
+
+import json
+
+import numpy as np
+import pytest
+from captures import save_photo, scene_of_views, to_opengl
+
+from gsjax.errors import InputError
+from gsjax.scene.colmap import read_colmap
+from gsjax.scene.colmap_writer import write_colmap
+from gsjax.scene.dataset import load_dataset
+from gsjax.scene.rebase import far_origin
+from gsjax.scene.splits import split_views
+from gsjax.scene.types import View
+
+
+def colmap(folder, **more):
+    scene = scene_of_views(**more)
+    write_colmap(folder / "sparse/0", scene)
+    for view in scene.views:
+        save_photo(folder / "images" / view.name)
+    return scene
+
+
+def transforms(folder, scene=None, name="transforms.json"):
+    scene = scene_of_views() if scene is None else scene
+    frames = []
+    for view in scene.views:
+        path = save_photo(folder / "images" / view.name)
+        matrix = to_opengl(view.viewmat).tolist()
+        frames.append({"file_path": f"images/{path.name}", "transform_matrix": matrix})
+    (folder / name).write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+
+
+# --- what is taken for what ---
+
+
+def test_order_of_formats(tmp_path):
+    np.save(tmp_path / "poses_bounds.npy", np.zeros((0, 17)))
+    transforms(tmp_path, name="transforms_train.json")
+    assert load_dataset(tmp_path).views[0].split == "train"
+    transforms(tmp_path)
+    scene = load_dataset(str(tmp_path))
+    assert (scene.format, scene.views[0].split) == ("transforms", None)
+    colmap(tmp_path)
+    assert load_dataset(tmp_path).format == "colmap"
+    assert load_dataset(tmp_path / "transforms.json").format == "transforms"
+
+
+def test_nothing_known(tmp_path):
+    (tmp_path / "IMG_1.JPG").write_bytes(b"")
+    with pytest.raises(
+        InputError, match=r"IMG_1\.JPG\).*sparse/0 of COLMAP.*gsjax sfm"
+    ):
+        load_dataset(tmp_path)
+    with pytest.raises(InputError, match=r"none: does not exist"):
+        load_dataset(tmp_path / "none")
+    with pytest.raises(InputError, match=r"IMG_1\.JPG: pass the folder"):
+        load_dataset(tmp_path / "IMG_1.JPG")
+
+
+def test_one_view(tmp_path):
+    colmap(tmp_path, count=1, points=0)
+    scene = load_dataset(tmp_path)
+    assert len(scene.views) == 1
+    assert scene.points.shape == (0, 3)
+
+
+def test_names_are_sorted_and_unique(tmp_path):
+    made = scene_of_views()
+    names = ["b.png", "a.png", "B.png", "a/a.png", "a10.png"]
+    views = [View(**{**v.__dict__, "name": n}) for v, n in zip(made.views, names)]
+    scene = made.__class__(made.source, "made", tuple(views))
+    write_colmap(tmp_path / "sparse", scene)
+    for name in names:
+        save_photo(tmp_path / "images" / name)
+    found = [view.name for view in load_dataset(tmp_path).views]
+    assert found == sorted(names)
+    views[3] = View(**{**views[3].__dict__, "name": "b.png"})
+    scene = made.__class__(made.source, "made", tuple(views))
+    write_colmap(tmp_path / "sparse", scene, overwrite=True)
+    with pytest.raises(InputError, match=r"'b\.png' is listed more than once"):
+        load_dataset(tmp_path)
+
+
+# --- far scenes ---
+
+PLACES = [(500_123.4, 5_712_345.6, 118.2), (0, 0, -7e6), (1e7, 1e7, 1e7), (3e3, 0, 0)]
+
+
+@pytest.mark.parametrize("at", PLACES)
+def test_far_scenes_come_near_and_back(tmp_path, at):
+    made = colmap(tmp_path, at=np.asarray(at, np.float64), points=500)
+    scene = load_dataset(tmp_path)
+    shifted = scene.origin != 0
+    np.testing.assert_array_equal(shifted, np.asarray(at) != 0)
+    assert np.abs(scene.points[:, shifted]).max() < 10
+    # Bit for bit, also as they stand in the file.
+    np.testing.assert_array_equal(scene.points + scene.origin, made.points)
+    there = read_colmap(tmp_path / "sparse/0").points.xyz
+    np.testing.assert_array_equal(scene.points + scene.origin, there)
+    for view, wanted in zip(scene.views, made.views):
+        scale = np.abs(at).max()
+        np.testing.assert_allclose(
+            view.centre + scene.origin, wanted.centre, atol=1e-15 * scale
+        )
+        rotations = view.viewmat[:3, :3], wanted.viewmat[:3, :3]
+        np.testing.assert_allclose(*rotations, atol=1e-14)
+    # What a camera sees is the same, in float32 too.
+    view, wanted = scene.views[0], made.views[0]
+    seen = made.points @ wanted.viewmat[:3, :3].T + wanted.viewmat[:3, 3]
+    viewmat = view.viewmat.astype(np.float32)
+    points = scene.points.astype(np.float32)
+    found = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    np.testing.assert_allclose(found, seen, atol=1e-5)
+
+
+def test_written_again_a_far_scene_is_the_same(tmp_path):
+    made = colmap(tmp_path, at=np.asarray(PLACES[0]))
+    write_colmap(tmp_path / "again", load_dataset(tmp_path))
+    again = read_colmap(tmp_path / "again")
+    np.testing.assert_array_equal(again.points.xyz, made.points)
+
+
+def test_near_scenes_stay(tmp_path):
+    made = colmap(tmp_path, at=np.asarray([40.0, -30, 3]))
+    scene = load_dataset(tmp_path)
+    np.testing.assert_array_equal(scene.origin, 0)
+    np.testing.assert_array_equal(scene.points, made.points)
+
+
+def test_origins_are_round():
+    rng = np.random.default_rng(0)
+    for size in (1e-3, 1.0, 40.0):
+        centres = rng.normal(size=(9, 3)) * size + (1e6, -3e6, 0)
+        origin = far_origin(centres, np.zeros((0, 3)))
+        assert (origin[:2] != 0).all()
+        assert origin[2] == 0
+        assert np.abs(origin - np.median(centres, axis=0))[:2].max() < 16 * size
+        assert (np.float32(origin) == origin).all() or size < 0.1
+    np.testing.assert_array_equal(far_origin(np.zeros((1, 3)), np.zeros((0, 3))), 0)
+    np.testing.assert_array_equal(
+        far_origin(np.full((1, 3), 12.0), np.zeros((0, 3))), 0
+    )
+
+
+def test_far_outliers_do_not_matter():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(1000, 3))
+    points[::10] *= 1e9
+    centres = rng.normal(size=(9, 3))
+    np.testing.assert_array_equal(far_origin(centres, points), 0)
+    assert (far_origin(centres + 1e5, points + 1e5) != 0).all()
+
+
+# --- splits ---
+
+
+def views_of(names, splits=None):
+    made = scene_of_views(len(names))
+    splits = splits or [None] * len(names)
+    return [
+        View(**{**view.__dict__, "name": name, "split": split})
+        for view, name, split in zip(made.views, names, splits)
+    ]
+
+
+NAMES = [f"img_{n:02d}.jpg" for n in range(20)]
+
+
+def test_every_eighth():
+    train, test = split_views(views_of(NAMES))
+    assert test == [0, 8, 16]
+    assert train == [n for n in range(20) if n % 8]
+    assert split_views(views_of(NAMES), 0) == ([*range(20)], [])
+    # By the order of names, whatever that of the views is.
+    train, test = split_views(views_of(NAMES[::-1]))
+    assert test == [3, 11, 19]
+    assert split_views(views_of(NAMES[:1])) == ([0], [])
+    assert split_views(views_of(NAMES[:2])) == ([1], [0])
+
+
+def test_the_split_of_the_dataset_wins():
+    views = views_of(NAMES[:4], ["train", "test", "train", "test"])
+    assert split_views(views, every=2) == ([0, 2], [1, 3])
+    assert split_views(views, test_names=[NAMES[0]]) == ([1, 2, 3], [0])
+
+
+def test_names_win():
+    assert split_views(views_of(NAMES), test_names=NAMES[5:7])[1] == [5, 6]
+    views = views_of(["a/1.png", "a/2.png", "b/1.png", "1.png"])
+    assert split_views(views, test_names=["2.png"])[1] == [1]
+    assert split_views(views, test_names=["1.png", "b/1.png"])[1] == [2, 3]
+    with pytest.raises(InputError, match=r"'1\.png' may be any of a/1\.png, b/1\.png"):
+        split_views(views[:3], test_names=["1.png"])
+
+
+def test_unknown_names():
+    with pytest.raises(
+        InputError, match=r"called 'img_5.jpg'; near it are .*img_05\.jpg"
+    ):
+        split_views(views_of(NAMES), test_names=["img_5.jpg"])
+    with pytest.raises(
+        InputError, match=r"called 'xyz'; names are like \['img_00\.jpg'"
+    ):
+        split_views(views_of(NAMES), test_names=["xyz"])
+
+
+def test_bad_splits():
+    with pytest.raises(InputError, match=r"every -1"):
+        split_views(views_of(NAMES), every=-1)
+    with pytest.raises(InputError, match=r"all 20 views are test views"):
+        split_views(views_of(NAMES), every=1)

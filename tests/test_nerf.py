@@ -1,0 +1,323 @@
+"""`transforms.json` as datasets: three dialects, their lenses, splits and points."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from captures import SIZE, save_photo, scene_of_views, to_opengl
+
+from gsjax.errors import InputError
+from gsjax.io.point_cloud import read_point_cloud
+from gsjax.scene.dataset import load_dataset
+from gsjax.scene.photos import load_photo
+from gsjax.scene.types import Lens
+
+PIXELS = {"fl_x": 40.0, "fl_y": 42.0, "cx": 15.5, "cy": 12.25, "w": 32, "h": 24}
+
+
+def frames_of(scene, form="images/{}", **more):
+    """Frames that list the views, whose names are numbers here."""
+    return [
+        {
+            "file_path": form.format(index),
+            "transform_matrix": to_opengl(view.viewmat).tolist(),
+            **more,
+        }
+        for index, view in enumerate(scene.views)
+    ]
+
+
+def put(folder, frames, name="transforms.json", **content):
+    path = folder / name
+    path.write_text(json.dumps({**content, "frames": frames}))
+    return path
+
+
+def nerfstudio(folder, count=4, **content):
+    """A dataset as ns-process-data writes it, with photographs."""
+    scene = scene_of_views(count)
+    frames = content.pop("frames", frames_of(scene, "images/frame_{}.png"))
+    for frame in frames:
+        save_photo(folder / frame["file_path"])
+    put(folder, frames, **{**PIXELS, "camera_model": "OPENCV", **content})
+    return scene
+
+
+def cloud(path, points, colors, kind="uchar"):
+    """An ascii PLY of points, as nerfstudio's sparse_pc.ply."""
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
+    lines += [f"property float {name}" for name in "xyz"]
+    if colors is not None:
+        lines += [f"property {kind} {name}" for name in ("red", "green", "blue")]
+    lines.append("end_header")
+    for index, point in enumerate(points):
+        color = [] if colors is None else colors[index].tolist()
+        lines.append(" ".join(map(str, [*point.tolist(), *color])))
+    path.write_text("\n".join(lines) + "\n")
+
+
+# --- dialects ---
+
+
+def test_nerfstudio(tmp_path):
+    # applied_transform says what was done to poses and points; nothing is undone.
+    made = nerfstudio(
+        tmp_path,
+        k1=0.1, k2=-0.02, p1=0.001, p2=0.002,
+        applied_transform=[[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 5]],
+        ply_file_path="sparse_pc.ply",
+    )  # fmt: skip
+    cloud(tmp_path / "sparse_pc.ply", made.points, made.colors)
+    scene = load_dataset(tmp_path)
+    assert scene.format == "transforms"
+    assert [v.name for v in scene.views] == [f"images/frame_{n}.png" for n in range(4)]
+    for view, wanted in zip(scene.views, made.views):
+        np.testing.assert_allclose(view.viewmat, wanted.viewmat, atol=1e-14)
+        np.testing.assert_array_equal(
+            view.K, [[40, 0, 15.5], [0, 42, 12.25], [0, 0, 1]]
+        )
+        assert view.lens == Lens("radial_tangential", (0.1, -0.02, 0.001, 0.002, 0.0))
+        assert view.image.is_file()
+        assert view.split is None
+    np.testing.assert_allclose(scene.points, made.points, rtol=1e-6)
+    np.testing.assert_array_equal(scene.colors, made.colors)
+
+
+def test_instant_ngp(tmp_path):
+    scene = scene_of_views(3)
+    frames = frames_of(scene, "./images/{}.jpg", sharpness=30.5)
+    for index in range(3):
+        save_photo(tmp_path / f"images/{index}.jpg")
+    more = {"k1": 0.05, "k2": 0.01, "k3": 0, "k4": 0, "p1": 0, "p2": 0.0}
+    more |= {"camera_angle_x": 0.7, "camera_angle_y": 0.5, "is_fisheye": False}
+    put(tmp_path, frames, aabb_scale=16, scale=0.33, **PIXELS, **more)
+    views = load_dataset(tmp_path).views
+    assert [v.name for v in views] == ["images/0.jpg", "images/1.jpg", "images/2.jpg"]
+    assert views[0].lens == Lens("radial_tangential", (0.05, 0.01, 0.0, 0.0, 0.0))
+    assert views[0].K[0, 0] == 40
+
+
+@pytest.mark.parametrize(
+    "more", [{"is_fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}]
+)
+def test_fisheye(tmp_path, more):
+    nerfstudio(
+        tmp_path, k1=0.1, k2=0.2, k3=0.3, k4=0.4, **{"camera_model": None, **more}
+    )
+    view = load_dataset(tmp_path).views[0]
+    assert view.lens == Lens("fisheye", (0.1, 0.2, 0.3, 0.4))
+
+
+def synthetic(folder):
+    """NeRF's synthetic scenes: RGBA, no suffixes, no sizes, one list per split."""
+    rgba = np.zeros((SIZE[1], SIZE[0], 4), np.uint8)
+    rgba[5:9] = (10, 200, 30, 128)
+    for split, count in (("train", 3), ("test", 2), ("val", 1)):
+        frames = frames_of(scene_of_views(count), f"./{split}/r_{{}}", rotation=0.01)
+        for index in range(count):
+            save_photo(folder / split / f"r_{index}.png", rgba)
+            save_photo(folder / split / f"r_{index}_depth_0001.png")
+        put(folder, frames, f"transforms_{split}.json", camera_angle_x=0.69)
+
+
+def test_nerf_synthetic(tmp_path):
+    synthetic(tmp_path)
+    scene = load_dataset(tmp_path)
+    names = [(view.name, view.split) for view in scene.views]
+    assert names == [
+        ("test/r_0.png", "test"),
+        ("test/r_1.png", "test"),
+        ("train/r_0.png", "train"),
+        ("train/r_1.png", "train"),
+        ("train/r_2.png", "train"),
+    ]
+    view = scene.views[2]
+    assert (view.width, view.height) == SIZE
+    focal = 16 / math.tan(0.69 / 2)
+    wanted = [[focal, 0, 16], [0, focal, 12], [0, 0, 1]]
+    np.testing.assert_allclose(view.K, wanted, rtol=1e-15)
+    photo = load_photo(view)
+    assert photo.alpha is not None
+    assert (photo.alpha[5:9] == 128).all()
+    assert (photo.pixels[6, 3] == (10, 200, 30)).all()
+    assert photo.alpha[0, 0] == 0
+
+
+def test_a_list_by_itself(tmp_path):
+    synthetic(tmp_path)
+    [view] = load_dataset(tmp_path / "transforms_val.json").views
+    assert (view.name, view.split) == ("val/r_0.png", None)
+    views = load_dataset(tmp_path / "transforms_train.json").views
+    assert {view.split for view in views} == {"train"}
+
+
+# --- parts ---
+
+
+def test_intrinsics_of_frames(tmp_path):
+    made = scene_of_views(3)
+    frames = frames_of(made, "images/{}.png")
+    frames[1] |= {"fl_x": 99.0, "fl_y": 98.0, "w": 64, "h": 48, "cx": 30.0, "cy": 20.0}
+    frames[2] |= {"distortion_params": [0.1, 0.2, 0.3, 0, 0.01, 0.02]}
+    nerfstudio(tmp_path, frames=frames)
+    views = load_dataset(tmp_path).views
+    assert views[0].lens is None
+    assert (views[1].width, views[1].K[0, 0], views[1].K[1, 2]) == (64, 99, 20)
+    assert views[2].lens == Lens("radial_tangential", (0.1, 0.2, 0.01, 0.02, 0.3))
+
+
+def test_splits_by_name(tmp_path):
+    names = [f"images/frame_{n}.png" for n in range(4)]
+    nerfstudio(tmp_path, train_filenames=names[:2], val_filenames=names[2:])
+    splits = [view.split for view in load_dataset(tmp_path).views]
+    assert splits == ["train", "train", "test", "test"]
+    lists = {"train_filenames": names[:2], "val_filenames": names[2:3]}
+    nerfstudio(tmp_path, **lists, test_filenames=names[3:])
+    views = load_dataset(tmp_path).views
+    assert [view.name for view in views] == [names[0], names[1], names[3]]
+    assert [view.split for view in views] == ["train", "train", "test"]
+
+
+def test_masks_and_smaller_copies(tmp_path):
+    made = scene_of_views(2)
+    frames = frames_of(made, "images/{}.png")
+    frames[1]["mask_path"] = "masks/one.png"
+    save_photo(tmp_path / "masks/one.png")
+    nerfstudio(tmp_path, frames=frames)
+    views = load_dataset(tmp_path).views
+    assert [view.mask for view in views] == [None, tmp_path / "masks/one.png"]
+    with pytest.raises(InputError, match="2 of 2 photographs are missing"):
+        load_dataset(tmp_path, factor=2)
+    for index in range(2):
+        save_photo(tmp_path / f"images_2/{index}.png", np.zeros((12, 16, 3), np.uint8))
+    view = load_dataset(tmp_path, factor=2).views[0]
+    assert view.image == tmp_path / "images_2/0.png"
+    assert (view.width, load_photo(view).K[0, 0]) == (32, 20)
+    (tmp_path / "masks/one.png").unlink()
+    with pytest.raises(InputError, match=r"frames\[1\]: mask_path 'masks/one\.png'"):
+        load_dataset(tmp_path)
+
+
+def test_missing_photographs(tmp_path):
+    nerfstudio(tmp_path)
+    (tmp_path / "images/frame_2.png").unlink()
+    wanted = r"transforms\.json: 1 of 4 photographs .*: images/frame_2\.png"
+    with pytest.raises(InputError, match=wanted):
+        load_dataset(tmp_path)
+    with pytest.warns(UserWarning, match=wanted):
+        assert len(load_dataset(tmp_path, skip_missing=True).views) == 3
+
+
+def test_scaled_rotations_are_warned_of(tmp_path):
+    made = scene_of_views(2)
+    frames = frames_of(made, "images/{}.png")
+    matrix = to_opengl(made.views[0].viewmat)
+    matrix[:3, :3] *= 2
+    frames[0]["transform_matrix"] = matrix.tolist()
+    nerfstudio(tmp_path, frames=frames)
+    with pytest.warns(UserWarning, match=r"1 frames are scaled, the first: 0 \(× 2\)"):
+        scene = load_dataset(tmp_path)
+    wanted = made.views[0].viewmat
+    np.testing.assert_allclose(scene.views[0].viewmat, wanted, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("more", "wanted"),
+    [
+        ({"camera_model": "EQUIRECTANGULAR"}, "'EQUIRECTANGULAR' is not supported"),
+        ({"k1": 0.1, "k4": 0.1}, "k4 of a lens that is no fisheye"),
+        ({"k1": 0.1, "k6": 0.1}, "k6 of a lens that is no fisheye"),
+        ({"is_fisheye": True, "p1": 0.1}, "a fisheye has no p1, p2"),
+        ({"k1": "a"}, "k1 is 'a'; a number"),
+        ({"fl_x": 0}, "focal lengths 0, 42"),
+        ({"w": 0}, "image size w 0"),
+        ({"ply_file_path": 3}, "ply_file_path is 3; text"),
+        ({"ply_file_path": "../a.ply"}, "within the dataset's folder"),
+        ({"ply_file_path": "none.ply"}, r"none\.ply: cannot be read"),
+        ({"test_filenames": "a"}, "test_filenames is 'a'; a list"),
+    ],
+)
+def test_bad_files(tmp_path, more, wanted):
+    nerfstudio(tmp_path, **more)
+    with pytest.raises(InputError, match=wanted):
+        load_dataset(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("more", "wanted"),
+    [
+        ({"file_path": None}, r"frames\[1\]: file_path is missing"),
+        ({"file_path": 7}, r"frames\[1\]: file_path is 7; text"),
+        ({"file_path": "../images/0.png"}, r"frames\[1\]: the name '../images"),
+        ({"file_path": "/etc/passwd"}, r"frames\[1\]: the name '/etc/passwd'"),
+        ({"file_path": "images/0.png"}, "'images/0.png' is listed more than once"),
+        ({"mask_path": "../m.png"}, r"frames\[1\]: the name '../m.png'"),
+        ({"distortion_params": [1, 2]}, r"distortion_params is \[1, 2\]"),
+        ({"transform_matrix": [[1]]}, r"frames\[1\]: transform_matrix"),
+        ({"k1": math.nan}, "k1 is nan"),
+    ],
+)
+def test_bad_frames(tmp_path, more, wanted):
+    nerfstudio(tmp_path, frames=frames_of(scene_of_views(3), "images/{}.png"))
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    data["frames"][1] |= more
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=wanted):
+        load_dataset(tmp_path)
+
+
+def test_every_truncation(tmp_path):
+    nerfstudio(tmp_path, count=1)
+    path = tmp_path / "transforms.json"
+    data = path.read_bytes()
+    for length in range(len(data)):
+        path.write_bytes(data[:length])
+        with pytest.raises(InputError, match=r"transforms\.json: "):
+            load_dataset(tmp_path)
+
+
+# --- point clouds ---
+
+
+def test_point_clouds(tmp_path):
+    made = scene_of_views(points=9)
+    path = tmp_path / "a.ply"
+    cloud(path, made.points, made.colors / 255, "float")
+    points, colors = read_point_cloud(path)
+    np.testing.assert_allclose(points, made.points, rtol=1e-6)
+    np.testing.assert_array_equal(colors, made.colors)
+    cloud(path, made.points, None)
+    assert (read_point_cloud(path)[1] == 128).all()
+    cloud(path, made.points[:0], None)
+    assert read_point_cloud(path)[0].shape == (0, 3)
+    names = ["x", "y", "z", "nx", "red", "green", "blue", "alpha"]
+    kinds = ["f8", "f8", "f8", "f4", "u1", "u1", "u1", "u1"]
+    table = np.zeros(9, np.dtype(list(zip(names, kinds))))
+    for axis, name in enumerate("xyz"):
+        table[name] = made.points[:, axis]
+        table[names[4 + axis]] = made.colors[:, axis]
+    words = {"f8": "double", "f4": "float", "u1": "uchar"}
+    head = ["ply", "format binary_little_endian 1.0", "element vertex 9"]
+    head += [f"property {words[k]} {n}" for n, k in zip(names, kinds)] + ["end_header"]
+    data = "\n".join(head).encode() + b"\n" + table.tobytes()
+    path.write_bytes(data)
+    points, colors = read_point_cloud(path)
+    np.testing.assert_array_equal(points, made.points)
+    np.testing.assert_array_equal(colors, made.colors)
+    for length in range(0, len(data), 7):
+        path.write_bytes(data[:length])
+        with pytest.raises(InputError, match=r"a\.ply: "):
+            read_point_cloud(path)
+
+
+def test_bad_point_clouds(tmp_path):
+    path = tmp_path / "a.ply"
+    cloud(path, np.asarray([[0, 1, 2], [0, np.nan, 1]]), None)
+    with pytest.raises(InputError, match=r"1 of 2 points have .*the first: \[1\]"):
+        read_point_cloud(path)
+    path.write_text(path.read_text().replace("float y", "float why"))
+    with pytest.raises(InputError, match=r"has x, why, z; scalar x, y, z"):
+        read_point_cloud(path)
+    with pytest.raises(InputError, match="not a regular file"):
+        read_point_cloud(tmp_path)
