@@ -74,6 +74,7 @@ def render(
     if count == 1:
         squeezed = jax.tree.map(lambda a: a[0], (cameras, probe, abs_probe))
         projected, radii, visible = project_one(squeezed)
+        radii = radii[None]
     else:
         projected, radii, visible = lax.map(project_one, (cameras, probe, abs_probe))
         projected = _flatten_cameras(projected)
@@ -87,7 +88,7 @@ def render(
     images = _finish(sums, config, background, count, projected.colors.shape[0])
     if not camera.batched:
         images = {name: image[0] for name, image in images.items()}
-        radii = radii.reshape(gaussians.capacity)
+        radii = radii[0]
     return Render(
         rgb=images.get("rgb"),
         alpha=images.get("alpha"),
@@ -324,6 +325,13 @@ def _finish(
 _render_jit = jax.jit(render, static_argnames="config")
 
 
+@partial(jax.jit, static_argnames="config")
+def _demand_jit(gaussians: Gaussians, camera: Camera, config: RasterConfig):
+    """What `render` tells of its sizes; the rest is not in the compiled program."""
+    view = render(gaussians, camera, config)
+    return view.demand, view.overflowed
+
+
 def render_exact(
     gaussians: Gaussians,
     camera: Camera,
@@ -367,16 +375,16 @@ def exact_config(
     Raises:
       CapacityError: as `render_exact`.
     """
-    light = config.replace(outputs=("alpha",), absgrad=False)
+    light = config.replace(outputs=("alpha",), absgrad=False, rungs=1)
     while True:
-        result = _render_jit(gaussians, camera, light)
-        if not bool(result.overflowed):
-            fitted = _fit(result.demand, max_capacity)
+        demand, overflowed = _demand_jit(gaussians, camera, light)
+        if not bool(overflowed):
+            fitted = _fit(demand, max_capacity)
             return config.replace(
                 pair_capacity=fitted["pair_capacity"],
                 visible_capacity=min(fitted["visible_capacity"], gaussians.capacity),
             )
-        light = _regrow(light, result.demand, max_capacity)
+        light = _regrow(light, demand, max_capacity)
 
 
 def _fit(demand: Demand, max_capacity: int) -> dict[str, int]:

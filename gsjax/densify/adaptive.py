@@ -1,0 +1,174 @@
+"""Adaptive density control: clone, split, prune, reset (Kerbl et al. 2023, Sec. 5).
+
+Axis legend: N Gaussians (capacity), B cameras.
+
+Where the image wants to move a Gaussian, on average over the views that show it,
+there are too few of them: a small one is cloned, a large one split in two. What is
+nearly transparent or too large goes. If there are fewer free slots than candidates,
+those with the largest gradient get them, and the count wanted is reported.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from gsjax.densify.slots import assign, copy_into, where_slots
+from gsjax.densify.types import Densifier, Observation, SlotEdit
+from gsjax.gaussians import Gaussians
+from gsjax.numerics import exp_log_scale, logit
+from gsjax.rotations import quaternion_to_matrix
+
+Array = jax.Array
+
+
+@dataclass(frozen=True)
+class AdaptiveSettings:
+    """Steps are counted from 1; the defaults are those of the paper and its code.
+
+    Attributes:
+      start, stop, every: densify after every ``every``-th step in (start, stop].
+      threshold: of the mean gradient by the projected mean, in units of half the
+        image (normalised device coordinates); with ``absgrad`` 8e-4 is usual.
+      absgrad: use the sum over pixels of absolute gradients (Ye et al. 2024).
+      clone_below: largest scale, as a share of the extent, that is cloned; what is
+        larger is split.
+      shrink: what the scales of a split are divided by.
+      revised_opacity: give clones and splits 1 − √(1 − o) each (Rota Bulò et al.
+        2024), so that the pair is as opaque as the one was.
+      prune_opacity: below it a Gaussian goes.
+      prune_scale: above it, as a share of the extent, it goes, after the first reset.
+      prune_radius: above it, as a share of the longer side of the image, it goes,
+        after the first reset; None never.
+      reset_every: bring all opacities down to ``reset_opacity``, so that what is not
+        needed shows; 0 never.
+      max_gaussians: never more than that.
+    """
+
+    start: int = 500
+    stop: int = 15_000
+    every: int = 100
+    threshold: float = 2e-4
+    absgrad: bool = False
+    clone_below: float = 0.01
+    shrink: float = 1.6
+    revised_opacity: bool = False
+    prune_opacity: float = 0.005
+    prune_scale: float = 0.1
+    prune_radius: float | None = None
+    reset_every: int = 3000
+    reset_opacity: float = 0.01
+    max_gaussians: int = 5_000_000
+
+
+class AdaptiveStats(NamedTuple):
+    """Since the last edit.
+
+    Attributes:
+      gradient: [N] sum of the gradients' norms.
+      views: [N] in how many views the Gaussian was seen.
+      radius: [N] largest radius, as a share of the image's longer side.
+    """
+
+    gradient: Array
+    views: Array
+    radius: Array
+
+
+def adaptive(settings: AdaptiveSettings, extent: float) -> Densifier:
+    """The strategy for a scene of this extent (in its units)."""
+
+    def init(gaussians: Gaussians) -> AdaptiveStats:
+        zeros = jnp.zeros(gaussians.capacity, gaussians.params.means.dtype)
+        return AdaptiveStats(zeros, zeros, zeros)
+
+    def observe(stats: AdaptiveStats, seen: Observation) -> AdaptiveStats:
+        half = jnp.asarray([seen.width / 2, seen.height / 2], seen.gradient.dtype)
+        norm = jnp.linalg.norm(seen.gradient * half, axis=-1)
+        visible = seen.radii > 0
+        share = jnp.max(seen.radii, 0) / max(seen.width, seen.height)
+        return AdaptiveStats(
+            gradient=stats.gradient + jnp.sum(jnp.where(visible, norm, 0), 0),
+            views=stats.views + jnp.sum(visible, 0),
+            radius=jnp.maximum(stats.radius, share),
+        )
+
+    def due(step: Array) -> Array:
+        inside = (step > settings.start) & (step <= settings.stop)
+        return inside & (step % settings.every == 0)
+
+    def plan(key: Array, step: Array, gaussians: Gaussians, stats: AdaptiveStats):
+        dense = _densified(settings, extent, key, step, gaussians, stats)
+        return _reset(settings, step, dense), init(gaussians)
+
+    return Densifier(init, observe, due, plan, absgrad=settings.absgrad)
+
+
+def _densified(
+    settings: AdaptiveSettings,
+    extent: float,
+    key: Array,
+    step: Array,
+    gaussians: Gaussians,
+    stats: AdaptiveStats,
+) -> SlotEdit:
+    params, active = gaussians.params, gaussians.active
+    scales = exp_log_scale(params.log_scales)
+    opacity = jax.nn.sigmoid(params.logit_opacities)
+    largest = jnp.max(scales, -1)
+
+    late = (settings.reset_every > 0) & (step > settings.reset_every)
+    too_big = largest > settings.prune_scale * extent
+    if settings.prune_radius is not None:
+        too_big |= stats.radius > settings.prune_radius
+    # Phrased positively: what is not a number goes too.
+    kept = active & (opacity >= settings.prune_opacity) & ~(late & too_big)
+
+    mean = stats.gradient / jnp.maximum(stats.views, 1)
+    hot = kept & (mean >= settings.threshold)
+    large = largest > settings.clone_below * extent
+    remaining = jnp.sum(kept, dtype=jnp.int32)
+    room = jnp.maximum(settings.max_gaussians - remaining, 0)
+    new = assign(hot, mean, ~kept, room)
+    split, cloned = new.chosen & large, new.chosen & ~large
+
+    noise = jax.random.normal(key, (2, *scales.shape), scales.dtype)
+    rotations = quaternion_to_matrix(params.quats)
+    shifts = jnp.einsum("nij,knj->kni", rotations, noise * scales, precision="highest")
+    smaller = params.log_scales - jnp.log(settings.shrink)
+    halves = logit(-jnp.expm1(0.5 * jnp.log1p(-opacity)))
+    revised = params.logit_opacities
+    if settings.revised_opacity:
+        revised = jnp.where(split | cloned, halves, revised)
+
+    def child(shift):
+        wide = split[:, None]
+        return params.replace(
+            means=jnp.where(wide, params.means + shift, params.means),
+            log_scales=jnp.where(wide, smaller, params.log_scales),
+            logit_opacities=revised,
+        )
+
+    in_place = where_slots(new.chosen, child(shifts[0]), params)
+    born = new.source < active.shape[0]
+    return SlotEdit(
+        params=copy_into(in_place, new.source, child(shifts[1])),
+        active=kept | born,
+        cleared=born | split | ~kept,
+        opacities_reset=jnp.asarray(False),
+        wanted=remaining
+        + jnp.minimum(jnp.sum(hot, dtype=jnp.int32), room.astype(jnp.int32)),
+    )
+
+
+def _reset(settings: AdaptiveSettings, step: Array, edit: SlotEdit) -> SlotEdit:
+    """With opacities brought down where it is time."""
+    if settings.reset_every <= 0:
+        return edit
+    now = step % settings.reset_every == 0
+    opacities = edit.params.logit_opacities
+    low = logit(jnp.asarray(settings.reset_opacity, opacities.dtype))
+    lowered = jnp.where(now, jnp.minimum(opacities, low), opacities)
+    params = edit.params.replace(logit_opacities=lowered)  # pyright: ignore
+    return edit._replace(params=params, opacities_reset=now)

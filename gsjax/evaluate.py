@@ -1,0 +1,119 @@
+"""How well a scene shows the views that it was not trained on.
+
+Axis legend: H W image.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.cameras import make_camera
+from gsjax.gaussians import Gaussians
+from gsjax.metrics import psnr, ssim
+from gsjax.raster.render import render_exact
+from gsjax.raster.types import RasterConfig
+from gsjax.scene.types import Photo, View
+
+LPIPS_NOTE = "unavailable: its weights are not part of gsjax"
+
+
+class ViewResult(NamedTuple):
+    """One view beside its photograph.
+
+    Attributes:
+      name: of the view.
+      psnr: dB, of the render clipped to [0, 1].
+      ssim: see `gsjax.metrics.ssim`.
+      truth, render: [H, W, 3] float32; where the photograph is transparent it is over
+        the background.
+      depth: [H, W] expected camera z, 0 where nothing is.
+      valid: [H, W] bool, or None where every pixel counts.
+    """
+
+    name: str
+    psnr: float
+    ssim: float
+    truth: np.ndarray
+    render: np.ndarray
+    depth: np.ndarray
+    valid: np.ndarray | None
+
+
+class Summary(NamedTuple):
+    """Means over the views; ``lpips`` says why there is none."""
+
+    views: int
+    psnr: float
+    ssim: float
+    lpips: str = LPIPS_NOTE
+
+
+_scores = jax.jit(lambda image, target, weight: (
+    psnr(image, target, weight), ssim(image, target, weight)
+))  # fmt: skip
+
+
+def evaluate(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    photos: Sequence[Photo],
+    *,
+    config: RasterConfig | None = None,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Iterator[ViewResult]:
+    """Render each view at its photograph's size and compare.
+
+    Args:
+      gaussians: the scene.
+      views, photos: as many of one as of the other.
+      config: how to render.
+      background: RGB behind the scene, and behind transparent photographs.
+
+    Yields:
+      One result for each view, as soon as it is there.
+    """
+    config = (config or RasterConfig()).replace(outputs=("rgb", "depth"))
+    behind = np.asarray(background, np.float32)
+    for view, photo in zip(views, photos, strict=True):
+        height, width = photo.pixels.shape[:2]
+        camera = make_camera(
+            viewmat=view.viewmat, K=photo.K, width=width, height=height
+        )
+        result = render_exact(gaussians, camera, config, jnp.asarray(behind))
+        assert result.rgb is not None
+        image = np.clip(np.asarray(result.rgb, np.float32), 0, 1)
+        truth = _over(photo, behind)
+        weight = None if photo.valid is None else photo.valid.astype(np.float32)
+        quality, likeness = _scores(image, truth, weight)
+        yield ViewResult(
+            name=view.name,
+            psnr=float(quality),
+            ssim=float(likeness),
+            truth=truth,
+            render=image,
+            depth=np.asarray(result.depth, np.float32),
+            valid=photo.valid,
+        )
+
+
+def _over(photo: Photo, background: np.ndarray) -> np.ndarray:
+    """The photograph in [0, 1], over the background where it is transparent."""
+    truth = photo.pixels.astype(np.float32) / 255
+    if photo.alpha is None:
+        return truth
+    alpha = photo.alpha[..., None].astype(np.float32) / 255
+    return truth * alpha + background * (1 - alpha)
+
+
+def summarise(results: Sequence[ViewResult]) -> Summary:
+    """Means; of no views NaN."""
+    count = len(results)
+    mean: Callable[[list[float]], float] = lambda v: float(np.mean(v)) if v else np.nan  # noqa: E731
+    return Summary(
+        views=count,
+        psnr=mean([r.psnr for r in results]),
+        ssim=mean([r.ssim for r in results]),
+    )

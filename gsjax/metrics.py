@@ -1,0 +1,102 @@
+"""How like two pictures are: PSNR and SSIM.
+
+Axis legend: H W image, C channels.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+Array = jax.Array
+
+_RADIUS, _SIGMA = 5, 1.5
+_C1, _C2 = 0.01**2, 0.03**2
+# Rows of the window's matrix taken at a time. Measured on two cores, 3 channels of
+# 400 × 267, value and gradient: 24 ms with 128 or 64, 31 ms with all at once, 104 ms
+# as eleven shifted sums, 370 ms as a convolution.
+_BLOCK = 128
+
+
+def psnr(image: Array, target: Array, weight: Array | None = None) -> Array:
+    """Peak signal-to-noise ratio in dB, for a peak of 1.
+
+    Args:
+      image, target: [H, W, C].
+      weight: [H, W] of each pixel, or None for all alike.
+
+    Returns:
+      [] −10 log10 of the mean squared error; infinite for equal pictures.
+    """
+    square = jnp.mean(jnp.square(image - target), -1)
+    return -10 * jnp.log10(weighted_mean(square, weight))
+
+
+def weighted_mean(values: Array, weight: Array | None) -> Array:
+    """Mean of [H, W] under weights [H, W]; 0 where all weights are."""
+    if weight is None:
+        return jnp.mean(values)
+    total = jnp.sum(weight)
+    return jnp.sum(values * weight) / jnp.where(total > 0, total, 1)
+
+
+def ssim(image: Array, target: Array, weight: Array | None = None) -> Array:
+    """Mean structural similarity (Wang et al. 2004), as Kerbl et al. 2023 take it.
+
+    Gaussian window of 11 px and σ = 1.5 px, zeros beyond the border, all pixels
+    counted. With a weight, both pictures are black where it is 0.
+
+    Args:
+      image, target: [H, W, C] in [0, 1].
+      weight: [H, W] of each pixel, or None for all alike.
+
+    Returns:
+      [] at most 1.
+    """
+    if weight is not None:
+        seen = (weight > 0)[..., None]
+        image, target = jnp.where(seen, image, 0), jnp.where(seen, target, 0)
+    return weighted_mean(jnp.mean(ssim_map(image, target), -1), weight)
+
+
+def ssim_map(image: Array, target: Array) -> Array:
+    """SSIM of every pixel and channel, [H, W, C]; see `ssim`."""
+    x, y = (jnp.moveaxis(a, -1, 0) for a in (image, target))
+    # Of what is given the derivative goes through three of the five means only.
+    of_x = _blur(jnp.stack([x, x * x, x * y]))
+    of_y = _blur(jnp.stack([y, y * y]))
+    (mean_x, square_x, product), (mean_y, square_y) = of_x, of_y
+    var_x, var_y = square_x - mean_x * mean_x, square_y - mean_y * mean_y
+    covar = product - mean_x * mean_y
+    score = ((2 * mean_x * mean_y + _C1) * (2 * covar + _C2)) / (
+        (mean_x * mean_x + mean_y * mean_y + _C1) * (var_x + var_y + _C2)
+    )
+    return jnp.moveaxis(score, 0, -1)
+
+
+def _blur(planes: Array) -> Array:
+    """The window's means of planes [..., H, W], zeros beyond the border."""
+    down = [
+        jnp.einsum("hk,...kw->...hw", rows, part, precision=lax.Precision.HIGHEST)
+        for rows, part in _bands(planes, -2)
+    ]
+    planes = jnp.concatenate(down, -2)
+    across = [
+        jnp.einsum("...k,wk->...w", part, rows, precision=lax.Precision.HIGHEST)
+        for rows, part in _bands(planes, -1)
+    ]
+    return jnp.concatenate(across, -1)
+
+
+def _bands(planes: Array, axis: int):
+    """(Rows of the banded window matrix, what they act on), block by block."""
+    size = planes.shape[axis]
+    for start in range(0, size, _BLOCK):
+        stop = min(start + _BLOCK, size)
+        low, high = max(0, start - _RADIUS), min(size, stop + _RADIUS)
+        distance = np.arange(start, stop)[:, None] - np.arange(low, high)
+        rows = np.exp(-0.5 * np.square(distance / _SIGMA))
+        whole = np.exp(-0.5 * np.square(np.arange(-_RADIUS, _RADIUS + 1) / _SIGMA))
+        rows = np.where(np.abs(distance) <= _RADIUS, rows / whole.sum(), 0)
+        part = lax.slice_in_dim(planes, low, high, axis=planes.ndim + axis)
+        yield jnp.asarray(rows, planes.dtype), part

@@ -1,0 +1,120 @@
+"""Gaussians to start from: at the points of a scene, or anywhere in view of it."""
+
+import numpy as np
+
+from gsjax.errors import InputError
+from gsjax.gaussians import Gaussians, make_gaussians
+from gsjax.scene.types import Scene
+from gsjax.sh import C0, num_bases
+
+
+def scene_extent(centres: np.ndarray) -> float:
+    """1.1 times the largest distance of a camera from their mean (Kerbl et al. 2023).
+
+    Args:
+      centres: [V, 3] where the cameras stand.
+
+    Returns:
+      The extent, above 0; 1 where all cameras stand in one place.
+    """
+    spread = np.linalg.norm(centres - centres.mean(0), axis=1).max()
+    return float(1.1 * spread) if spread > 0 else 1.0
+
+
+def init_gaussians(
+    scene: Scene,
+    *,
+    sh_degree: int = 3,
+    opacity: float = 0.1,
+    scale: float = 1.0,
+    max_count: int = 1_000_000,
+    random_count: int | None = None,
+    capacity: int | None = None,
+    seed: int = 0,
+) -> Gaussians:
+    """Isotropic Gaussians, as wide as their neighbours are far.
+
+    Args:
+      scene: its points are taken.
+      sh_degree: colours are of degree 0, the rest is zero.
+      opacity: of each.
+      scale: times the root mean square distance to the three nearest neighbours.
+      max_count: of more points than that, that many are drawn.
+      random_count: that many, drawn evenly from the ball of the scene's extent around
+        the point that the cameras look at, instead of its points.
+      capacity: number of slots; default the number of Gaussians.
+      seed: of what is drawn.
+
+    Raises:
+      InputError: if the scene has no points and ``random_count`` is None.
+    """
+    rng = np.random.default_rng(seed)
+    if random_count is not None:
+        points, colors = _random_points(scene, random_count, rng)
+    else:
+        points, colors = scene.points, scene.colors / 255.0
+        finite = np.isfinite(points).all(1)
+        points, colors = points[finite], colors[finite]
+        if len(points) == 0:
+            raise InputError(
+                f"{scene.source}: no points to start from; start from random ones "
+                "(--initial random)"
+            )
+    if len(points) > max_count:
+        chosen = np.sort(rng.choice(len(points), max_count, replace=False))
+        points, colors = points[chosen], colors[chosen]
+    count = len(points)
+    centres = np.stack([view.centre for view in scene.views])
+    spacing = scale * neighbour_distance(points, scene_extent(centres))
+    sh = np.zeros((count, num_bases(sh_degree), 3))
+    sh[:, 0] = (colors - 0.5) / C0
+    return make_gaussians(
+        means=points,
+        quats=np.tile([1.0, 0, 0, 0], (count, 1)),
+        log_scales=np.repeat(np.log(spacing)[:, None], 3, 1),
+        logit_opacities=np.full(count, np.log(opacity / (1 - opacity))),
+        sh=sh,
+        capacity=capacity,
+    )
+
+
+def neighbour_distance(points: np.ndarray, extent: float) -> np.ndarray:
+    """[M] root mean square distance to the three nearest other points.
+
+    At least 1e-7 and at most 0.1 of the extent: points in one place, and points far
+    from all others, would otherwise be nothing or everything.
+    """
+    from scipy.spatial import cKDTree
+
+    count = min(4, len(points))
+    if count < 2:
+        return np.full(len(points), 0.01 * extent)
+    distance, _ = cKDTree(points).query(points, k=count)
+    rms = np.sqrt(np.mean(np.square(distance[:, 1:]), 1))
+    return np.clip(rms, 1e-7 * extent, 0.1 * extent)
+
+
+def _random_points(scene: Scene, count: int, rng) -> tuple[np.ndarray, np.ndarray]:
+    centres = np.stack([view.centre for view in scene.views])
+    extent = scene_extent(centres)
+    middle = looked_at(scene)
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    radius = extent * rng.uniform(size=(count, 1)) ** (1 / 3)
+    return middle + radius * direction, rng.uniform(size=(count, 3))
+
+
+def looked_at(scene: Scene) -> np.ndarray:
+    """[3] the point nearest to all optical axes, in front of the cameras.
+
+    Least squares, drawn to the cameras' mean a little, so that parallel axes have an
+    answer: an extent in front of it.
+    """
+    centres = np.stack([view.centre for view in scene.views])
+    axes = np.stack([view.viewmat[2, :3] for view in scene.views])
+    ahead = centres.mean(0) + scene_extent(centres) * axes.mean(0)
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    weight = 1e-3
+    left = across.sum(0) + weight * len(axes) * np.eye(3)
+    right = np.einsum("vij,vj->i", across, centres) + weight * len(axes) * ahead
+    return np.linalg.solve(left, right)

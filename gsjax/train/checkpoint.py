@@ -1,0 +1,161 @@
+"""Checkpoints: the whole state of a run in one file, written at once or not at all.
+
+An .npz holds every array of the state under its path in the pytree, each with a
+checksum (that of the zip format), and a JSON text beside them. The two latest are
+kept, so that a file that was damaged later costs one interval, not the run.
+"""
+
+import io
+import json
+import re
+import warnings
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.errors import InputError
+from gsjax.images import make_folder, write_file
+from gsjax.train.step import TrainState
+
+_KEEP = 2
+_FORMAT = 1
+_META = "meta.json"
+
+
+class Checkpoint(NamedTuple):
+    """A file as read.
+
+    Attributes:
+      step: at which it was written.
+      arrays: by path in the state.
+      meta: what was saved with it: ``capacity``, ``pair_capacity``, …
+    """
+
+    step: int
+    arrays: dict[str, np.ndarray]
+    meta: dict[str, Any]
+
+
+def _named_leaves(state: TrainState) -> dict[str, Any]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
+    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
+
+
+def _is_key(leaf) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Path:
+    """Write the state; older files than the latest two are removed after that.
+
+    Args:
+      folder: created if missing.
+      state: of the run.
+      meta: JSON values to keep with it.
+
+    Raises:
+      InputError: if it cannot be written; the checkpoints that were there still are.
+    """
+    make_folder(folder)
+    leaves = _named_leaves(state)
+    arrays = {
+        name: np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+        for name, leaf in leaves.items()
+    }
+    step = int(state.step)
+    text = {**meta, "format": _FORMAT, "step": step}
+    text["capacity"] = state.gaussians.capacity
+    encoded = np.frombuffer(json.dumps(text).encode(), np.uint8)
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **{_META: encoded}, **arrays)
+    path = folder / f"step_{step:09d}.npz"
+    write_file(path, buffer.getvalue())
+    for old in _files(folder)[:-_KEEP]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def _files(folder: Path) -> list[Path]:
+    names = sorted(folder.glob("step_*.npz"))
+    return [path for path in names if re.fullmatch(r"step_\d{9}\.npz", path.name)]
+
+
+def load_latest(folder: Path) -> Checkpoint:
+    """The latest checkpoint that can be read; a warning names those that cannot.
+
+    Raises:
+      InputError: if there is none.
+    """
+    failed = []
+    for path in reversed(_files(folder)):
+        try:
+            found = load_checkpoint(path)
+        except InputError as error:
+            failed.append(str(error))
+            continue
+        for message in failed:
+            warnings.warn(f"{message}; going on from {path.name}", stacklevel=2)
+        return found
+    told = f" ({'; '.join(failed)})" if failed else ""
+    raise InputError(f"{folder}: no checkpoint to go on from{told}; train anew")
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """One file.
+
+    Raises:
+      InputError: if it is damaged, cut short or no checkpoint.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            declared = sum(entry.file_size for entry in archive.infolist())
+        if declared > 2 * path.stat().st_size + 4096:
+            raise ValueError(f"declares {declared} bytes, more than it can hold")
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+        meta = json.loads(arrays.pop(_META).tobytes())
+        if meta["format"] != _FORMAT:
+            raise ValueError(f"format {meta['format']}; {_FORMAT} is wanted")
+        return Checkpoint(int(meta["step"]), arrays, meta)
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zlib.error) as error:
+        raise InputError(f"{path}: no readable checkpoint: {error}") from error
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
+        raise InputError(f"{path}: damaged checkpoint: {error}") from error
+
+
+def restore(checkpoint: Checkpoint, template: TrainState) -> TrainState:
+    """The state of a checkpoint.
+
+    Args:
+      checkpoint: as read.
+      template: a state with the same settings and capacity.
+
+    Raises:
+      InputError: if the settings are others than those that it was written under.
+    """
+    leaves, structure = jax.tree_util.tree_flatten_with_path(template)
+    names = [jax.tree_util.keystr(path) for path, _ in leaves]
+    if set(names) != set(checkpoint.arrays):
+        differing = sorted(set(names) ^ set(checkpoint.arrays))[:3]
+        raise InputError(
+            f"the checkpoint of step {checkpoint.step} is of other settings: "
+            f"{differing} differ; pass those of the run, or train anew"
+        )
+    out = []
+    for name, (_, leaf) in zip(names, leaves):
+        array = checkpoint.arrays[name]
+        wanted = jax.random.key_data(leaf) if _is_key(leaf) else leaf
+        if array.shape != wanted.shape or array.dtype != wanted.dtype:
+            raise InputError(
+                f"the checkpoint of step {checkpoint.step} has {name} as {array.dtype} "
+                f"{array.shape}; {wanted.dtype} {wanted.shape} is wanted: its settings "
+                "are others"
+            )
+        value = jnp.asarray(array)
+        out.append(jax.random.wrap_key_data(value) if _is_key(leaf) else value)
+    return jax.tree_util.tree_unflatten(structure, out)

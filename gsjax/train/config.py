@@ -1,0 +1,198 @@
+"""Settings of a training run, and its presets."""
+
+import json
+from dataclasses import asdict, dataclass, field, fields, replace
+from itertools import pairwise
+from typing import Any
+
+from gsjax.densify.adaptive import AdaptiveSettings, adaptive
+from gsjax.densify.mcmc import McmcSettings, mcmc
+from gsjax.densify.types import Densifier
+from gsjax.errors import InputError
+from gsjax.optim import Rates
+from gsjax.raster.types import RasterConfig
+
+STRATEGIES = ("adaptive", "mcmc")
+BACKGROUNDS = ("black", "white", "random")
+
+
+@dataclass(frozen=True)
+class Level:
+    """From ``start``, a share of all steps, images are ``divisor`` times smaller."""
+
+    start: float
+    divisor: int
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """All that a run depends on besides its photographs; the defaults are the field's.
+
+    Attributes:
+      steps: how many, of ``batch`` views each.
+      seed: of all that is random.
+      strategy: "adaptive" or "mcmc", with the settings of that name.
+      max_size: px, longest side that photographs are scaled down to; None: as is.
+      levels: coarse to fine.
+      sh_degree: of the scene; bands join one by one, every ``sh_every`` steps.
+      ssim_weight: share of 1 − SSIM in the loss.
+      background: behind the scene while training; "random" is a new colour at each
+        step, so that nothing hides in it. Views and files have it black then.
+      initial: "points" of the dataset, or "random" where it has too few.
+      initial_count: how many random ones.
+      initial_opacity, initial_scale: the latter times the mean distance to the
+        three nearest neighbours.
+      max_initial: of more points than that, that many are drawn.
+      rates: of Adam.
+      refine_poses, refine_intrinsics: learn small corrections of the cameras.
+      exposure: learn an affine correction of the colours of each photograph.
+      pose_rate, intrinsics_rate, exposure_rate: of Adam, for those.
+      every_eval: evaluate the held-out views that often as well; 0 only at the end.
+      every_checkpoint: in steps; 0 only at the end.
+      raster: how to render; sizes in it are set by the run.
+    """
+
+    steps: int = 30_000
+    batch: int = 1
+    seed: int = 0
+    strategy: str = "adaptive"
+    adaptive: AdaptiveSettings = field(default_factory=AdaptiveSettings)
+    mcmc: McmcSettings = field(default_factory=McmcSettings)
+    max_size: int | None = 1600
+    levels: tuple[Level, ...] = (Level(0.0, 1),)
+    sh_degree: int = 3
+    sh_every: int = 1000
+    ssim_weight: float = 0.2
+    background: str = "black"
+    initial: str = "points"
+    initial_count: int = 100_000
+    initial_opacity: float = 0.1
+    initial_scale: float = 1.0
+    max_initial: int = 1_000_000
+    rates: Rates = field(default_factory=Rates)
+    refine_poses: bool = False
+    refine_intrinsics: bool = False
+    exposure: bool = False
+    pose_rate: float = 1e-5
+    intrinsics_rate: float = 1e-5
+    exposure_rate: float = 1e-3
+    every_eval: int = 0
+    every_checkpoint: int = 1000
+    raster: RasterConfig = field(default_factory=RasterConfig)
+
+    def __post_init__(self):
+        checks = {
+            "steps": self.steps >= 1,
+            "batch": self.batch >= 1,
+            "strategy": self.strategy in STRATEGIES,
+            "max_size": self.max_size is None or self.max_size >= 8,
+            "levels": bool(self.levels)
+            and self.levels[0].start == 0
+            and all(a.start < b.start for a, b in pairwise(self.levels))
+            and all(level.divisor >= 1 for level in self.levels),
+            "sh_degree": 0 <= self.sh_degree <= 4,
+            "sh_every": self.sh_every >= 1,
+            "ssim_weight": 0 <= self.ssim_weight <= 1,
+            "background": self.background in BACKGROUNDS,
+            "initial": self.initial in ("points", "random"),
+            "initial_count": self.initial_count >= 1,
+            "initial_opacity": 0 < self.initial_opacity < 1,
+            "initial_scale": self.initial_scale > 0,
+            "max_initial": self.max_initial >= 1,
+            "every_eval": self.every_eval >= 0,
+            "every_checkpoint": self.every_checkpoint >= 0,
+        }
+        for name, good in checks.items():
+            if not good:
+                raise InputError(
+                    f"TrainConfig.{name} = {getattr(self, name)!r} is out of range; "
+                    "see its documentation"
+                )
+
+    def replace(self, **changes) -> "TrainConfig":
+        """A copy with some settings changed."""
+        return replace(self, **changes)
+
+    def densifier(self, extent: float) -> Densifier:
+        """The strategy, for a scene of this extent."""
+        if self.strategy == "mcmc":
+            return mcmc(self.mcmc)
+        return adaptive(self.adaptive, extent)
+
+    @property
+    def max_gaussians(self) -> int:
+        """The most that the strategy may make."""
+        return getattr(self, self.strategy).max_gaussians
+
+    def divisor(self, step: int) -> int:
+        """How much smaller the images are at ``step`` (from 0)."""
+        share = step / self.steps
+        return next(lv.divisor for lv in reversed(self.levels) if share >= lv.start)
+
+
+def to_json(config: TrainConfig) -> str:
+    """As text, for `config.json`."""
+    return json.dumps(asdict(config), indent=2) + "\n"
+
+
+def from_json(text: str) -> TrainConfig:
+    """The settings in such a text.
+
+    Raises:
+      InputError: if it is not one, or of another version.
+    """
+    rooms: dict[str, Any] = {
+        "adaptive": AdaptiveSettings,
+        "mcmc": McmcSettings,
+        "raster": RasterConfig,
+        "rates": Rates,
+    }
+    try:
+        data = json.loads(text)
+        unknown = set(data) - {f.name for f in fields(TrainConfig)}
+        if unknown:
+            raise ValueError(f"unknown settings {sorted(unknown)}")
+        if "rates" in data:  # a NamedTuple: a list in JSON
+            rates = data["rates"]
+            data["rates"] = Rates(tuple(rates[0]), *rates[1:])
+        for name in ("adaptive", "mcmc"):
+            if name in data:
+                data[name] = rooms[name](**data[name])
+        if "raster" in data:
+            outputs = tuple(data["raster"].pop("outputs", ("rgb",)))
+            data["raster"] = RasterConfig(outputs=outputs, **data["raster"])
+        if "levels" in data:
+            data["levels"] = tuple(Level(**level) for level in data["levels"])
+        return TrainConfig(**data)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise InputError(
+            f"not the settings of a training run: {error}; train again, or use the "
+            "version of gsjax that wrote them"
+        ) from error
+
+
+def scaled(config: TrainConfig, steps: int) -> TrainConfig:
+    """The same run in another number of steps: its schedules keep their shares."""
+    ratio = steps / config.steps
+
+    def some(count: int, least: int = 1) -> int:
+        return max(least, round(count * ratio)) if count else count
+
+    old = config.adaptive
+    return config.replace(
+        steps=steps,
+        sh_every=some(config.sh_every),
+        adaptive=replace(
+            old,
+            start=some(old.start),
+            stop=some(old.stop),
+            every=some(old.every, 20),
+            reset_every=some(old.reset_every, 20),
+        ),
+        mcmc=replace(
+            config.mcmc,
+            start=some(config.mcmc.start),
+            stop=some(config.mcmc.stop),
+            every=some(config.mcmc.every, 20),
+        ),
+    )

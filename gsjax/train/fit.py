@@ -1,0 +1,303 @@
+"""The loop around the step: resolution, capacities, and what is compiled when.
+
+Runs on the host and in memory; files are the business of `gsjax.train.run`.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.errors import DivergedError, InputError
+from gsjax.gaussians import Gaussians, capacity_bucket, grow, make_gaussians
+from gsjax.raster.render import exact_config
+from gsjax.raster.types import RasterConfig
+from gsjax.scene.initialise import init_gaussians, scene_extent
+from gsjax.scene.types import Photo, Scene
+from gsjax.sh import num_bases
+from gsjax.train.config import TrainConfig
+from gsjax.train.frames import Frames, draw, make_frames
+from gsjax.train.step import Metrics, TrainState, init_state, make_train_step
+
+# Room beyond what is wanted now, so that it lasts for a while.
+_PAIR_MARGIN, _SLOT_MARGIN = 1.5, 1.3
+_MAX_BAD_STEPS = 50
+_MAX_PROBED_VIEWS = 6
+
+
+class Progress(NamedTuple):
+    """What the loop tells after each step.
+
+    Attributes:
+      metrics: of the step, on the host.
+      seconds: since the start of this call, compilation included.
+      compile_seconds: of those, spent compiling.
+      compilations: programs compiled so far.
+      divisor: how much smaller the images are.
+      capacity: slots.
+    """
+
+    metrics: Metrics
+    seconds: float
+    compile_seconds: float
+    compilations: int
+    divisor: int
+    capacity: int
+
+    def record(self) -> dict[str, float | int | bool]:
+        """As plain numbers, for a line of `metrics.jsonl`."""
+        out = {k: np.asarray(v).item() for k, v in self.metrics._asdict().items()}
+        rest = {k: v for k, v in self._asdict().items() if k != "metrics"}
+        rounded = {
+            k: round(v, 3) if isinstance(v, float) else v for k, v in rest.items()
+        }
+        return {**out, **rounded}
+
+
+@dataclass
+class Hooks:
+    """What a caller may want to know or do; each is called on the host.
+
+    Attributes:
+      step: after each step.
+      phase: before something that takes a while, with what it is.
+      checkpoint: every ``config.every_checkpoint`` steps: state, pair capacity, and
+        the record of that step.
+      stop: asked after each step; True ends the run there.
+    """
+
+    step: Callable[[Progress], None] = lambda _: None
+    phase: Callable[[str], None] = lambda _: None
+    checkpoint: Callable[[TrainState, int, Progress], None] = lambda *_: None
+    stop: Callable[[], bool] = lambda: False
+
+
+@dataclass
+class FitResult:
+    """What a run came to.
+
+    Attributes:
+      state: after the last step.
+      pair_capacity: what the last step used.
+      progress: of the last step, or None if there was none to do.
+    """
+
+    state: TrainState
+    pair_capacity: int
+    progress: Progress | None = None
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The scene."""
+        return self.state.gaussians
+
+
+def extent_of(scene: Scene) -> float:
+    """Of the scene's cameras; see `scene_extent`."""
+    return scene_extent(np.stack([view.centre for view in scene.views]))
+
+
+def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
+    """A run on this scene before its first step.
+
+    Raises:
+      InputError: if it has no points and the settings ask for them.
+    """
+    gaussians = init_gaussians(
+        scene,
+        sh_degree=config.sh_degree,
+        opacity=config.initial_opacity,
+        scale=config.initial_scale,
+        max_count=min(config.max_initial, config.max_gaussians),
+        random_count=config.initial_count if config.initial == "random" else None,
+        seed=config.seed,
+    )
+    wanted = min(config.max_gaussians, 4 * gaussians.capacity)
+    gaussians = grow(gaussians, max(gaussians.capacity, capacity_bucket(wanted)))
+    return init_state(gaussians, config, extent_of(scene), len(scene.views))
+
+
+def empty_state(
+    config: TrainConfig, extent: float, views: int, capacity: int
+) -> TrainState:
+    """The shapes of a run with this many slots, for reading a checkpoint into."""
+    numbers = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1}
+    gaussians = make_gaussians(
+        **{name: np.zeros((0, count)) for name, count in numbers.items()},
+        sh=np.zeros((0, num_bases(config.sh_degree), 3)),
+        capacity=capacity,
+    )
+    return init_state(gaussians, config, extent, views)
+
+
+def fit(
+    scene: Scene,
+    photos: Sequence[Photo],
+    config: TrainConfig,
+    *,
+    state: TrainState | None = None,
+    pair_capacity: int | None = None,
+    hooks: Hooks | None = None,
+) -> FitResult:
+    """Train.
+
+    The same arguments give the same bits on a CPU, also when a run is taken up again
+    from the state and pair capacity that a checkpoint kept.
+
+    Args:
+      scene: its views are trained on, all of them.
+      photos: one for each view, as `load_photo` gives them.
+      config: the settings.
+      state: go on from there; default `initial_state`.
+      pair_capacity: of that state's run.
+      hooks: see `Hooks`.
+
+    Raises:
+      InputError: if photos and views do not match, or there is nothing to start from.
+      CapacityError: if a view wants more pairs than can be addressed.
+      DivergedError: if loss or gradients stay not finite.
+    """
+    if len(photos) != len(scene.views) or not photos:
+        raise InputError(
+            f"{len(photos)} photos for {len(scene.views)} views; one for each is wanted"
+        )
+    hooks = hooks or Hooks()
+    state = initial_state(scene, config) if state is None else state
+    # The step takes the state's memory over: not the caller's, and none twice.
+    state = jax.tree.map(jnp.copy, state)
+    run = _Run(scene, photos, config, hooks)
+    return run.loop(state, pair_capacity)
+
+
+@dataclass
+class _Run:
+    """One call of `fit`."""
+
+    scene: Scene
+    photos: Sequence[Photo]
+    config: TrainConfig
+    hooks: Hooks
+    start: float = field(default_factory=time.perf_counter)
+    compile_seconds: float = 0.0
+    programs: dict[Any, Any] = field(default_factory=dict)
+
+    def loop(self, state: TrainState, pair_capacity: int | None) -> FitResult:
+        config, hooks = self.config, self.hooks
+        step, bad = int(state.step), 0
+        divisor = config.divisor(max(step - 1, 0))  # of the step before
+        frames, progress = None, None
+        while step < config.steps:
+            finer = config.divisor(step) != divisor
+            if frames is None or finer:
+                divisor = config.divisor(step)
+                frames = make_frames(self.scene.views, self.photos, divisor)
+            if pair_capacity is None or finer:
+                pair_capacity = self.pairs_wanted(state, frames)
+            raster = config.raster.replace(pair_capacity=pair_capacity)
+            program = self.program(state, frames, raster)
+            state, metrics = program(state, frames)
+            metrics = jax.device_get(metrics)
+            if metrics.overflowed:
+                pair_capacity = _roomy(int(metrics.pair_capacity), _PAIR_MARGIN)
+                continue
+            step = int(metrics.step)
+            progress = self.progress(metrics, divisor, state)
+            bad = 0 if metrics.finite else bad + 1
+            if bad >= _MAX_BAD_STEPS:
+                raise DivergedError(
+                    f"the loss or its gradient was not finite in {bad} steps running, "
+                    f"up to step {step}; lower the learning rates, or look for a "
+                    "photograph or a pose that is off"
+                )
+            hooks.step(progress)
+            state = self.with_room(state, metrics)
+            # The last is saved by the caller, with what belongs to the end.
+            every = config.every_checkpoint
+            if every and step % every == 0 and step < config.steps:
+                hooks.checkpoint(state, pair_capacity, progress)
+            if hooks.stop():
+                break
+        return FitResult(state, pair_capacity or 0, progress)
+
+    def progress(self, metrics: Metrics, divisor: int, state: TrainState) -> Progress:
+        return Progress(
+            metrics=metrics,
+            seconds=time.perf_counter() - self.start,
+            compile_seconds=self.compile_seconds,
+            compilations=len(self.programs),
+            divisor=divisor,
+            capacity=state.gaussians.capacity,
+        )
+
+    def pairs_wanted(self, state: TrainState, frames: Frames) -> int:
+        """Pair capacity for these images, with room to spare."""
+        begun = time.perf_counter()
+        few = np.linspace(0, frames.count - 1, min(frames.count, _MAX_PROBED_VIEWS))
+        config = self.config.raster
+        for index in np.unique(few.astype(int)):
+            camera = jax.tree.map(lambda a, i=index: a[i], frames.camera)
+            fitted = exact_config(state.gaussians, camera, config)
+            larger = max(config.pair_capacity or 1, fitted.pair_capacity or 1)
+            config = config.replace(pair_capacity=larger)
+        self.compile_seconds += time.perf_counter() - begun
+        return _roomy(self.config.batch * (config.pair_capacity or 1), _PAIR_MARGIN)
+
+    def program(self, state: TrainState, frames: Frames, raster: RasterConfig):
+        """The compiled step for these sizes."""
+        shapes = (frames.pixels.shape, state.gaussians.capacity, raster)
+        if shapes not in self.programs:
+            height, width = frames.pixels.shape[1:3]
+            self.hooks.phase(
+                f"compiling for {width} × {height} px, "
+                f"{state.gaussians.capacity:,} slots, {raster.pair_capacity:,} pairs"
+            )
+            begun = time.perf_counter()
+            train_step = make_train_step(self.config, extent_of(self.scene), raster)
+
+            def advance(state: TrainState, frames: Frames):
+                batch = draw(frames, state.key, state.step, self.config.batch)
+                return train_step(state, batch)
+
+            jitted = jax.jit(advance, donate_argnums=0)
+            self.programs[shapes] = jitted.lower(state, frames).compile()
+            self.compile_seconds += time.perf_counter() - begun
+        return self.programs[shapes]
+
+    def with_room(self, state: TrainState, metrics: Metrics) -> TrainState:
+        """``state``, with more slots if those it has will soon be too few."""
+        wanted, capacity = int(metrics.wanted), state.gaussians.capacity
+        if _SLOT_MARGIN * wanted <= capacity:
+            return state
+        most = capacity_bucket(self.config.max_gaussians)
+        larger = min(capacity_bucket(2 * wanted), most)
+        return grow_state(state, larger) if larger > capacity else state
+
+
+def _roomy(count: int, margin: float) -> int:
+    return capacity_bucket(min(int(margin * count), 2**30 - 1))
+
+
+def grow_state(state: TrainState, capacity: int) -> TrainState:
+    """The same run with more slots."""
+    extra = capacity - state.gaussians.capacity
+    slots = state.gaussians.capacity
+
+    def pad(array):
+        if array.ndim and array.shape[0] == slots:
+            return jnp.pad(array, [(0, extra)] + [(0, 0)] * (array.ndim - 1))
+        return array
+
+    return state.replace(  # pyright: ignore
+        gaussians=grow(state.gaussians, capacity),
+        moments=jax.tree.map(pad, state.moments),
+        stats=jax.tree.map(pad, state.stats),
+    )
+
+
+def subset(scene: Scene, indices: Sequence[int]) -> Scene:
+    """The scene with some of its views."""
+    return replace(scene, views=tuple(scene.views[i] for i in indices))

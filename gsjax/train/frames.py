@@ -1,0 +1,128 @@
+"""Photographs on the device, and which of them a step looks at.
+
+Axis legend: V views, H W image, B views of a step.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.cameras import Camera, make_camera
+from gsjax.images import opencv
+from gsjax.scene.types import Photo, View
+
+Array = jax.Array
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("pixels", "valid", "camera"),
+    meta_fields=(),
+)
+@dataclass(frozen=True)
+class Frames:
+    """All views of one resolution.
+
+    Attributes:
+      pixels: [V, H, W, 3 or 4] uint8; the fourth is the photograph's opacity.
+      valid: [V, H, W] bool, False where there is nothing to learn from; or None.
+      camera: batch of V.
+    """
+
+    pixels: Array
+    valid: Array | None
+    camera: Camera
+
+    @property
+    def count(self) -> int:
+        """V."""
+        return self.pixels.shape[0]
+
+
+class Batch(NamedTuple):
+    """What one step sees.
+
+    Attributes:
+      pixels: [B, H, W, 3 or 4] uint8.
+      valid: [B, H, W] bool or None.
+      camera: batch of B.
+      index: [B] int32, which of the V views these are.
+    """
+
+    pixels: Array
+    valid: Array | None
+    camera: Camera
+    index: Array
+
+
+def make_frames(
+    views: Sequence[View], photos: Sequence[Photo], divisor: int = 1
+) -> Frames:
+    """Photographs, ``divisor`` times smaller, in arrays of one size.
+
+    Smaller ones are padded on the right and below; those pixels are not valid.
+    """
+    small = [_shrunk(photo, divisor) for photo in photos]
+    height = max(p.pixels.shape[0] for p in small)
+    width = max(p.pixels.shape[1] for p in small)
+    with_alpha = any(p.alpha is not None for p in small)
+    pixels = np.zeros((len(small), height, width, 3 + with_alpha), np.uint8)
+    valid = np.zeros(pixels.shape[:3], bool)
+    for index, photo in enumerate(small):
+        h, w = photo.pixels.shape[:2]
+        pixels[index, :h, :w, :3] = photo.pixels
+        if with_alpha:
+            pixels[index, :h, :w, 3] = 255 if photo.alpha is None else photo.alpha
+        valid[index, :h, :w] = True if photo.valid is None else photo.valid
+    camera = make_camera(
+        viewmat=np.stack([view.viewmat for view in views]),
+        K=np.stack([photo.K for photo in small]),
+        width=width,
+        height=height,
+    )
+    return Frames(
+        jnp.asarray(pixels), None if valid.all() else jnp.asarray(valid), camera
+    )
+
+
+def _shrunk(photo: Photo, divisor: int) -> Photo:
+    if divisor == 1:
+        return photo
+    cv2 = opencv()
+    height, width = photo.pixels.shape[:2]
+    size = max(1, round(width / divisor)), max(1, round(height / divisor))
+
+    def area(image):
+        return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+    valid = photo.valid
+    if valid is not None:
+        valid = area(valid.astype(np.uint8) * 255) == 255
+    alpha = None if photo.alpha is None else area(photo.alpha)
+    scale = np.diag([size[0] / width, size[1] / height, 1.0])
+    return Photo(area(photo.pixels), alpha, valid, scale @ photo.K)
+
+
+def draw(frames: Frames, key: Array, step: Array, batch: int) -> Batch:
+    """The views of one step: each once an epoch, in an order of its own.
+
+    Depends on nothing but its arguments, so that a run that is resumed sees what it
+    would have seen.
+    """
+    count = frames.count
+    number = step * batch + jnp.arange(batch, dtype=jnp.int32)
+
+    def one(number):
+        order = jax.random.permutation(jax.random.fold_in(key, number // count), count)
+        return order[number % count]
+
+    index = jax.vmap(one)(number).astype(jnp.int32)
+    pixels, valid, camera = jax.tree.map(
+        lambda a: a[index], (frames.pixels, frames.valid, frames.camera)
+    )
+    return Batch(pixels, valid, camera, index)

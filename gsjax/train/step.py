@@ -1,0 +1,268 @@
+"""One step of training: a pure function (state, batch) → (state, metrics).
+
+Axis legend: N Gaussians (capacity), V views, B views of a step, H W image.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax
+
+from gsjax.densify.types import Observation, apply_edit
+from gsjax.gaussians import Gaussians, num_active
+from gsjax.losses import photometric
+from gsjax.metrics import psnr
+from gsjax.optim import adam_step, init_moments, means_rate
+from gsjax.raster.render import render
+from gsjax.raster.types import RasterConfig
+from gsjax.train.config import TrainConfig
+from gsjax.train.frames import Batch
+from gsjax.train.tuning import (
+    Tuning,
+    exposed,
+    init_tuning,
+    init_tuning_moments,
+    tuned_camera,
+    tuning_step,
+)
+
+Array = jax.Array
+
+
+@chex.dataclass(frozen=True, mappable_dataclass=False)
+class TrainState:
+    """All that a run goes on from; what it does next depends on nothing else.
+
+    Attributes:
+      step: [] int32, steps done.
+      key: random key of the run; steps derive theirs from it and never change it.
+      gaussians: the scene.
+      moments: Adam's, slot by slot.
+      stats: what the strategy has gathered.
+      tuning, tuning_moments: corrections of cameras and exposures.
+    """
+
+    step: Array
+    key: Array
+    gaussians: Gaussians
+    moments: optax.ScaleByAdamState
+    stats: Any
+    tuning: Tuning
+    tuning_moments: optax.ScaleByAdamState
+
+
+class Metrics(NamedTuple):
+    """What a step tells of itself; scalars.
+
+    Attributes:
+      step: steps done, including this one.
+      loss: what was minimised.
+      psnr: dB of the views of this step, before it.
+      gaussians: active ones, after it.
+      wanted: how many there would be with room for all; 0 where nothing was edited.
+      pairs, pair_capacity: (tile, Gaussian) pairs, and the capacity that they want.
+      overflowed: the pairs did not fit, and nothing was changed, nor counted as a
+        step: grow `RasterConfig.pair_capacity`, and go on.
+      finite: False if loss or gradients were not, and nothing but ``step`` changed.
+    """
+
+    step: Array
+    loss: Array
+    psnr: Array
+    gaussians: Array
+    wanted: Array
+    pairs: Array
+    pair_capacity: Array
+    overflowed: Array
+    finite: Array
+
+
+TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
+
+
+def init_state(
+    gaussians: Gaussians, config: TrainConfig, extent: float, views: int
+) -> TrainState:
+    """A run before its first step.
+
+    Args:
+      gaussians: as initialised; capacity as wanted.
+      config: the settings.
+      extent: of the scene, see `gsjax.scene.initialise.scene_extent`.
+      views: V.
+    """
+    tuning = init_tuning(config, views)
+    return TrainState(  # pyright: ignore
+        step=jnp.int32(0),
+        key=jax.random.key(config.seed),
+        gaussians=gaussians,
+        moments=init_moments(gaussians.params),
+        stats=config.densifier(extent).init(gaussians),
+        tuning=tuning,
+        tuning_moments=init_tuning_moments(tuning),
+    )
+
+
+def make_train_step(
+    config: TrainConfig, extent: float, raster: RasterConfig | None = None
+) -> TrainStep:
+    """The step of a run: to be jitted, scanned, or mapped over seeds by the caller.
+
+    Args:
+      config: the settings.
+      extent: of the scene, in its units.
+      raster: how to render, with a `pair_capacity` that fits; default
+        ``config.raster``.
+    """
+    densifier = config.densifier(extent)
+    raster = (raster or config.raster).replace(
+        outputs=("rgb",), absgrad=densifier.absgrad
+    )
+
+    def objective(params, tuning, probe, state, batch: Batch, background):
+        gaussians = state.gaussians.replace(params=params)
+        camera = tuned_camera(batch.camera, tuning, batch.index, extent)
+        name = "abs_probe" if densifier.absgrad else "probe"
+        view = render(gaussians, camera, raster, background, **{name: probe})
+        assert view.rgb is not None
+        image = exposed(view.rgb, tuning, batch.index)
+        target, weight = targets(batch, background, image.dtype)
+        loss = jax.vmap(
+            lambda i, t, w: photometric(i, t, w, config.ssim_weight),
+            in_axes=(0, 0, None if weight is None else 0),
+        )(image, target, weight)
+        total = jnp.mean(loss)
+        if densifier.penalty is not None:
+            total += densifier.penalty(gaussians)
+        quality = jnp.mean(
+            jax.vmap(psnr, in_axes=(0, 0, None if weight is None else 0))(
+                lax.stop_gradient(image), target, weight
+            )
+        )
+        return total, (quality, view.radii, view.demand, view.overflowed)
+
+    differentiate = jax.value_and_grad(objective, argnums=(0, 1, 2), has_aux=True)
+
+    def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
+        key = jax.random.fold_in(state.key, state.step)
+        by_background, by_noise, by_plan = jax.random.split(key, 3)
+        params = state.gaussians.params
+        dtype = params.means.dtype
+        background = background_of(config, by_background, dtype)
+        count = batch.index.shape[0]
+        probe = jnp.zeros((count, state.gaussians.capacity, 2), dtype)
+        (loss, (quality, radii, demand, overflowed)), grads = differentiate(
+            params, state.tuning, probe, state, batch, background
+        )
+        finite = jnp.isfinite(loss)
+        for leaf in jax.tree.leaves(grads):
+            finite &= jnp.all(jnp.isfinite(leaf))
+        observation = Observation(
+            # The loss is a mean over the views of the step.
+            grads[2] * count,
+            radii,
+            batch.camera.width,
+            batch.camera.height,
+        )
+
+        def keep():
+            return state, jnp.int32(0)
+
+        def skip():
+            return state.replace(step=state.step + 1), jnp.int32(0)  # pyright: ignore
+
+        def update():
+            moved = _optimise(state, grads, config, extent)
+            return _densify(moved, observation, (by_noise, by_plan), config, extent)
+
+        state, wanted = lax.cond(
+            overflowed, keep, lambda: lax.cond(finite, update, skip)
+        )
+        return state, Metrics(
+            step=state.step,
+            loss=loss,
+            psnr=quality,
+            gaussians=num_active(state.gaussians),
+            wanted=wanted,
+            pairs=demand.pairs,
+            pair_capacity=demand.capacity,
+            overflowed=overflowed,
+            finite=finite,
+        )
+
+    return train_step
+
+
+def background_of(config: TrainConfig, key: Array, dtype) -> Array:
+    """[3] colour behind the scene."""
+    if config.background == "random":
+        return jax.random.uniform(key, (3,), dtype)
+    return jnp.full(3, 1.0 if config.background == "white" else 0.0, dtype)
+
+
+def targets(batch: Batch, background: Array, dtype) -> tuple[Array, Array | None]:
+    """What to learn, [B, H, W, 3] in [0, 1], and the weights [B, H, W] or None."""
+    values = batch.pixels.astype(dtype) / 255
+    rgb = values[..., :3]
+    if values.shape[-1] == 4:
+        alpha = values[..., 3:]
+        rgb = rgb * alpha + background * (1 - alpha)
+    return rgb, None if batch.valid is None else batch.valid.astype(dtype)
+
+
+def _optimise(
+    state: TrainState, grads, config: TrainConfig, extent: float
+) -> TrainState:
+    """Parameters and corrections after one step of Adam."""
+    by_params, by_tuning, _ = grads
+    bases = by_params.sh.shape[-2]
+    degree = jnp.floor(jnp.sqrt(jnp.arange(bases, dtype=jnp.float32))).astype(jnp.int32)
+    learnt = degree <= state.step // config.sh_every
+    sh = jnp.where(learnt[:, None], by_params.sh, 0)
+    params, moments = adam_step(
+        state.gaussians.params,
+        by_params.replace(sh=sh),
+        state.moments,
+        config.rates,
+        state.step / config.steps,
+        extent,
+    )
+    tuning, tuning_moments = tuning_step(
+        state.tuning, by_tuning, state.tuning_moments, config
+    )
+    return state.replace(  # pyright: ignore
+        step=state.step + 1,
+        gaussians=state.gaussians.replace(params=params),  # pyright: ignore
+        moments=moments,
+        tuning=tuning,
+        tuning_moments=tuning_moments,
+    )
+
+
+def _densify(
+    state: TrainState, observation: Observation, keys, config: TrainConfig, extent
+) -> tuple[TrainState, Array]:
+    """What the strategy does after a step; also how many Gaussians it wanted."""
+    by_noise, by_plan = keys
+    densifier = config.densifier(extent)
+    gaussians = state.gaussians
+    if densifier.perturb is not None:
+        rate = means_rate(config.rates, state.step / config.steps, extent)
+        moved = densifier.perturb(by_noise, gaussians, rate)
+        gaussians = gaussians.replace(params=moved)  # pyright: ignore
+    stats = densifier.observe(state.stats, observation)
+
+    def edit():
+        plan, fresh = densifier.plan(by_plan, state.step, gaussians, stats)
+        return (*apply_edit(plan, state.moments), fresh, plan.wanted)
+
+    def leave():
+        return gaussians, state.moments, stats, jnp.int32(0)
+
+    gaussians, moments, stats, wanted = lax.cond(densifier.due(state.step), edit, leave)
+    state = state.replace(gaussians=gaussians, moments=moments, stats=stats)  # pyright: ignore
+    return state, wanted

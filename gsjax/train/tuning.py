@@ -1,0 +1,94 @@
+"""Small corrections of the cameras and of the exposures, learnt along with the scene.
+
+Axis legend: V views, B views of a step, H W image.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+
+from gsjax.cameras import Camera
+from gsjax.rotations import quaternion_to_matrix
+from gsjax.train.config import TrainConfig
+
+Array = jax.Array
+_ADAM = optax.scale_by_adam(eps=1e-15)
+
+
+@chex.dataclass(frozen=True, mappable_dataclass=False)
+class Tuning:
+    """Corrections; those that are not learnt are None, all others start at nothing.
+
+    Attributes:
+      turns: [V, 3] rotation of the camera, as half the vector part of a quaternion.
+      shifts: [V, 3] of the camera, in camera axes and in extents of the scene.
+      intrinsics: [4] logarithm of the factor on each focal length, and shift of the
+        principal point as a share of the image's size; one for all views.
+      exposures: [V, 3, 4] affine map of the colours, minus the identity.
+    """
+
+    turns: Array | None = None
+    shifts: Array | None = None
+    intrinsics: Array | None = None
+    exposures: Array | None = None
+
+
+def init_tuning(config: TrainConfig, views: int) -> Tuning:
+    """Nothing corrected yet; of the kinds that the settings ask for."""
+    poses = jnp.zeros((views, 3)) if config.refine_poses else None
+    return Tuning(  # pyright: ignore
+        turns=poses,
+        shifts=poses,
+        intrinsics=jnp.zeros(4) if config.refine_intrinsics else None,
+        exposures=jnp.zeros((views, 3, 4)) if config.exposure else None,
+    )
+
+
+def init_tuning_moments(tuning: Tuning) -> optax.ScaleByAdamState:
+    """Zero moments."""
+    return _ADAM.init(tuning)  # pyright: ignore
+
+
+def tuning_step(tuning: Tuning, grads: Tuning, moments, config: TrainConfig):
+    """One step of Adam; returns (tuning, moments)."""
+    updates, moments = _ADAM.update(grads, moments)  # pyright: ignore
+    rates = {
+        "turns": config.pose_rate,
+        "shifts": config.pose_rate,
+        "intrinsics": config.intrinsics_rate,
+        "exposures": config.exposure_rate,
+    }
+    moved = {
+        name: None if value is None else value - rates[name] * getattr(updates, name)
+        for name, value in vars(tuning).items()
+    }
+    return Tuning(**moved), moments
+
+
+def tuned_camera(camera: Camera, tuning: Tuning, index: Array, extent: float) -> Camera:
+    """The cameras of a batch, corrected; ``index`` [B] says which views they are."""
+    viewmat, K = camera.viewmat, camera.K
+    if tuning.turns is not None and tuning.shifts is not None:
+        turns = tuning.turns[index]
+        quats = jnp.concatenate([jnp.ones_like(turns[:, :1]), turns], -1)
+        rotation = quaternion_to_matrix(quats)
+        top = jnp.einsum("bij,bjk->bik", rotation, viewmat[:, :3], precision="highest")
+        top = top.at[:, :, 3].add(extent * tuning.shifts[index])
+        viewmat = jnp.concatenate([top, viewmat[:, 3:]], 1)
+    if tuning.intrinsics is not None:
+        factor = jnp.exp(tuning.intrinsics[:2])
+        size = jnp.asarray([camera.width, camera.height], K.dtype)
+        K = K.at[:, 0, 0].multiply(factor[0]).at[:, 1, 1].multiply(factor[1])
+        K = K.at[:, :2, 2].add(size * tuning.intrinsics[2:])
+    return Camera(viewmat, K, camera.near, camera.far, camera.width, camera.height,
+                  camera.model)  # fmt: skip
+
+
+def exposed(images: Array, tuning: Tuning, index: Array) -> Array:
+    """Renders [B, H, W, 3] as the photographs' exposures would show them."""
+    if tuning.exposures is None:
+        return images
+    affine = tuning.exposures[index]
+    colour = jnp.einsum("bij,bhwj->bhwi", affine[:, :, :3], images, precision="highest")
+    return images + colour + affine[:, None, None, :, 3]
