@@ -4,6 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from gsjax.cameras import look_at
 from gsjax.scene.types import Scene, View
@@ -44,3 +45,20 @@ def scene_of_views(count: int = 5, points: int = 40, seed: int = 0, at=(0, 0, 0)
 def to_opengl(viewmat: np.ndarray) -> np.ndarray:
     """Camera → world in OpenGL axes of an OpenCV world → camera matrix."""
     return np.linalg.inv(viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def synthetic_model(folder: Path) -> Path:
+    """A model by pycolmap in ``bin`` and ``txt``, with tracks and 2D points."""
+    # After cv2: loaded before, its zlib breaks the PNG encoder of OpenCV.
+    pycolmap = pytest.importorskip("pycolmap")
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig = 2, 2
+    options.num_frames_per_rig, options.num_points3D = 3, 15
+    options.num_points2D_without_point3D = 3
+    pycolmap.set_random_seed(1)
+    model = pycolmap.synthesize_dataset(options)
+    for form in ("bin", "txt"):
+        (folder / form).mkdir()
+    model.write_binary(folder / "bin")
+    model.write_text(folder / "txt")
+    return folder

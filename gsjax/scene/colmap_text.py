@@ -22,13 +22,13 @@ from gsjax.scene.colmap_model import (
 _UINT32, _UINT64 = (1 << 32) - 1, (1 << 64) - 1
 
 
-def _lines(path: Path) -> Iterator[tuple[str, str]]:
-    """(where, line) of all lines, comments and blank ones too, without their ends."""
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """(number, line) of all lines, comments and blank ones too, without their ends."""
     number = 0
     try:
         with path.open(encoding="utf-8") as file:
             for number, line in enumerate(file, 1):
-                yield f"{path}: line {number}", line.strip()
+                yield number, line.strip()
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read: {error.strerror or error}; check the path and "
@@ -73,9 +73,10 @@ def _words(where: str, line: str, least: int, wanted: str, split: int = -1):
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
     """Cameras of a cameras.txt, by id."""
     cameras: dict[int, ColmapCamera] = {}
-    for where, line in _lines(path):
+    for number, line in _lines(path):
         if not _is_record(line):
             continue
+        where = f"{path}: line {number}"
         words = _words(where, line, 4, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
         identity = _whole(where, "the camera id", words[0], _UINT32)
         kind = kind_of(where, words[1])
@@ -100,7 +101,8 @@ def read_images(path: Path) -> list[ColmapImage]:
     identities: set[int] = set()
     wanted = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
     declared, observations = None, False
-    for where, line in _lines(path):
+    for number, line in _lines(path):
+        where = f"{path}: line {number}"
         if observations:  # a line of its own after each image, which may be empty
             observations = False
             if len(line.split()) % 3:
@@ -129,36 +131,58 @@ def read_images(path: Path) -> list[ColmapImage]:
 
 def read_points(path: Path) -> ColmapPoints:
     """Points of a points3D.txt, sorted by id; of the tracks only the length."""
-    identities, values, lengths = [], [], []
+    identities, values, lengths, numbers = [], [], [], []
     declared = None
-    for where, line in _lines(path):
+    for number, line in _lines(path):
         if not _is_record(line):
             declared = _declared(line, "points", declared)
             continue
-        words = _words(where, line, 8, "POINT3D_ID X Y Z R G B ERROR TRACK")
-        if len(words) % 2:
-            raise InputError(
-                f"{where}: the track has {len(words) - 8} values; pairs of IMAGE_ID "
-                "POINT2D_IDX are wanted; the file is truncated or damaged"
-            )
-        identities.append(_whole(where, "the point id", words[0], _UINT64))
-        row = _floats(where, words[1:8])
-        if not all(0 <= value <= 255 and value % 1 == 0 for value in row[3:6]):
-            raise InputError(
-                f"{where}: colour {words[4:7]}; whole numbers from 0 to 255 are wanted"
-            )
+        words = line.split()
+        try:  # quick, as there may be millions; what is wrong is found out below
+            row = [float(word) for word in words[1:8]]
+            identity = int(words[0])
+        except ValueError:
+            row, identity = [], -1
+        if len(row) < 7 or len(words) % 2 or not 0 <= identity <= _UINT64:
+            raise _bad_point(f"{path}: line {number}", words)
+        identities.append(identity)
         values.append(row)
         lengths.append((len(words) - 8) // 2)
+        numbers.append(number)
     _compare(path, "points", len(values), declared)
     table = np.asarray(values, np.float64).reshape(-1, 7)
+    colors = table[:, 3:6]
+    bad = ~((colors >= 0) & (colors <= 255) & (colors == np.rint(colors))).all(axis=1)
+    if bad.any():
+        first = int(np.flatnonzero(bad)[0])
+        raise InputError(
+            f"{path}: line {numbers[first]}: colour {colors[first].tolist()}; whole "
+            "numbers from 0 to 255 are wanted"
+        )
     points = ColmapPoints(
         ids=np.asarray(identities, np.uint64),
         xyz=np.ascontiguousarray(table[:, :3]),
-        colors=table[:, 3:6].astype(np.uint8),
+        colors=colors.astype(np.uint8),
         errors=table[:, 6].copy(),
         track_lengths=np.asarray(lengths, np.int64),
     )
     return sorted_points(str(path), points)
+
+
+def _bad_point(where: str, words: list[str]) -> InputError:
+    """What is wrong with a line of points3D.txt."""
+    try:
+        if len(words) < 8:
+            wanted = "POINT3D_ID X Y Z R G B ERROR TRACK is wanted"
+            return InputError(f"{where}: found {len(words)} values, {wanted}")
+        _whole(where, "the point id", words[0], _UINT64)
+        _floats(where, words[1:8])
+    except InputError as error:
+        return error
+    return InputError(
+        f"{where}: the track has {len(words) - 8} values; pairs of IMAGE_ID "
+        "POINT2D_IDX are wanted; the file is truncated or damaged"
+    )
 
 
 def _declared(line: str, records: str, before: int | None) -> int | None:

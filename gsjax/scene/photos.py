@@ -49,6 +49,11 @@ def load_photo(view: View, max_size: int | None = None) -> Photo:
     K = _scaled(view.K, *_ratio(view, width, height))
     invalid = None if view.mask is None else _masked(view.mask, width, height)
     if view.lens is not None:
+        if max(width, height) > _MAX_REMAP:
+            raise InputError(
+                f"{view.image}: {width} × {height} px; at most {_MAX_REMAP} px a side "
+                "are undistorted: make it smaller"
+            )
         pixels, alpha, invalid = _undistorted(view.lens, K, pixels, alpha, invalid)
     if max_size is not None and max(width, height) > max_size:
         scale = max_size / max(width, height)
@@ -199,11 +204,6 @@ def _undistorted(
     invalid: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     height, width = pixels.shape[:2]
-    if max(width, height) > _MAX_REMAP:
-        raise InputError(
-            f"a photograph of {width} × {height} px; at most {_MAX_REMAP} px a side "
-            "are undistorted: make it smaller"
-        )
     with _maps_lock:  # one thread computes what the others then find
         map_x, map_y, seen = _maps(lens, tuple(K.ravel().tolist()), width, height)
     cv2 = opencv()
