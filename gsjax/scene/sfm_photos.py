@@ -1,0 +1,224 @@
+"""Photographs and masks as structure from motion wants them: upright, and not large.
+
+They are decoded by OpenCV, which turns them as EXIF says, scaled down, and written as
+PNG without EXIF: whatever reads those files sees the same pixels the same way up.
+"""
+
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from gsjax.errors import InputError
+from gsjax.images import encode_png, opencv, write_file
+from gsjax.scene.image_files import find_mask
+from gsjax.scene.sfm_colmap import Shot, exif_camera
+
+READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+_KEPT = (".jpg", ".jpeg", ".png")  # formats in which the dataset is written
+_UNREAD = (
+    *(".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"),
+    *(".orf", ".rw2", ".gif", ".jxl"),
+)
+
+
+class Photograph(NamedTuple):
+    """A photograph in the working folder.
+
+    Attributes:
+      name: what the dataset calls it; the working file has a number for a name.
+      shot: what COLMAP is told of it.
+      mask: whether it came with one.
+    """
+
+    name: str
+    shot: Shot
+    mask: bool = False
+
+
+class Workshop(NamedTuple):
+    """The working folder: ``photos/`` and, if there are any, ``masks/``."""
+
+    folder: Path
+
+    @property
+    def photos(self) -> Path:
+        return self.folder / "photos"
+
+    @property
+    def masks(self) -> Path:
+        return self.folder / "masks"
+
+    def mask(self, file: str) -> Path:
+        return self.masks / f"{file}.png"  # COLMAP's rule: a second suffix
+
+    def add(
+        self, number: int, name: str, pixels: np.ndarray, focal: float | None, key: str
+    ) -> Photograph:
+        """Write a photograph [H, W, 3] BGR, whose focal length is in its own px."""
+        file = f"{number:06d}.png"
+        write_file(self.photos / file, encode_png(pixels[..., ::-1]))
+        height, width = pixels.shape[:2]
+        return Photograph(name, Shot(file, width, height, focal, key))
+
+
+def find_photos(folder: Path) -> list[Path]:
+    """The photographs in a folder (not in folders within), sorted by name.
+
+    Raises:
+      InputError: if there are fewer than two, or any that cannot be read.
+    """
+    files = sorted(p for p in folder.iterdir() if p.is_file() and p.name[0] != ".")
+    unread = [p for p in files if p.suffix.lower() in _UNREAD]
+    if unread:
+        raise InputError(
+            f"{_some(unread)}: {unread[0].suffix} photos are not read here; convert "
+            "them to JPEG (keeping EXIF), or move them away"
+        )
+    found = [p for p in files if p.suffix.lower() in READ]
+    if len(found) < 2:
+        raise InputError(
+            f"{folder}: {len(found)} photos ({', '.join(READ)}) in it; at least two "
+            "are wanted, rather twenty (a video is given by its own name)"
+        )
+    names = [dataset_name(path) for path in found]
+    double = [p for p, name in zip(found, names) if names.count(name) > 1]
+    if double:
+        raise InputError(
+            f"{_some(double)}: would have the same name in the dataset; rename one"
+        )
+    return found
+
+
+def dataset_name(path: Path) -> str:
+    """What a photograph is called in the dataset: as it was, if JPEG or PNG."""
+    kept = path.suffix.lower() in _KEPT
+    return path.name if kept else path.with_suffix(".png").name
+
+
+def read_upright(path: Path, grey: bool = False) -> np.ndarray | None:
+    """[H, W, 3] BGR (or [H, W]) uint8, turned as EXIF says; None if unreadable."""
+    cv2 = opencv()
+    data = np.fromfile(path, np.uint8)
+    flag = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR
+    try:
+        with silent_libraries():
+            return cv2.imdecode(data, flag) if data.size else None
+    except cv2.error:
+        return None
+
+
+def prepare_photos(
+    paths: Sequence[Path], masks: Path | None, work: Workshop, max_size: int
+) -> list[Photograph]:
+    """Write the photographs, and their masks, into the working folder.
+
+    Args:
+      masks: folder of masks, or None.
+      max_size: the longer side in px is at most this; 0 for any size.
+
+    Raises:
+      InputError: naming all that are unreadable, or a mask that does not fit.
+    """
+    pairs = {} if masks is None else find_masks(masks, paths)
+    made, bad = [], []
+    for number, path in enumerate(paths):
+        pixels = read_upright(path)
+        if pixels is None:
+            bad.append(path)
+            continue
+        height, width = pixels.shape[:2]
+        camera, focal = exif_camera(path)
+        small = shrink(pixels, max_size)
+        if focal is not None:
+            focal *= max(small.shape) / max(height, width)
+        key = f"{camera} {width}x{height} {focal}"
+        photo = work.add(number, dataset_name(path), small, focal, key)
+        if masks is not None:
+            mask = _mask(pairs.get(path), path, (height, width), small.shape[:2])
+            write_file(work.mask(photo.shot.file), encode_png(mask))
+        made.append(photo._replace(mask=path in pairs))
+    if bad:
+        raise InputError(
+            f"{_some(bad)}: cannot be read as an image, being damaged or something "
+            "else; mend or remove"
+        )
+    return made
+
+
+def shrink(pixels: np.ndarray, max_size: int) -> np.ndarray:
+    """The image with its longer side at most ``max_size`` (0: as it is)."""
+    height, width = pixels.shape[:2]
+    scale = max_size / max(height, width) if max_size else 1.0
+    if scale >= 1:
+        return pixels
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    cv2 = opencv()
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+
+
+def find_masks(folder: Path, photos: Sequence[Path]) -> dict[Path, Path]:
+    """The mask of each photograph that has one, named as `find_mask` knows them.
+
+    Raises:
+      InputError: if the folder is missing or has no mask for any.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of masks")
+    found = {}
+    for photo in photos:
+        mask = find_mask(folder, photo.name)
+        if mask is not None and not mask.samefile(photo):
+            found[photo] = mask
+    if not found:
+        raise InputError(
+            f"{folder}: no mask for any photo; for {photos[0].name} one would be "
+            f"{photos[0].stem}.png or {photos[0].name}.png"
+        )
+    return found
+
+
+def _mask(
+    path: Path | None, photo: Path, full: tuple[int, int], size: tuple[int, ...]
+) -> np.ndarray:
+    """[h, w] of 0, to be left out, and 255: whatever is not black in the file."""
+    if path is None:
+        return np.full(size, 255, np.uint8)
+    mask = read_upright(path, grey=True)
+    if mask is None:
+        raise InputError(f"{path}: this mask cannot be read as an image")
+    if mask.shape != full and mask.shape != size:
+        raise InputError(
+            f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]}, {photo.name} seen "
+            f"upright is {full[1]}x{full[0]}; draw it in that size"
+        )
+    cv2 = opencv()
+    wanted = (size[1], size[0])
+    mask = cv2.resize(mask, wanted, interpolation=cv2.INTER_NEAREST)
+    return np.where(mask > 0, 255, 0).astype(np.uint8)
+
+
+def _some(paths: Sequence[Path]) -> str:
+    """The first, and the names of some others."""
+    others = [path.name for path in paths[1:6]]
+    dots = ["…"] if len(paths) > 6 else []
+    return ", ".join([str(paths[0]), *others, *dots])
+
+
+@contextmanager
+def silent_libraries() -> Iterator[None]:
+    """Within, what C libraries write on stderr is dropped: errors are told by us."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
