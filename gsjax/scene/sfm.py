@@ -188,12 +188,16 @@ def _collect(
         paths = find_photos(source)
         tell(f"reading {len(paths)} photos")
         found = prepare_photos(paths, settings.masks, work, size)
+        if settings.masks is not None:
+            tell(f"{sum(p.mask for p in found)} of {len(found)} photos have a mask")
     else:
         tell(f"choosing the sharpest {settings.frames} frames")
         found = []
         for number, pixels in sharpest_frames(source, settings.frames, size):
             name = f"frame_{number:06d}.jpg"
             found.append(work.add(number, name, pixels, None, "video"))
+        if len(found) < 2:
+            raise InputError(f"{source}: only {len(found)} frames of it can be read")
     return _with_cameras(found, settings.camera)
 
 

@@ -334,6 +334,7 @@ def _watched(work: Callable[[Any], Any], look: Callable[[], str], tell: Tell) ->
                     return running.result(timeout=_WAIT)
                 except TimeoutError:
                     tell(look())
-        except BaseException:
+        except KeyboardInterrupt:
             token.cancel()
+            tell("stopping when the images that are begun are done")
             raise

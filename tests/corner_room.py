@@ -1,0 +1,134 @@
+"""Photographs made by code, for structure from motion.
+
+They are of the corner of a room, three planes of random texture, by casting rays: the
+cameras' centres and focal length are known exactly.
+"""
+
+import struct
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsjax import look_at
+
+WIDTH, HEIGHT, FOCAL, COUNT = 320, 240, 297.0, 6
+NAMES = [f"photo {i}.jpg" for i in range(COUNT)]  # with a space
+TURNED = 2  # this one is stored turned, with an EXIF orientation
+
+
+def viewmat_at(turn: float) -> np.ndarray:
+    """A camera in the corner x, y, z > 0, on an arc around it; ``turn`` in 0 … 1."""
+    angle = 0.45 + 0.6 * turn
+    eye = np.array([3.2 * np.cos(angle), 1.5 + 0.5 * turn, 3.2 * np.sin(angle)])
+    return np.asarray(look_at(eye, (0.5, 0.6, 0.5)), np.float64)
+
+
+def corner_view(viewmat: np.ndarray, scale: float = 1.0) -> np.ndarray:
+    """[H, W, 3] uint8 of the room's corner: the nearest of three planes, by rays."""
+    width, height = round(WIDTH * scale), round(HEIGHT * scale)
+    y, x = np.mgrid[:height, :width] + 0.5
+    focal = FOCAL * scale
+    rays = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, x * 0 + 1], -1)
+    rays = rays @ viewmat[:3, :3]
+    eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    with np.errstate(divide="ignore"):
+        depths = np.where(rays < -1e-9, -eye / rays, np.inf)
+    plane = depths.argmin(-1)
+    points = eye + rays * depths.min(-1)[..., None]
+    picture = np.zeros((height, width, 3), np.uint8)
+    for axis in range(3):
+        a, b = (points[..., k].astype(np.float32) * 120 for k in range(3) if k != axis)
+        wrap = cv2.BORDER_WRAP
+        seen = cv2.remap(texture(axis), a, b, cv2.INTER_LINEAR, borderMode=wrap)
+        picture[plane == axis] = seen[plane == axis]
+    return picture
+
+
+@cache
+def texture(seed: int) -> np.ndarray:
+    """Blobs of several sizes, which is what SIFT looks for."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros((512, 512, 3))
+    for size in (64, 128, 256):
+        noise = rng.normal(0, 1, (size, size, 3)).astype(np.float32)
+        total += cv2.resize(noise, (512, 512), interpolation=cv2.INTER_CUBIC)
+    return np.clip(128 + 45 * total, 0, 255).astype(np.uint8)
+
+
+def exif(orientation: int, focal_35mm: int) -> bytes:
+    """EXIF with an orientation, a camera, and a focal length for 35 mm film."""
+
+    def ifd(entries, at):
+        head, tail = struct.pack("<H", len(entries)), b""
+        after = at + 2 + 12 * len(entries) + 4
+        for tag, kind, count, value in entries:
+            if len(value) > 4:
+                where = struct.pack("<I", after + len(tail))
+                tail += value + b"\0" * (len(value) % 2)
+                value = where
+            head += struct.pack("<HHI", tag, kind, count) + value.ljust(4, b"\0")
+        return head + b"\0" * 4 + tail
+
+    short = struct.Struct("<H").pack
+    main = [
+        (0x010F, 2, 6, b"Maker\0"),
+        (0x0110, 2, 6, b"Model\0"),
+        (0x0112, 3, 1, short(orientation)),
+        (0x8769, 4, 1, struct.pack("<I", 8)),
+    ]
+    start = 8 + len(ifd(main, 8))
+    main[-1] = (0x8769, 4, 1, struct.pack("<I", start))
+    lens = [
+        (0x920A, 5, 1, struct.pack("<II", 60, 10)),
+        (0xA405, 3, 1, short(focal_35mm)),
+    ]
+    body = b"II*\0" + struct.pack("<I", 8) + ifd(main, 8) + ifd(lens, start)
+    body = b"Exif\0\0" + body
+    return b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
+
+
+def write_photo(path: Path, upright: np.ndarray, orientation=1, focal_35mm=0) -> None:
+    """A JPEG of RGB pixels; of orientation 6 it is stored turned to the left."""
+    stored = np.rot90(upright, 1) if orientation == 6 else upright
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 97]
+    data = cv2.imencode(".jpg", np.ascontiguousarray(stored[..., ::-1]), quality)[1]
+    data = data.tobytes()
+    if focal_35mm or orientation != 1:
+        data = data[:2] + exif(orientation, focal_35mm) + data[2:]
+    path.write_bytes(data)
+
+
+def blank(path: Path, seed: int | None = None) -> None:
+    """A photo of nothing, or of noise that no other has."""
+    pixels = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    if seed is not None:
+        pixels = texture(100 + seed)[:HEIGHT, :WIDTH]
+    write_photo(path, pixels)
+
+
+def read(path: Path) -> np.ndarray:
+    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert pixels is not None
+    return pixels[..., ::-1] if pixels.ndim == 3 else pixels
+
+
+def alike(a: np.ndarray, b: np.ndarray) -> float:
+    """Correlation of two pictures."""
+    assert min(a.std(), b.std()) > 20, "neither is empty"
+    return np.corrcoef(a.ravel(), b.ravel())[0, 1]
+
+
+def make_room(folder: Path) -> Path:
+    """Fill a folder: photographs with EXIF, one stored turned, and what is none."""
+    for i, name in enumerate(NAMES):
+        pixels = corner_view(viewmat_at(i / (COUNT - 1)))
+        write_photo(folder / name, pixels, 6 if i == TURNED else 1, 32)
+    (folder / "notes.txt").write_text("not a photo")
+    (folder / "._photo 0.jpg").write_text("of another system")
+    return folder
+
+
+def leftovers(folder: Path) -> list[str]:
+    return [path.name for path in folder.iterdir() if path.name.startswith(".gsjax")]
