@@ -12,6 +12,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from gsjax import images
 from gsjax.errors import MissingExtraError
 
 MAX_FEATURES = 8192
@@ -51,6 +52,8 @@ def colmap() -> Any:
     Raises:
       MissingExtraError: if it is absent or does not load.
     """
+    # OpenCV first: loaded after pycolmap 4.2, OpenCV 5.0 aborts as it writes a PNG.
+    images.opencv()
     try:
         import pycolmap
     except ImportError as error:

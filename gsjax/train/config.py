@@ -196,3 +196,56 @@ def scaled(config: TrainConfig, steps: int) -> TrainConfig:
             every=some(config.mcmc.every, 20),
         ),
     )
+
+
+def preset(name: str) -> TrainConfig:
+    """Settings by name.
+
+    Args:
+      name: "fast" is minutes on two cores; "default" a quarter of an hour or so there;
+        "quality" the 30 000 steps of the papers, for bigger machines.
+
+    Raises:
+      InputError: if there is none of that name.
+    """
+    if name not in _PRESETS:
+        raise InputError(f"no preset is called {name!r}; known: {sorted(_PRESETS)}")
+    return _PRESETS[name]()
+
+
+def _fast() -> TrainConfig:
+    return TrainConfig(
+        steps=1500,
+        max_size=400,
+        levels=(Level(0.0, 2), Level(0.3, 1)),
+        sh_degree=1,
+        sh_every=500,
+        adaptive=AdaptiveSettings(
+            start=100, stop=1000, every=50, reset_every=0, max_gaussians=50_000
+        ),
+        mcmc=McmcSettings(
+            start=100, stop=1200, every=50, growth=1.2, max_gaussians=30_000
+        ),
+    )
+
+
+def _default() -> TrainConfig:
+    return TrainConfig(
+        steps=7000,
+        max_size=800,
+        levels=(Level(0.0, 4), Level(0.1, 2), Level(0.3, 1)),
+        sh_degree=2,
+        adaptive=AdaptiveSettings(
+            start=300, stop=4500, every=100, reset_every=0, max_gaussians=300_000
+        ),
+        mcmc=McmcSettings(
+            start=300, stop=5500, every=100, growth=1.1, max_gaussians=150_000
+        ),
+    )
+
+
+def _quality() -> TrainConfig:
+    return TrainConfig(levels=(Level(0.0, 4), Level(0.03, 2), Level(0.1, 1)))
+
+
+_PRESETS = {"fast": _fast, "default": _default, "quality": _quality}

@@ -1,0 +1,42 @@
+"""`gsjax eval`: how well a run shows the views that were held out."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+from gsjax.commands.common import Command, use_all_cores
+from gsjax.console import say
+
+
+@dataclass(kw_only=True)
+class EvalCommand(Command):
+    """Measure a run: PSNR and SSIM of held-out views, with pictures."""
+
+    folder: Positional[Path]
+    """Folder of the run."""
+    views: Literal["test", "train"] = "test"
+    """Which views to measure on."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self) -> int:
+        use_all_cores()
+        from gsjax.train.run import evaluate_run, run_files
+
+        summary = evaluate_run(self.folder, which=self.views)
+        files = run_files(self.folder)
+        told = json.loads(files.eval.read_text(encoding="utf-8"))
+        if self.json:
+            say(json.dumps(told, indent=2))
+            return 0
+        for each in told["each"]:
+            say(f"{each['name']}  PSNR {each['psnr']:.2f} dB  SSIM {each['ssim']:.4f}")
+        say(
+            f"{summary.views} {self.views} views: PSNR {summary.psnr:.2f} dB, SSIM "
+            f"{summary.ssim:.4f}, LPIPS {summary.lpips}"
+        )
+        say(str(files.preview))
+        return 0

@@ -1,0 +1,142 @@
+"""`gsjax train`: from photographs with known cameras to a scene."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from gsjax.commands.common import Command, UsageError, use_all_cores
+from gsjax.console import note, say
+
+
+@dataclass(kw_only=True)
+class TrainCommand(Command):
+    """Train a scene on a dataset: COLMAP, nerfstudio, NeRF or LLFF."""
+
+    dataset: Positional[Path]
+    """Folder of the dataset, as `gsjax sfm` makes it, or its .json or .npy file."""
+    out: Annotated[Path, arg(aliases=["-o"], metavar="RUN")]
+    """Folder for the run; created if missing."""
+    preset: Literal["fast", "default", "quality"] = "default"
+    """fast: minutes on two cores; quality: 30 000 steps as in the papers."""
+    strategy: Literal["adaptive", "mcmc"] | None = None
+    """How Gaussians are added and removed; default: that of the preset."""
+    steps: int | None = None
+    """How many; the schedules of the preset are stretched to them."""
+    max_size: int | None = None
+    """Longest side of the photographs in px; larger ones are scaled down."""
+    max_gaussians: int | None = None
+    """Never more than that."""
+    sh_degree: Literal[0, 1, 2, 3, 4] | None = None
+    """Degree of the spherical harmonics; 0 is one colour from all sides."""
+    background: Literal["black", "white", "random"] | None = None
+    """Behind the scene; random while training hides nothing in it."""
+    initial: Literal["points", "random"] | None = None
+    """Start from the dataset's points, or from anywhere in view."""
+    antialias: bool = False
+    """Compensate thin splats for the blur of a pixel, to look right at other sizes."""
+    absgrad: bool = False
+    """Adaptive strategy: split by absolute gradients; sharper, with more Gaussians."""
+    refine_poses: bool = False
+    """Correct the cameras' poses along with the scene."""
+    refine_intrinsics: bool = False
+    """Correct focal length and principal point along with the scene."""
+    exposure: bool = False
+    """Learn an exposure for each photograph."""
+    seed: int = 0
+    """The same seed gives the same bits on a CPU."""
+    images: str | None = None
+    """Folder of the photographs, if not as usual."""
+    factor: int | None = None
+    """Use images_2, images_4 or images_8."""
+    skip_missing: bool = False
+    """Leave out photographs that are listed but not there."""
+    test_every: int = 8
+    """Hold out every so many-th view to measure with; 0 for none."""
+    test_images: tuple[str, ...] = ()
+    """Hold out these views instead."""
+    checkpoint_every: int | None = None
+    """Steps between checkpoints; 0 only at the end."""
+    resume: bool = False
+    """Go on where the run in RUN stopped, with the settings that it has."""
+    overwrite: bool = False
+    """Replace a run that exists."""
+
+    def run(self) -> int:
+        if self.resume and self.overwrite:
+            raise UsageError("--resume and --overwrite exclude each other")
+        use_all_cores()
+        from gsjax.train.run import load_settings, resume_run, run_files, start_run
+
+        if self.resume and run_files(self.out).config.exists():
+            settings = load_settings(self.out)
+            if settings.dataset != self.dataset.resolve():
+                raise UsageError(
+                    f"{self.out} was trained on {settings.dataset}; --resume goes on "
+                    "with that"
+                )
+            result = resume_run(self.out)
+        else:
+            result = start_run(self._settings(), self.out, overwrite=self.overwrite)
+        if not result.finished:
+            note(f"stopped after step {result.step}; go on with --resume")
+            return 130
+        say(str(result.files.splat))
+        line = f"{result.gaussians:,} Gaussians, {result.seconds:.0f} s"
+        if result.summary is not None:
+            line += (
+                f"; {result.summary.views} held-out views: "
+                f"PSNR {result.summary.psnr:.2f} dB, SSIM {result.summary.ssim:.4f}"
+            )
+        say(line)
+        say(str(result.files.preview))
+        return 0
+
+    def _settings(self):
+        from gsjax.train.config import preset, scaled
+        from gsjax.train.run import RunSettings
+
+        config = preset(self.preset)
+        if self.steps is not None:
+            if self.steps < 1:
+                raise UsageError("--steps from 1")
+            config = scaled(config, self.steps)
+        changes = {
+            "strategy": self.strategy,
+            "max_size": self.max_size,
+            "sh_degree": self.sh_degree,
+            "background": self.background,
+            "initial": self.initial,
+            "every_checkpoint": self.checkpoint_every,
+        }
+        changes = {name: value for name, value in changes.items() if value is not None}
+        config = config.replace(
+            **changes,
+            seed=self.seed,
+            refine_poses=self.refine_poses,
+            refine_intrinsics=self.refine_intrinsics,
+            exposure=self.exposure,
+            raster=config.raster.replace(antialias=self.antialias),
+        )
+        if self.max_gaussians is not None:
+            if self.max_gaussians < 1:
+                raise UsageError("--max-gaussians from 1")
+            config = config.replace(
+                adaptive=replace(config.adaptive, max_gaussians=self.max_gaussians),
+                mcmc=replace(config.mcmc, max_gaussians=self.max_gaussians),
+            )
+        if self.absgrad:
+            adaptive = replace(config.adaptive, absgrad=True)
+            if config.adaptive.threshold == 2e-4:
+                adaptive = replace(adaptive, threshold=8e-4)
+            config = config.replace(adaptive=adaptive)
+        return RunSettings(
+            dataset=self.dataset,
+            config=config,
+            images=self.images,
+            factor=self.factor,
+            skip_missing=self.skip_missing,
+            every=self.test_every,
+            test_images=self.test_images,
+        )
