@@ -6,6 +6,8 @@ All arithmetic is on components (structure of arrays); no matrix product is used
 no accelerator can lower its precision.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -139,21 +141,76 @@ def project(
     """
     order = jnp.minimum(order, gaussians.capacity - 1)
     rows = jax.tree.map(lambda a: a[order], gaussians.params)
-    live = lax.iota(jnp.int32, order.shape[0]) < count
     colour_rows = rows.sh if features is None else features[order]
-    live &= jnp.all(jnp.isfinite(colour_rows), axis=tuple(range(1, colour_rows.ndim)))
+    components = _Components(
+        means=tuple(rows.means.T),
+        quats=tuple(rows.quats.T),
+        log_scales=tuple(rows.log_scales.T),
+        logit_opacities=rows.logit_opacities,
+        colors=jnp.moveaxis(colour_rows, 0, -1),
+        shift=None if probe is None else tuple(probe[order].T),
+    )
+
+    @jax.checkpoint
+    def some(components: _Components, camera: Camera, count: Array) -> Projected:
+        return _project_components(components, camera, config, count, features is None)
+
+    def none(*operands) -> Projected:
+        shapes = jax.eval_shape(some, *operands)
+        empty = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+        ones = jnp.ones_like(empty.u)
+        return empty._replace(inv_sx=ones, inv_sy=ones, det=ones)
+
+    out = lax.cond(count > 0, some, none, components, camera, count)
+    return out if abs_probe is None else out._replace(probe=abs_probe[order].T)
+
+
+class _Components(NamedTuple):
+    """Parameters of the ranks, [R] each: see `GaussianParams`.
+
+    Attributes:
+      colors: [K, 3, R] coefficients, or [C, R] features.
+      shift: of the projected mean, px, or None.
+    """
+
+    means: tuple[Array, ...]
+    quats: tuple[Array, ...]
+    log_scales: tuple[Array, ...]
+    logit_opacities: Array
+    colors: Array
+    shift: tuple[Array, ...] | None
+
+
+def _project_components(
+    rows: _Components,
+    camera: Camera,
+    config: RasterConfig,
+    count: Array,
+    harmonic: bool,
+) -> Projected:
+    """The arithmetic of `project`, on components.
+
+    `project` runs it in a branch of its own, for two reasons. How it is fused, and so
+    rounded, then does not depend on what uses it: images are the same bits whatever
+    the capacity and the devices. And XLA's CPU backend evaluates a shared value anew
+    for each use that indexes it differently; were the derivatives by x, y and z put
+    into one array in the same loop, they would cost 160 ms in place of 3 (48 k
+    Gaussians, jax 0.10.2). It is recomputed in the backward pass rather than kept.
+    """
+    live = lax.iota(jnp.int32, rows.logit_opacities.shape[0]) < count
+    live &= jnp.all(jnp.isfinite(rows.colors), axis=tuple(range(rows.colors.ndim - 1)))
     unit, good = safe_normalize(
-        tuple(jnp.where(live, q, 1) for q in rows.quats.T), (1.0, 0.0, 0.0, 0.0)
+        tuple(jnp.where(live, q, 1) for q in rows.quats), (1.0, 0.0, 0.0, 0.0)
     )
     live &= good
-    means = tuple(jnp.where(live, m, 0) for m in rows.means.T)
-    scales = tuple(exp_log_scale(jnp.where(live, s, 0)) for s in rows.log_scales.T)
+    means = tuple(jnp.where(live, m, 0) for m in rows.means)
+    scales = tuple(exp_log_scale(jnp.where(live, s, 0)) for s in rows.log_scales)
     x, y, z = transform_point(camera.viewmat, means)
     # A dead rank's mean is the origin, which may lie anywhere: park it at z = 1.
     x, y, z = jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1)
     u, v = camera.model.project_point(camera.K, (x, y, z))
-    if probe is not None:
-        u, v = u + probe[order, 0], v + probe[order, 1]
+    if rows.shift is not None:
+        u, v = u + rows.shift[0], v + rows.shift[1]
 
     m1, m2 = _half_covariance(camera, (x, y, z), unit, scales)
     a, b, c, det, det_sharp = _dilate(m1, m2, config.dilation)
@@ -169,10 +226,10 @@ def project(
     if config.antialias:
         opacity = opacity * compensation
     reach = jnp.where(live, reach_of(lax.stop_gradient(opacity), config), 0)
-    if features is None:
-        colors = _sh_colors(camera, means, rows.sh, live)
+    if harmonic:
+        colors = _sh_colors(camera, means, rows.colors, live)
     else:
-        colors = jnp.where(live, colour_rows.T, 0)
+        colors = jnp.where(live, rows.colors, 0)
     return Projected(
         u=u,
         v=v,
@@ -186,7 +243,7 @@ def project(
         reach=reach,
         colors=colors,
         compensation=compensation,
-        probe=None if abs_probe is None else abs_probe[order].T,
+        probe=None,
     )
 
 
@@ -227,17 +284,17 @@ def _dilate(m1, m2, dilation: float):
 
 
 def _sh_colors(camera: Camera, means, sh: Array, live: Array) -> Array:
-    """Colour [3, R] of coefficients [R, K, 3] seen from the camera; + 0.5, ≥ 0."""
-    degree = sh_lib.degree_of(sh.shape[1])
-    coefficients = jnp.where(live, jnp.moveaxis(sh, 0, -1), 0)
+    """Colour [3, R] of coefficients [K, 3, R] seen from the camera; + 0.5, ≥ 0."""
+    degree = sh_lib.degree_of(sh.shape[0])
+    coefficients = jnp.where(live, sh, 0)
     if degree == 0:
         raw = sh_lib.C0 * coefficients[0]
     else:
         centre = camera_centre(camera.viewmat)
         offset = tuple(m - c for m, c in zip(means, centre))
         direction, _ = safe_normalize(offset, (0.0, 0.0, 1.0))
-        basis = sh_lib.sh_basis(degree, *direction)
-        raw = sum(value * coefficients[k] for k, value in enumerate(basis))
+        basis = jnp.stack(sh_lib.sh_basis(degree, *direction))
+        raw = jnp.sum(basis[:, None] * coefficients, 0)
     shifted = raw + 0.5
     return jnp.where(shifted > 0, shifted, 0)
 

@@ -108,31 +108,12 @@ def _project_one(
     probe: Array | None,
     abs_probe: Array | None,
 ) -> tuple[Projected, Array, Array]:
-    """One camera: what was projected, radii [N], and the count of what may be seen.
-
-    A branch of its own, taken where anything is active: how the projection is fused,
-    and so rounded, then does not depend on what uses it, and images are the same bits
-    whatever the capacity and the devices. Recomputed in the backward pass rather
-    than kept.
-    """
-
-    @jax.checkpoint
-    def some(params, camera, features, probe, abs_probe):
-        whole = gaussians.replace(params=params)  # pyright: ignore
-        order, visible = depth_order(whole, camera, config)
-        out = project(whole, camera, config, order, visible, features, probe, abs_probe)
-        radii = jnp.zeros(gaussians.capacity, out.u.dtype)
-        seen = lax.stop_gradient(radii_of(out))
-        return out, radii.at[order].set(seen, mode="drop"), visible
-
-    def none(*operands):
-        shapes = jax.eval_shape(some, *operands)
-        empty = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
-        ones = jnp.ones_like(empty[0].u)
-        return (empty[0]._replace(inv_sx=ones, inv_sy=ones, det=ones), *empty[1:])
-
-    operands = (gaussians.params, camera, features, probe, abs_probe)
-    return lax.cond(jnp.any(gaussians.active), some, none, *operands)
+    """One camera: what was projected, radii [N], and the count of what may be seen."""
+    order, visible = depth_order(gaussians, camera, config)
+    out = project(gaussians, camera, config, order, visible, features, probe, abs_probe)
+    radii = jnp.zeros(gaussians.capacity, out.u.dtype)
+    seen = lax.stop_gradient(radii_of(out))
+    return out, radii.at[order].set(seen, mode="drop"), visible
 
 
 def _with_batch(name: str, probe, gaussians: Gaussians, camera: Camera):
