@@ -29,12 +29,11 @@ _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 def _running_product(alpha: Array) -> tuple[Array, Array]:
     """(Π over all K, Π over those before k [G, K, P]) of 1 − alpha [G, K, P]."""
 
-    def step(product, a):
-        return product * (1 - a), product
-
-    ones = jnp.ones_like(alpha[:, 0])
-    total, before = lax.scan(step, ones, jnp.moveaxis(alpha, 1, 0))
-    return total, jnp.moveaxis(before, 0, 1)
+    product, before = jnp.ones_like(alpha[:, 0]), []
+    for k in range(alpha.shape[1]):
+        before.append(product)
+        product = product * (1 - alpha[:, k])
+    return product, jnp.stack(before, 1)
 
 
 @jax.custom_jvp
