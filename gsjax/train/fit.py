@@ -291,7 +291,7 @@ def grow_state(state: TrainState, capacity: int) -> TrainState:
             return jnp.pad(array, [(0, extra)] + [(0, 0)] * (array.ndim - 1))
         return array
 
-    return state.replace(  # pyright: ignore
+    return state.replace(
         gaussians=grow(state.gaussians, capacity),
         moments=jax.tree.map(pad, state.moments),
         stats=jax.tree.map(pad, state.stats),

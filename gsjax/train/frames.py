@@ -51,13 +51,13 @@ class Batch(NamedTuple):
       pixels: [B, H, W, 3 or 4] uint8.
       valid: [B, H, W] bool or None.
       camera: batch of B.
-      index: [B] int32, which of the V views these are.
+      view: [B] int32, which of the V views these are.
     """
 
     pixels: Array
     valid: Array | None
     camera: Camera
-    index: Array
+    view: Array
 
 
 def make_frames(

@@ -4,9 +4,9 @@ Axis legend: N Gaussians (capacity), V views, B views of a step, H W image.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -33,7 +33,8 @@ from gsjax.train.tuning import (
 Array = jax.Array
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class TrainState:
     """All that a run goes on from; what it does next depends on nothing else.
 
@@ -53,6 +54,10 @@ class TrainState:
     stats: Any
     tuning: Tuning
     tuning_moments: optax.ScaleByAdamState
+
+    def replace(self, **changes) -> "TrainState":
+        """A copy with some fields changed."""
+        return replace(self, **changes)
 
 
 class Metrics(NamedTuple):
@@ -96,7 +101,7 @@ def init_state(
       views: V.
     """
     tuning = init_tuning(config, views)
-    return TrainState(  # pyright: ignore
+    return TrainState(
         step=jnp.int32(0),
         key=jax.random.key(config.seed),
         gaussians=gaussians,
@@ -125,11 +130,11 @@ def make_train_step(
 
     def objective(params, tuning, probe, state, batch: Batch, background):
         gaussians = state.gaussians.replace(params=params)
-        camera = tuned_camera(batch.camera, tuning, batch.index, extent)
+        camera = tuned_camera(batch.camera, tuning, batch.view, extent)
         name = "abs_probe" if densifier.absgrad else "probe"
         view = render(gaussians, camera, raster, background, **{name: probe})
         assert view.rgb is not None
-        image = exposed(view.rgb, tuning, batch.index)
+        image = exposed(view.rgb, tuning, batch.view)
         target, weight = targets(batch, background, image.dtype)
         loss = jax.vmap(
             lambda i, t, w: photometric(i, t, w, config.ssim_weight),
@@ -153,7 +158,7 @@ def make_train_step(
         params = state.gaussians.params
         dtype = params.means.dtype
         background = background_of(config, by_background, dtype)
-        count = batch.index.shape[0]
+        count = batch.view.shape[0]
         probe = jnp.zeros((count, state.gaussians.capacity, 2), dtype)
         (loss, (quality, radii, demand, overflowed)), grads = differentiate(
             params, state.tuning, probe, state, batch, background
@@ -173,7 +178,7 @@ def make_train_step(
             return state, jnp.int32(0)
 
         def skip():
-            return state.replace(step=state.step + 1), jnp.int32(0)  # pyright: ignore
+            return state.replace(step=state.step + 1), jnp.int32(0)
 
         def update():
             moved = _optimise(state, grads, config, extent)
@@ -234,7 +239,7 @@ def _optimise(
     tuning, tuning_moments = tuning_step(
         state.tuning, by_tuning, state.tuning_moments, config
     )
-    return state.replace(  # pyright: ignore
+    return state.replace(
         step=state.step + 1,
         gaussians=state.gaussians.replace(params=params),  # pyright: ignore
         moments=moments,
@@ -264,5 +269,4 @@ def _densify(
         return gaussians, state.moments, stats, jnp.int32(0)
 
     gaussians, moments, stats, wanted = lax.cond(densifier.due(state.step), edit, leave)
-    state = state.replace(gaussians=gaussians, moments=moments, stats=stats)  # pyright: ignore
-    return state, wanted
+    return state.replace(gaussians=gaussians, moments=moments, stats=stats), wanted

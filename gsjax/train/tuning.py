@@ -3,7 +3,8 @@
 Axis legend: V views, B views of a step, H W image.
 """
 
-import chex
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -16,7 +17,8 @@ Array = jax.Array
 _ADAM = optax.scale_by_adam(eps=1e-15)
 
 
-@chex.dataclass(frozen=True, mappable_dataclass=False)
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class Tuning:
     """Corrections; those that are not learnt are None, all others start at nothing.
 
@@ -37,7 +39,7 @@ class Tuning:
 def init_tuning(config: TrainConfig, views: int) -> Tuning:
     """Nothing corrected yet; of the kinds that the settings ask for."""
     poses = jnp.zeros((views, 3)) if config.refine_poses else None
-    return Tuning(  # pyright: ignore
+    return Tuning(
         turns=poses,
         shifts=poses,
         intrinsics=jnp.zeros(4) if config.refine_intrinsics else None,
