@@ -66,12 +66,14 @@ def adam_step(
     updates, moments = _ADAM.update(grads, moments)  # pyright: ignore
     bases = params.sh.shape[-2]
     by_band = jnp.where(jnp.arange(bases) == 0, rates.sh_dc, rates.sh_rest)
-    rate = GaussianParams(  # pyright: ignore
-        means=means_rate(rates, fraction, extent),
-        quats=rates.quats,
-        log_scales=rates.log_scales,
-        logit_opacities=rates.logit_opacities,
-        sh=by_band[:, None],
+    rate = GaussianParams(
+        **{
+            "means": means_rate(rates, fraction, extent),
+            "quats": rates.quats,
+            "log_scales": rates.log_scales,
+            "logit_opacities": rates.logit_opacities,
+            "sh": by_band[:, None],
+        }
     )
     moved = jax.tree.map(
         lambda p, u, r: p - (u * r).astype(p.dtype), params, updates, rate

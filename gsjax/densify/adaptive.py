@@ -144,11 +144,10 @@ def _densified(
 
     def child(shift):
         wide = split[:, None]
-        return params.replace(
-            means=jnp.where(wide, params.means + shift, params.means),
-            log_scales=jnp.where(wide, smaller, params.log_scales),
-            logit_opacities=revised,
-        )
+        means = jnp.where(wide, params.means + shift, params.means)
+        scales = jnp.where(wide, smaller, params.log_scales)
+        changes = {"means": means, "log_scales": scales, "logit_opacities": revised}
+        return params.replace(**changes)  # pyright: ignore
 
     in_place = where_slots(new.chosen, child(shifts[0]), params)
     born = new.source < active.shape[0]

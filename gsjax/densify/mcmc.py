@@ -89,7 +89,8 @@ def mcmc(settings: McmcSettings) -> Densifier:
         shift = jnp.einsum("nij,nj->ni", spread, noise, precision="highest")
         shift = shift * (gate * settings.noise * rate)[:, None]
         good = gaussians.active[:, None] & jnp.isfinite(shift)
-        return params.replace(means=params.means + jnp.where(good, shift, 0))
+        means = params.means + jnp.where(good, shift, 0)
+        return params.replace(means=means)  # pyright: ignore
 
     def due(step: Array) -> Array:
         inside = (step > settings.start) & (step <= settings.stop)

@@ -84,7 +84,7 @@ def neighbour_distance(points: np.ndarray, extent: float) -> np.ndarray:
     At least 1e-7 and at most 0.1 of the extent: points in one place, and points far
     from all others, would otherwise be nothing or everything.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import cKDTree  # pyright: ignore
 
     count = min(4, len(points))
     if count < 2:

@@ -166,11 +166,10 @@ def fit(
             f"{len(photos)} photos for {len(scene.views)} views; one for each is wanted"
         )
     hooks = hooks or Hooks()
-    state = initial_state(scene, config) if state is None else state
+    begun = initial_state(scene, config) if state is None else state
     # The step takes the state's memory over: not the caller's, and none twice.
-    state = jax.tree.map(jnp.copy, state)
-    run = _Run(scene, photos, config, hooks)
-    return run.loop(state, pair_capacity)
+    own: TrainState = jax.tree.map(jnp.copy, begun)
+    return _Run(scene, photos, config, hooks).loop(own, pair_capacity)
 
 
 @dataclass
