@@ -6,13 +6,14 @@ Axis legend: H W image, C channels.
 import jax
 import jax.numpy as jnp
 
-from gsjax.metrics import ssim, weighted_mean
+from gsjax.metrics import seen_only, ssim, weighted_mean
 
 Array = jax.Array
 
 
 def l1(image: Array, target: Array, weight: Array | None = None) -> Array:
     """Mean absolute difference of [H, W, C], weighted by [H, W]."""
+    image, target = seen_only(image, target, weight)
     return weighted_mean(jnp.mean(jnp.abs(image - target), -1), weight)
 
 

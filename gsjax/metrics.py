@@ -28,8 +28,22 @@ def psnr(image: Array, target: Array, weight: Array | None = None) -> Array:
     Returns:
       [] −10 log10 of the mean squared error; infinite for equal pictures.
     """
+    image, target = seen_only(image, target, weight)
     square = jnp.mean(jnp.square(image - target), -1)
     return -10 * jnp.log10(weighted_mean(square, weight))
+
+
+def seen_only(
+    image: Array, target: Array, weight: Array | None
+) -> tuple[Array, Array]:
+    """Both pictures [H, W, C], black where the weight [H, W] is 0.
+
+    So that what lies there cannot show, NaN included, nor in a derivative.
+    """
+    if weight is None:
+        return image, target
+    seen = (weight > 0)[..., None]
+    return jnp.where(seen, image, 0), jnp.where(seen, target, 0)
 
 
 def weighted_mean(values: Array, weight: Array | None) -> Array:
@@ -53,9 +67,7 @@ def ssim(image: Array, target: Array, weight: Array | None = None) -> Array:
     Returns:
       [] at most 1.
     """
-    if weight is not None:
-        seen = (weight > 0)[..., None]
-        image, target = jnp.where(seen, image, 0), jnp.where(seen, target, 0)
+    image, target = seen_only(image, target, weight)
     return weighted_mean(jnp.mean(ssim_map(image, target), -1), weight)
 
 

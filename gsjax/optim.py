@@ -20,8 +20,8 @@ class Rates(NamedTuple):
     """Learning rates; the defaults are those of Kerbl et al. 2023.
 
     Attributes:
-      means: at the first and the last step, log-linear between; times the extent of
-        the scene.
+      means: at the first and the last step, log-linear between, both above 0 or
+        equal; times the extent of the scene.
       log_scales, quats, logit_opacities: constant.
       sh_dc, sh_rest: of degree 0, and of all above.
     """
@@ -38,6 +38,8 @@ def means_rate(rates: Rates, fraction: Array, extent: float | Array) -> Array:
     """Rate of the means at ``fraction`` (0 to 1) of the run."""
     first, last = rates.means
     fraction = jnp.clip(fraction, 0, 1)
+    if first == last:  # (0, 0) holds the means where they are
+        return extent * first * jnp.ones_like(fraction)
     return extent * first * (last / first) ** fraction
 
 
