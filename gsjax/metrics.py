@@ -33,9 +33,7 @@ def psnr(image: Array, target: Array, weight: Array | None = None) -> Array:
     return -10 * jnp.log10(weighted_mean(square, weight))
 
 
-def seen_only(
-    image: Array, target: Array, weight: Array | None
-) -> tuple[Array, Array]:
+def seen_only(image: Array, target: Array, weight: Array | None) -> tuple[Array, Array]:
     """Both pictures [H, W, C], black where the weight [H, W] is 0.
 
     So that what lies there cannot show, NaN included, nor in a derivative.

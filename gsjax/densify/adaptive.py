@@ -16,6 +16,7 @@ import jax.numpy as jnp
 
 from gsjax.densify.slots import assign, copy_into, where_slots
 from gsjax.densify.types import Densifier, Observation, SlotEdit
+from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.numerics import exp_log_scale, logit
 from gsjax.rotations import quaternion_to_matrix
@@ -42,7 +43,8 @@ class AdaptiveSettings:
       prune_radius: above it, as a share of the longer side of the image, it goes,
         after the first reset; None never.
       reset_every: bring all opacities down to ``reset_opacity``, so that what is not
-        needed shows; 0 never.
+        needed shows, at the first edit from every so many-th step on; 0 never. Not at
+        the last edit, which no pruning follows.
       max_gaussians: never more than that.
     """
 
@@ -60,6 +62,24 @@ class AdaptiveSettings:
     reset_every: int = 3000
     reset_opacity: float = 0.01
     max_gaussians: int = 5_000_000
+
+    def __post_init__(self):
+        checks = {
+            "start": self.start >= 0,
+            "every": self.every >= 1,
+            "threshold": self.threshold > 0,
+            "shrink": self.shrink > 0,
+            "prune_opacity": 0 <= self.prune_opacity < 1,
+            "reset_every": self.reset_every >= 0,
+            "reset_opacity": 0 < self.reset_opacity < 1,
+            "max_gaussians": self.max_gaussians >= 1,
+        }
+        for name, good in checks.items():
+            if not good:
+                raise InputError(
+                    f"AdaptiveSettings.{name} = {getattr(self, name)!r} is out of "
+                    "range; see its documentation"
+                )
 
 
 class AdaptiveStats(NamedTuple):
@@ -80,8 +100,10 @@ def adaptive(settings: AdaptiveSettings, extent: float) -> Densifier:
     """The strategy for a scene of this extent (in its units)."""
 
     def init(gaussians: Gaussians) -> AdaptiveStats:
-        zeros = jnp.zeros(gaussians.capacity, gaussians.params.means.dtype)
-        return AdaptiveStats(zeros, zeros, zeros)
+        def zeros():  # each its own: a step that is donated takes no array twice
+            return jnp.zeros(gaussians.capacity, gaussians.params.means.dtype)
+
+        return AdaptiveStats(zeros(), zeros(), zeros())
 
     def observe(stats: AdaptiveStats, seen: Observation) -> AdaptiveStats:
         half = jnp.asarray([seen.width / 2, seen.height / 2], seen.gradient.dtype)
@@ -165,7 +187,9 @@ def _reset(settings: AdaptiveSettings, step: Array, edit: SlotEdit) -> SlotEdit:
     """With opacities brought down where it is time."""
     if settings.reset_every <= 0:
         return edit
-    now = step % settings.reset_every == 0
+    # Edits need not fall on its multiples: at the first one after.
+    now = step % settings.reset_every < settings.every
+    now &= step + settings.every <= settings.stop
     opacities = edit.params.logit_opacities
     low = logit(jnp.asarray(settings.reset_opacity, opacities.dtype))
     lowered = jnp.where(now, jnp.minimum(opacities, low), opacities)

@@ -15,6 +15,7 @@ from jax import lax
 
 from gsjax.densify.slots import copy_into
 from gsjax.densify.types import Densifier, SlotEdit
+from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.numerics import exp_log_scale, logit
 from gsjax.rotations import covariance
@@ -49,6 +50,24 @@ class McmcSettings:
     noise: float = 5e5
     opacity_penalty: float = 0.01
     scale_penalty: float = 0.01
+
+    def __post_init__(self):
+        checks = {
+            "start": self.start >= 0,
+            "every": self.every >= 1,
+            "max_gaussians": self.max_gaussians >= 1,
+            "growth": self.growth >= 1,
+            "dead_opacity": 0 < self.dead_opacity < 1,
+            "noise": self.noise >= 0,
+            "opacity_penalty": self.opacity_penalty >= 0,
+            "scale_penalty": self.scale_penalty >= 0,
+        }
+        for name, good in checks.items():
+            if not good:
+                raise InputError(
+                    f"McmcSettings.{name} = {getattr(self, name)!r} is out of range; "
+                    "see its documentation"
+                )
 
 
 def mcmc(settings: McmcSettings) -> Densifier:
@@ -87,7 +106,8 @@ def mcmc(settings: McmcSettings) -> Densifier:
         noise = jax.random.normal(key, params.means.shape, params.means.dtype)
         spread = covariance(params.quats, exp_log_scale(params.log_scales))
         shift = jnp.einsum("nij,nj->ni", spread, noise, precision="highest")
-        shift = shift * (gate * settings.noise * rate)[:, None]
+        # The rate may be wider than the parameters, and must not widen them.
+        shift = shift * (gate * settings.noise * rate.astype(gate.dtype))[:, None]
         good = gaussians.active[:, None] & jnp.isfinite(shift)
         means = params.means + jnp.where(good, shift, 0)
         return params.replace(means=means)  # pyright: ignore

@@ -37,7 +37,8 @@ def assign(candidates: Array, priority: Array, free: Array, limit: Array) -> Ass
     """
     slots = candidates.shape[0]
     place = lax.iota(jnp.int32, slots)
-    by_priority = jnp.argsort(jnp.where(candidates, -priority, jnp.inf), stable=True)
+    # Candidates first, whatever their priority: -inf and NaN come last among them.
+    by_priority = jnp.lexsort((-priority, ~candidates))
     by_slot = jnp.argsort(~free, stable=True)
     given = jnp.minimum(jnp.sum(candidates), jnp.sum(free))
     taken = place < jnp.minimum(given, limit)

@@ -38,10 +38,10 @@ class Tuning:
 
 def init_tuning(config: TrainConfig, views: int) -> Tuning:
     """Nothing corrected yet; of the kinds that the settings ask for."""
-    poses = jnp.zeros((views, 3)) if config.refine_poses else None
+    # Each its own array: a step that is donated takes none twice.
     return Tuning(
-        turns=poses,
-        shifts=poses,
+        turns=jnp.zeros((views, 3)) if config.refine_poses else None,
+        shifts=jnp.zeros((views, 3)) if config.refine_poses else None,
         intrinsics=jnp.zeros(4) if config.refine_intrinsics else None,
         exposures=jnp.zeros((views, 3, 4)) if config.exposure else None,
     )
