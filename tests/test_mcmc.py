@@ -69,7 +69,7 @@ def test_together_they_are_as_opaque():
     covered = -np.expm1(count * np.log1p(-shared))
     np.testing.assert_allclose(covered, opacity + 0 * covered, rtol=1e-9)
     assert (np.diff(shared, axis=1) < 0).all()
-    wide = shared_scale(opacity, shared, count)
+    wide = shared_scale(opacity + 0 * shared, shared, count)
     assert (wide <= 1 + 1e-6).all()
     assert (wide > 0).all()
 

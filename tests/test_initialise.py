@@ -1,0 +1,156 @@
+"""Where a run starts: at the points of a scene, or anywhere in view of it."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from captures import scene_of_views
+
+import gsjax
+from gsjax.errors import InputError
+from gsjax.scene.initialise import (
+    init_gaussians,
+    looked_at,
+    neighbour_distance,
+    scene_extent,
+)
+from gsjax.sh import dc_to_rgb
+
+FAR = 1e3  # an extent that clips nothing
+
+
+def brute_force(points):
+    distance = np.linalg.norm(points[:, None] - points, axis=-1)
+    nearest = np.sort(distance, axis=1)[:, 1:4]
+    return np.sqrt(np.mean(nearest**2, axis=1))
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 200])
+def test_distance_to_the_three_nearest(count):
+    points = np.random.default_rng(0).normal(size=(count, 3))
+    found = neighbour_distance(points, FAR)
+    np.testing.assert_allclose(found, brute_force(points), rtol=1e-12)
+
+
+def test_distance_where_there_are_no_neighbours():
+    assert neighbour_distance(np.zeros((1, 3)), 5.0).tolist() == [0.05]
+    assert neighbour_distance(np.zeros((0, 3)), 5.0).shape == (0,)
+    same = neighbour_distance(np.ones((7, 3)), 5.0)
+    np.testing.assert_array_equal(same, 5e-7)
+    far = neighbour_distance(np.diag([1e6, 1e6, 1e6]), 5.0)
+    np.testing.assert_array_equal(far, 0.5)
+
+
+def test_extent():
+    centres = np.asarray([[0.0, 0, 0], [4, 0, 0], [2, 6, 0]]) + 100
+    wanted = 1.1 * np.linalg.norm([0, 4, 0])  # the mean is (2, 2, 0)
+    assert scene_extent(centres) == pytest.approx(wanted)
+    assert scene_extent(centres[:1]) == 1.0
+    assert scene_extent(np.ones((5, 3))) == 1.0
+
+
+def test_points_become_gaussians():
+    scene = scene_of_views(points=40)
+    gaussians = init_gaussians(scene, sh_degree=2, opacity=0.3, scale=0.5)
+    params = gaussians.params
+    assert gaussians.active.all()
+    assert gaussians.capacity == 40
+    assert params.sh.shape == (40, 9, 3)
+    np.testing.assert_array_equal(params.means, scene.points)
+    np.testing.assert_allclose(jax.nn.sigmoid(params.logit_opacities), 0.3, rtol=1e-12)
+    extent = scene_extent(np.stack([view.centre for view in scene.views]))
+    wanted = np.clip(0.5 * brute_force(scene.points), 0, 0.05 * extent)
+    np.testing.assert_allclose(
+        np.exp(params.log_scales), np.repeat(wanted[:, None], 3, 1), rtol=1e-12
+    )
+    np.testing.assert_array_equal(params.quats, np.tile([1.0, 0, 0, 0], (40, 1)))
+    np.testing.assert_allclose(
+        dc_to_rgb(params.sh[:, 0]) * 255, scene.colors, atol=1e-9
+    )
+    assert (params.sh[:, 1:] == 0).all()
+
+
+@pytest.mark.parametrize(
+    "points",
+    [[[1.0, 2, 3]], [[0.0, 0, 0], [1, 0, 0]], [[1.0, 1, 1]] * 6, np.eye(3)],
+    ids=["one", "two", "identical", "three"],
+)
+def test_few_points_are_finite_and_visible(points):
+    points = np.asarray(points, float)
+    colors = np.full((len(points), 3), 200, np.uint8)
+    scene = replace(scene_of_views(), points=points, colors=colors)
+    gaussians = init_gaussians(scene, capacity=8)
+    assert gaussians.capacity == 8
+    assert gsjax.num_active(gaussians) == len(points)
+    for leaf in jax.tree.leaves(gaussians.params):
+        assert np.isfinite(leaf).all()
+
+
+def test_points_that_are_no_numbers_are_left_out():
+    scene = scene_of_views(points=9)
+    points = scene.points.copy()
+    points[3, 1], points[7, 0] = np.nan, np.inf
+    left = np.delete(np.arange(9), [3, 7])
+    found = init_gaussians(replace(scene, points=points))
+    wanted = init_gaussians(
+        replace(scene, points=points[left], colors=scene.colors[left])
+    )
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted)):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_of_too_many_some_are_drawn():
+    scene = scene_of_views(points=50)
+    few = init_gaussians(scene, max_count=20, seed=1)
+    means = np.asarray(few.params.means)
+    places = [np.flatnonzero((scene.points == m).all(1)) for m in means]
+    assert all(len(p) == 1 for p in places)
+    assert (np.diff(np.concatenate(places)) > 0).all()  # each once, in order
+    again, other = (init_gaussians(scene, max_count=20, seed=s) for s in (1, 2))
+    np.testing.assert_array_equal(again.params.means, means)
+    assert not np.array_equal(other.params.means, means)
+    # As wide as those are apart that are left.
+    extent = scene_extent(np.stack([view.centre for view in scene.views]))
+    np.testing.assert_allclose(
+        few.params.log_scales[:, 0], np.log(neighbour_distance(means, extent))
+    )
+
+
+def test_random_ones_are_in_view():
+    scene = scene_of_views(points=0)
+    gaussians = init_gaussians(scene, random_count=3000, seed=3)
+    means = np.asarray(gaussians.params.means)
+    extent = scene_extent(np.stack([view.centre for view in scene.views]))
+    away = np.linalg.norm(means - looked_at(scene), axis=1) / extent
+    assert away.max() <= 1
+    # Even in the ball: the cube of the distance is uniform.
+    shares = np.histogram(away**3, 10, (0, 1))[0]
+    assert np.sum((shares - 300) ** 2 / 300) < 34  # χ², 9 degrees, 0.9999
+    colors = dc_to_rgb(np.asarray(gaussians.params.sh[:, 0]))
+    assert colors.min() >= 0
+    assert colors.max() <= 1
+    assert init_gaussians(scene, random_count=30, max_count=10).capacity == 10
+
+
+def test_no_points():
+    with pytest.raises(InputError, match="no points to start from"):
+        init_gaussians(scene_of_views(points=0))
+
+
+def test_what_the_cameras_look_at():
+    scene = scene_of_views(count=6)
+    target = np.asarray([1.0, -2.0, 0.5])
+    views = []
+    for view in scene.views:
+        viewmat = gsjax.look_at(view.centre, target)
+        views.append(replace(view, viewmat=viewmat))
+    found = looked_at(replace(scene, views=tuple(views)))
+    assert np.linalg.norm(found - target) < 0.02
+    # Parallel axes: an extent ahead of the mean.
+    views = []
+    for x in (0.0, 1.0, 2.0):
+        viewmat = gsjax.look_at((x, 0, 0), (x, 5, 0))
+        views.append(replace(scene.views[0], viewmat=viewmat))
+    found = looked_at(replace(scene, views=tuple(views)))
+    np.testing.assert_allclose(found, (1, 1.1, 0), atol=1e-6)
