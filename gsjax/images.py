@@ -113,15 +113,25 @@ def make_folder(path: Path) -> None:
         ) from error
 
 
-def write_file(path: Path, data: bytes) -> None:
+def write_file(path: Path, data: bytes, *, durable: bool = False) -> None:
     """Write ``data``, in place of what may be there.
+
+    Args:
+      path: of the file.
+      data: all of it.
+      durable: wait until it is on the disk before it gets its name, so that a power
+        cut leaves the one file or the other.
 
     Raises:
       InputError: if it cannot be written.
     """
     temporary = path.parent / f".gsjax-{secrets.token_hex(6)}.tmp"
     try:
-        temporary.write_bytes(data)
+        with temporary.open("wb") as file:
+            file.write(data)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
         raise InputError(

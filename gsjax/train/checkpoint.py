@@ -69,13 +69,15 @@ def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Pa
     }
     step = int(state.step)
     text = {**meta, "format": _FORMAT, "step": step}
-    text["capacity"] = state.gaussians.capacity
+    text["capacity"], text["arrays"] = state.gaussians.capacity, sorted(arrays)
     encoded = np.frombuffer(json.dumps(text).encode(), np.uint8)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **{_META: encoded}, **arrays)
     path = folder / f"step_{step:09d}.npz"
-    write_file(path, buffer.getvalue())
-    for old in _files(folder)[:-_KEEP]:
+    write_file(path, buffer.getvalue(), durable=True)
+    # Later ones, which a run that was taken up again could not read, do not count.
+    upto = [old for old in _files(folder) if old.name <= path.name]
+    for old in upto[:-_KEEP]:
         old.unlink(missing_ok=True)
     return path
 
@@ -114,13 +116,19 @@ def load_checkpoint(path: Path) -> Checkpoint:
     try:
         with zipfile.ZipFile(path) as archive:
             declared = sum(entry.file_size for entry in archive.infolist())
-        if declared > 2 * path.stat().st_size + 4096:
-            raise ValueError(f"declares {declared} bytes, more than it can hold")
+            if declared > 2 * path.stat().st_size + 4096:
+                raise ValueError(f"declares {declared} bytes, more than it can hold")
+            # Before NumPy reads headers: those are checked by nothing else.
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise ValueError(f"the checksum of {damaged} does not match")
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}
         meta = json.loads(arrays.pop(_META).tobytes())
         if meta["format"] != _FORMAT:
             raise ValueError(f"format {meta['format']}; {_FORMAT} is wanted")
+        if meta["arrays"] != sorted(arrays):
+            raise ValueError(f"holds {len(arrays)} of {len(meta['arrays'])} arrays")
         return Checkpoint(int(meta["step"]), arrays, meta)
     except (OSError, ValueError, KeyError, TypeError, EOFError, zlib.error) as error:
         raise InputError(f"{path}: no readable checkpoint: {error}") from error
