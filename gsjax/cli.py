@@ -1,4 +1,4 @@
-"""The command line: `gsjax sfm`, `train`, `eval`, `render`, `info`, `demo`, `doctor`.
+"""The command line: `gsjax demo`, `sfm`, `train`, `eval`, `render`, `export`, …
 
 Exit codes: 0 done, 1 not well, 2 usage, 3 bad or missing input, 4 structure from
 motion failed, 5 training diverged, 6 a package is missing, 130 interrupted. Results
@@ -21,6 +21,7 @@ from gsjax.commands.common import UsageError
 from gsjax.commands.demo import DemoCommand
 from gsjax.commands.doctor import DoctorCommand
 from gsjax.commands.evaluate import EvalCommand
+from gsjax.commands.export import ExportCommand
 from gsjax.commands.info import InfoCommand
 from gsjax.commands.render import RenderCommand
 from gsjax.commands.sfm import SfmCommand
@@ -29,12 +30,13 @@ from gsjax.console import one_line, warnings_as_lines
 from gsjax.errors import GsjaxError, InputError
 
 _COMMANDS = (
-    Annotated[RenderCommand, subcommand("render")]
+    Annotated[DemoCommand, subcommand("demo")]
     | Annotated[SfmCommand, subcommand("sfm")]
     | Annotated[TrainCommand, subcommand("train")]
     | Annotated[EvalCommand, subcommand("eval")]
+    | Annotated[RenderCommand, subcommand("render")]
+    | Annotated[ExportCommand, subcommand("export")]
     | Annotated[InfoCommand, subcommand("info")]
-    | Annotated[DemoCommand, subcommand("demo")]
     | Annotated[DoctorCommand, subcommand("doctor")]
 )
 

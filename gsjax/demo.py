@@ -1,112 +1,111 @@
-"""The built-in demonstration: a scene from nothing, pictures of it, and its files.
+"""The built-in demonstration: photographs from nothing, and a scene trained on them.
 
-Renders a made-up scene; it writes what training would (a scene as PLY, its cameras),
-so that the other commands can be tried on it.
+It goes the whole way that `gsjax train` goes with photographs of one's own.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-import jax.numpy as jnp
-import numpy as np
-
 from gsjax import images
-from gsjax.console import note, progress
-from gsjax.io import save
-from gsjax.movies import encode_animation
-from gsjax.raster.render import render_exact
-from gsjax.raster.types import RasterConfig, Render
-from gsjax.scene.synthetic import SyntheticScene, torus_knot_scene
-from gsjax.scene.transforms import CameraEntry
-from gsjax.scene.transforms_writer import transforms_json
+from gsjax.console import note
+from gsjax.flights import path_entries, write_flight
+from gsjax.scene.caster import DemoDatasetSettings, write_demo_dataset
+from gsjax.subjects import open_subject
+from gsjax.train.config import Level, TrainConfig, preset, scaled
+from gsjax.train.run import RunResult, RunSettings, load_data, run_files, start_run
 
-_TURN_SECONDS = 4.0
+STEPS = 600
+_TURN_FRAMES, _TURN_SECONDS = 48, 4.0
+_MAX_GAUSSIANS = 16_384
 
 
 class DemoFiles(NamedTuple):
     """Where the demonstration writes."""
 
-    scene: Path
-    cameras: Path
-    still: Path
-    depth: Path
+    dataset: Path
+    run: Path
     turntable: Path
 
 
 class DemoSettings(NamedTuple):
-    """How much there is to see."""
+    """How much there is to do."""
 
-    gaussians: int = 20_000
-    frames: int = 48
-    width: int = 640
-    height: int = 480
+    photos: int = 40
+    width: int = 256
+    height: int = 192
+    steps: int = STEPS
+    seed: int = 0
 
 
 def demo_files(folder: Path) -> DemoFiles:
     """Names inside ``folder``."""
-    return DemoFiles(
-        scene=folder / "scene.ply",
-        cameras=folder / "cameras.json",
-        still=folder / "still.png",
-        depth=folder / "depth.png",
-        turntable=folder / "turntable.webp",
+    return DemoFiles(folder / "dataset", folder / "run", folder / "turntable.webp")
+
+
+def demo_config(steps: int = STEPS, seed: int = 0) -> TrainConfig:
+    """The preset "fast", smaller still: compiled once, and for few Gaussians.
+
+    One resolution and one size of the work, for each is compiled anew, which takes as
+    long as a hundred steps.
+    """
+    config = scaled(preset("fast"), steps)
+    return config.replace(
+        seed=seed,
+        max_size=None,
+        levels=(Level(0.0, 1),),
+        adaptive=replace(config.adaptive, max_gaussians=_MAX_GAUSSIANS),
+        raster=config.raster.replace(rungs=1),
     )
 
 
-def run_demo(folder: Path, settings: DemoSettings, *, overwrite: bool) -> DemoFiles:
-    """Make the scene, render it and write all files.
+def run_demo(
+    folder: Path, settings: DemoSettings, *, overwrite: bool
+) -> tuple[DemoFiles, RunResult]:
+    """Take the photographs, train on them, evaluate, and turn the scene around.
+
+    Interrupted, it stops after training; the result then says so.
 
     Raises:
-      InputError: if a file exists and ``overwrite`` is not set, or cannot be written.
+      InputError: if something of it exists and ``overwrite`` is not set, or cannot be
+        written.
       MissingExtraError: if OpenCV is absent.
     """
-    files = demo_files(folder)
-    images.refuse_existing(files, overwrite)
     images.opencv()
-    images.make_folder(folder)
-    scene = torus_knot_scene(*settings)
-    _write_scene(files, scene, overwrite)
-    note(f"rendering {scene.gaussians.capacity:,} Gaussians (the first view compiles)")
-    first, frames = _turn(scene)
-    images.write_file(files.still, _png(first.rgb))
-    depth = images.depth_picture(np.asarray(first.depth))
-    # Near is bright, as pictures of depth mostly are; 0 stays "nothing".
-    shown = np.where(depth.pixels > 0, 65536 - depth.pixels.astype(np.int32), 0)
-    images.write_file(files.depth, images.encode_png(shown.astype(np.uint16)))
-    fps = len(frames) / _TURN_SECONDS
-    images.write_file(files.turntable, encode_animation(".webp", frames, fps))
-    return files
+    files = demo_files(folder)
+    _refuse_existing(files, overwrite)
+    size = f"{settings.width} × {settings.height} px"
+    note(f"taking {settings.photos} photographs of {size} of a still life")
+    taken = DemoDatasetSettings(
+        photos=settings.photos,
+        width=settings.width,
+        height=settings.height,
+        points=5000,
+        seed=settings.seed,
+    )
+    write_demo_dataset(files.dataset, taken, overwrite=overwrite)
+    config = demo_config(settings.steps, settings.seed)
+    run = RunSettings(dataset=files.dataset, config=config)
+    result = start_run(run, files.run, overwrite=overwrite)
+    if result.finished:
+        _turn(files, run, overwrite)
+    return files, result
 
 
-def _write_scene(files: DemoFiles, scene: SyntheticScene, overwrite: bool) -> None:
-    save(files.scene, scene.gaussians, overwrite=overwrite)
-    entries = [
-        CameraEntry(f"orbit_{index:03d}", camera)
-        for index, camera in enumerate(scene.cameras)
-    ]
-    images.write_file(files.cameras, transforms_json(entries).encode())
+def _refuse_existing(files: DemoFiles, overwrite: bool) -> None:
+    photos = files.dataset / "transforms.json"
+    images.refuse_existing(
+        [photos, run_files(files.run).config, files.turntable], overwrite
+    )
 
 
-def _turn(scene: SyntheticScene) -> tuple[Render, list[np.ndarray]]:
-    """The first view, and pictures of all views at half the size."""
-    # All views are alike, so one size of the work is enough: it compiles faster.
-    config = RasterConfig(outputs=("rgb", "depth"), rungs=1)
-    background = jnp.asarray(scene.background)
-    first, frames = None, []
-    for camera in progress(scene.cameras, "turntable"):
-        view = render_exact(scene.gaussians, camera, config, background)
-        first = view if first is None else first
-        frames.append(images.to_8_bit(_halved(np.asarray(view.rgb))))
-    assert first is not None, "an orbit has a camera"
-    return first, frames
-
-
-def _halved(image: np.ndarray) -> np.ndarray:
-    """Means over 2 × 2 pixels; an odd last row or column is cut off."""
-    height, width = image.shape[0] // 2, image.shape[1] // 2
-    blocks = image[: 2 * height, : 2 * width].reshape(height, 2, width, 2, -1)
-    return blocks.mean(axis=(1, 3))
-
-
-def _png(rgb) -> bytes:
-    return images.encode_png(images.to_8_bit(np.asarray(rgb)))
+def _turn(files: DemoFiles, run: RunSettings, overwrite: bool) -> None:
+    data = load_data(run)
+    entries = path_entries(data, "orbit", frames=_TURN_FRAMES)
+    write_flight(
+        open_subject(files.run, scene=data.scene),
+        entries,
+        files.turntable,
+        fps=_TURN_FRAMES / _TURN_SECONDS,
+        overwrite=overwrite,
+    )

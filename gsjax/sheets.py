@@ -56,17 +56,20 @@ def comparison(rows: Sequence[SheetRow], *, width: int = 320) -> np.ndarray:
     return np.concatenate([_row(row, width, with_depth) for row in rows])
 
 
-def depth_colors(depth: np.ndarray) -> tuple[np.ndarray, float, float]:
+def depth_colors(
+    depth: np.ndarray, limits: tuple[float, float] | None = None
+) -> tuple[np.ndarray, float, float]:
     """([H, W, 3] uint8, near, far): Turbo from near (red) to far (blue).
 
-    Near and far are the 2nd and the 98th percentile, both 0 if there is no depth.
+    Near and far are ``limits``, or else the 2nd and the 98th percentile, both 0 if
+    there is no depth.
     """
     cv2 = images.opencv()
     found = np.isfinite(depth) & (depth > 0)
     pixels = np.full((*depth.shape, 3), _NOTHING, np.uint8)
     if not found.any():
         return pixels, 0.0, 0.0
-    near, far = (float(p) for p in np.percentile(depth[found], (2, 98)))
+    near, far = limits or np.percentile(depth[found], (2, 98)).tolist()
     # The ends of the map are nearly black.
     closeness = (far - np.where(found, depth, far)) / max(far - near, 1e-12)
     level = images.to_8_bit(0.06 + 0.88 * np.clip(closeness, 0, 1))

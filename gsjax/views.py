@@ -1,6 +1,6 @@
-"""Views of a scene to image files: the work behind `gsjax render`."""
+"""Views of a scene to image files, one or several for each camera."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,16 +12,12 @@ from gsjax.cameras import Camera
 from gsjax.console import progress, say
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
-from gsjax.io import load
-from gsjax.raster.render import render_exact
-from gsjax.raster.types import RasterConfig
-from gsjax.scene.transforms import load_transforms
+from gsjax.raster.render import exact_config, render_exact
+from gsjax.raster.types import RasterConfig, Render
+from gsjax.scene.transforms import CameraEntry
+from gsjax.subjects import Subject
 
-_PRESETS = {
-    "compat": RasterConfig.compat,
-    "accurate": RasterConfig.accurate,
-    "fast": RasterConfig.fast,
-}
+_MARGIN = 1.5  # room for views that show more than the first
 
 
 class _Target(NamedTuple):
@@ -32,63 +28,65 @@ class _Target(NamedTuple):
     npy: Path | None
 
 
-def render_views(
-    scene: Path,
-    cameras: Path,
+def write_views(
+    subject: Subject,
+    entries: Sequence[CameraEntry],
     folder: Path,
     *,
-    preset: str = "compat",
-    size: tuple[int, int] | None = None,
     kinds: Sequence[str] = ("rgb",),
-    background: Sequence[float] = (0.0, 0.0, 0.0),
     npy: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Render every camera of a file; one result line for each image.
+    """Render every camera to files of its name; one result line for each image.
 
     Args:
-      scene: file of the Gaussians.
-      cameras: a `transforms.json`.
+      subject: what to render.
+      entries: the cameras.
       folder: where the images go; created if missing.
-      preset: "compat", "accurate" or "fast".
-      size: (width, height) to render at; None takes that of the file.
       kinds: of "rgb", "alpha" and "depth"; the first has the plain name.
-      background: RGB behind the scene.
       npy: also write float32 arrays, linear and unclipped.
       overwrite: whether images that exist may be replaced.
 
     Raises:
-      InputError: if a file cannot be read or written, is not as it should be, or
-        exists and ``overwrite`` is not set.
+      InputError: if the scene cannot be read, or an image exists and ``overwrite`` is
+        not set, or cannot be written.
       CapacityError: if a view wants more memory than can be addressed.
       MissingExtraError: if OpenCV is absent.
     """
     images.opencv()
-    entries = load_transforms(cameras, size=size)
     targets = [_targets(folder, entry.name, kinds, npy) for entry in entries]
     _refuse_conflicts(targets, overwrite)
-    gaussians = load(scene)
+    gaussians = subject.load()
     images.make_folder(folder)
-    behind = jnp.asarray(background, jnp.result_type(float))
-    config = _PRESETS[preset](outputs=tuple(kinds))
-    for index in progress(range(len(entries)), "views"):
-        camera = entries[index].camera
-        config = config.replace(pair_capacity=_capacity(gaussians, camera, config))
-        view = render_exact(gaussians, camera, config, behind)
-        wanted = capacity_bucket(int(view.demand.capacity))
-        config = config.replace(pair_capacity=max(config.pair_capacity or 1, wanted))
-        for target in targets[index]:
+    config = subject.config.replace(outputs=tuple(kinds))
+    cameras = [entry.camera for entry in entries]
+    views = rendered(gaussians, cameras, config, subject.background)
+    for of_view, view in zip(progress(targets, "views"), views):
+        for target in of_view:
             _write(target, np.asarray(getattr(view, target.kind), np.float32))
 
 
-def _capacity(gaussians: Gaussians, camera: Camera, config: RasterConfig) -> int:
-    """Room for pairs: never less than for the views before, so as to grow once.
+def rendered(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    config: RasterConfig,
+    background: Sequence[float],
+) -> Iterator[Render]:
+    """`render_exact` of each camera in turn.
 
-    The first guess is eight tiles a Gaussian and two Gaussians a tile.
+    The capacity fits the first view, and grows with the others: it never shrinks, so
+    that few programs are compiled.
     """
-    tiles = camera.width * camera.height // config.tile_size**2
-    guess = capacity_bucket(8 * gaussians.capacity + 2 * tiles)
-    return max(guess, config.pair_capacity or 1)
+    behind = jnp.asarray(background, jnp.result_type(float))
+    for index, camera in enumerate(cameras):
+        if index == 0 and config.pair_capacity is None:
+            fitted = exact_config(gaussians, camera, config).pair_capacity or 1
+            roomy = capacity_bucket(int(_MARGIN * fitted))
+            config = config.replace(pair_capacity=roomy)
+        view = render_exact(gaussians, camera, config, behind)
+        wanted = capacity_bucket(int(view.demand.capacity))
+        config = config.replace(pair_capacity=max(config.pair_capacity or 1, wanted))
+        yield view
 
 
 def _targets(folder: Path, name: str, kinds: Sequence[str], npy: bool) -> list[_Target]:

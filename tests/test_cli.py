@@ -179,12 +179,13 @@ BAD = {
     "suffix": (3, lambda _s, _t: ["info", "a.spz"], "no known format"),
     "command": (2, lambda _s, _t: ["paint"], "paint"),
     "option": (2, lambda s, _t: ["info", str(s / "scene.ply"), "--foo"], "foo"),
-    "missing option": (2, lambda _s, _t: ["render", "a.ply"], "--cameras"),
+    "no cameras": (2, lambda _s, t: ["render", "a.ply", "-o", str(t)], "--cameras"),
+    "missing option": (2, lambda _s, _t: ["render", "a.ply"], "--out"),
     "choice": (2, lambda s, t: render_args(s, t, "--preset", "best"), "best"),
     "size": (2, lambda s, t: render_args(s, t, "--size", "0x3"), "--size '0x3'"),
     "what": (2, lambda s, t: render_args(s, t, "--what", "rgb,x"), "--what"),
     "colour": (2, lambda s, t: render_args(s, t, "--background", "1,2"), "R,G,B"),
-    "frames": (2, lambda _s, _t: ["demo", "--frames", "0"], "--frames"),
+    "steps": (2, lambda _s, _t: ["demo", "--steps", "0"], "--steps"),
 }
 
 
@@ -254,7 +255,7 @@ def test_import_is_light():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-# --- info, doctor, demo ---
+# --- info, doctor ---
 
 
 def test_info(scene, capsys):
@@ -306,35 +307,9 @@ def test_doctor(capsys, monkeypatch):
     assert "NOT WELL" in capsys.readouterr().out
 
 
-@pytest.mark.long
-def test_demo(tmp_path, capsys):
-    import cv2
-
-    args = ["demo", "-o", str(tmp_path), "--gaussians", "80", "--frames", "3"]
-    args += ["--size", "40x30"]
-    assert cli.main(args) == 0
-    said = capsys.readouterr()
-    paths = [Path(line) for line in said.out.splitlines()]
-    assert sorted(paths) == sorted(tmp_path.iterdir())
-    assert read_image(tmp_path / "still.png").shape == (30, 40, 3)
-    assert read_image(tmp_path / "depth.png").dtype == np.uint16
-    done, turntable = cv2.imreadanimation(str(tmp_path / "turntable.webp"))
-    assert done
-    assert len(turntable.frames) == 3
-    assert turntable.frames[0].shape[:2] == (15, 20)
-    # The commands that it says to try next are commands.
-    tries = [line.split()[2:] for line in said.err.splitlines() if "  gsjax " in line]
-    assert [line[0] for line in tries] == ["info", "render"]
-    for line in tries:
-        assert cli.main(line) == 0
-    capsys.readouterr()
-    assert cli.main(args) == 3
-    assert "exists; pass --overwrite" in error_of(capsys)
-
-
 def test_help_and_version(capsys):
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("gsjax ")
-    for args in ([], ["--help"], ["render", "--help"]):
+    for args in ([], ["--help"], ["render", "--help"], ["export", "--help"]):
         assert cli.main(args) == 0
         assert "usage: gsjax" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""`gsjax demo`: a made-up scene, rendered, and files to try the others on."""
+"""`gsjax demo`: photographs from nothing, a scene trained on them, and a turntable."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,36 +12,57 @@ from gsjax.console import note, say
 
 @dataclass(kw_only=True)
 class DemoCommand(Command):
-    """Make up a scene, render it, and write files to try the other commands on."""
+    """Take photographs of a made-up still life, train a scene on them, and show it."""
 
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")] = Path("gsjax-demo")
-    """Folder for the files; created if missing."""
-    gaussians: int = 20_000
-    """How many the knot consists of; the floor takes half as many more."""
-    frames: int = 48
-    """Views of the turntable."""
-    size: Annotated[str, arg(metavar="WxH")] = "640x480"
-    """Size of the still image; the turntable has half of it."""
+    """Folder for dataset/, run/ and turntable.webp; created if missing."""
+    steps: int = 600
+    """Steps of training."""
+    size: Annotated[str, arg(metavar="WxH")] = "256x192"
+    """Size of the photographs."""
+    photos: int = 40
+    """How many; every 8th is held out to measure with."""
+    seed: int = 0
+    """Of the points to start from, and of the training."""
     overwrite: bool = False
-    """Replace files that exist."""
+    """Replace a demonstration that exists."""
 
     def run(self) -> int:
         width, height = parse_size(self.size)
-        if min(self.gaussians, self.frames, width // 2, height // 2) < 1:
-            raise UsageError("--gaussians and --frames from 1, --size from 2x2")
+        if min(width, height) < 16:
+            raise UsageError(f"--size {self.size}: from 16x16")
+        if self.steps < 1 or not 2 <= self.photos <= 1000:
+            raise UsageError("--steps from 1, --photos from 2 to 1000")
+        if not 0 <= self.seed < 2**31:
+            raise UsageError(f"--seed {self.seed}: from 0 to {2**31 - 1} is wanted")
         use_all_cores()
         from gsjax.demo import DemoSettings, run_demo
-        from gsjax.scene.synthetic import BACKGROUND
 
-        settings = DemoSettings(self.gaussians, self.frames, width, height)
-        files = run_demo(self.out, settings, overwrite=self.overwrite)
-        for path in files:
+        settings = DemoSettings(self.photos, width, height, self.steps, self.seed)
+        files, result = run_demo(self.out, settings, overwrite=self.overwrite)
+        if not result.finished:
+            again = f"gsjax train {files.dataset} -o {files.run} --resume"
+            note(f"stopped after step {result.step}; go on with {again}")
+            return 130
+        summary = result.summary
+        assert summary is not None, "some views are held out"
+        for path in (
+            result.files.splat,
+            result.files.preview,
+            result.files.curves,
+            files.turntable,
+        ):
             say(str(path))
-        background = ",".join(f"{value:g}" for value in BACKGROUND)
-        note("done; next, try")
-        note(f"  gsjax info {files.scene}")
-        note(
-            f"  gsjax render {files.scene} --cameras {files.cameras} "
-            f"-o {self.out / 'views'} --what rgb,depth --background {background}"
+        say(
+            f"{result.gaussians:,} Gaussians, {result.seconds:.0f} s; "
+            f"{summary.views} held-out views: PSNR {summary.psnr:.2f} dB, "
+            f"SSIM {summary.ssim:.4f}"
         )
+        note("done; next, try")
+        note(f"  gsjax info {files.run}")
+        note(f"  gsjax render {files.run} --path test -o {self.out / 'views'}")
+        note(f"  gsjax export {files.run} {self.out / 'scene.ply'} --min-opacity 0.01")
+        note("and with photographs of your own")
+        note("  gsjax sfm PHOTOS -o DATASET")
+        note("  gsjax train DATASET -o RUN --preset fast")
         return 0

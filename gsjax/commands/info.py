@@ -1,10 +1,11 @@
-"""`gsjax info`: what a scene consists of."""
+"""`gsjax info`: what a scene or a run consists of."""
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from gsjax.commands.common import Command, use_all_cores
 from gsjax.console import say
@@ -12,10 +13,10 @@ from gsjax.console import say
 
 @dataclass(kw_only=True)
 class InfoCommand(Command):
-    """Say what a scene consists of."""
+    """Say what a scene consists of, and how a run went."""
 
-    scene: Positional[Path]
-    """The Gaussians: a .ply file."""
+    scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
+    """The Gaussians: a .ply file, or the folder of a run."""
     json: bool = False
     """Print JSON."""
 
@@ -23,11 +24,20 @@ class InfoCommand(Command):
         use_all_cores()
         from gsjax.info import describe, info_text
         from gsjax.io import load
+        from gsjax.runinfo import describe_run, run_text
+        from gsjax.subjects import is_run
+        from gsjax.train.run import run_files
 
-        facts = describe(load(self.scene))
-        facts["file_bytes"] = self.scene.stat().st_size
-        if self.json:
-            say(json.dumps({"path": str(self.scene), **facts}, indent=2))
-        else:
-            say(info_text(str(self.scene), facts))
+        told: dict[str, Any] = {"path": str(self.scene)}
+        texts, splat = [], self.scene
+        if is_run(self.scene):
+            told["run"] = describe_run(self.scene)
+            texts.append(run_text(str(self.scene), told["run"]))
+            splat = run_files(self.scene).splat
+        if splat.exists() or "run" not in told:
+            facts = describe(load(splat))
+            facts["file_bytes"] = splat.stat().st_size
+            told |= facts
+            texts.append(info_text(str(splat), facts))
+        say(json.dumps(told, indent=2) if self.json else "\n".join(texts))
         return 0

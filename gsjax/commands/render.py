@@ -1,4 +1,4 @@
-"""`gsjax render`: images of a scene from a list of cameras."""
+"""`gsjax render`: pictures and movies of a scene."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,52 +8,131 @@ from tyro.conf import Positional, arg
 
 from gsjax.commands.common import (
     Command,
+    UsageError,
     parse_background,
     parse_kinds,
     parse_size,
     use_all_cores,
 )
+from gsjax.console import note, say
+
+_OTHER_MOVIES = (".mp4", ".mov", ".m4v", ".avi", ".mkv")
 
 
 @dataclass(kw_only=True)
 class RenderCommand(Command):
-    """Render a scene from a list of cameras, one image each."""
+    """Render a scene from a list of cameras or along a path: images or a movie."""
 
-    scene: Positional[Path]
-    """The Gaussians: a .ply file."""
-    cameras: Path
+    scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
+    """The Gaussians: a .ply file, or the folder of a run."""
+    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|MOVIE")]
+    """Folder for the images, created if missing; or a movie: .gif, .webp or .webm."""
+    cameras: Path | None = None
     """The cameras: a transforms.json (NeRF, instant-ngp, nerfstudio)."""
-    out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
-    """Folder for the images; created if missing."""
+    path: Literal["test", "train", "orbit", "spiral", "interpolate"] | None = None
+    """Of a run: its held-out or its training views; once around what they look at; a
+    spiral before it; or a flight through all of them. Default of a run: orbit."""
+    frames: int | None = None
+    """Of orbit, spiral and interpolate; default 120."""
+    fps: float | None = None
+    """Of a movie; default 24."""
     npy: bool = False
     """Also write each image as .npy of linear float32."""
-    preset: Literal["compat", "accurate", "fast"] = "compat"
-    """Which constants to render with; see RasterConfig."""
+    preset: Literal["compat", "accurate", "fast"] | None = None
+    """Which constants to render with, see RasterConfig; default: those of the run, of
+    a .ply compat."""
     size: Annotated[str | None, arg(metavar="WxH")] = None
-    """Size of the images, e.g. 800x600; default: as in the file."""
+    """Size of the images, e.g. 800x600; default: as in the file, or as in training."""
     what: Annotated[str, arg(metavar="KINDS")] = "rgb"
-    """rgb, alpha or depth, or several with commas; the first is NAME.png, a further
-    one e.g. NAME.depth.png."""
-    background: Annotated[str, arg(metavar="R,G,B")] = "0,0,0"
-    """Colour behind the scene, each usually 0 to 1."""
+    """rgb, alpha or depth, or for images several with commas; the first is NAME.png, a
+    further one e.g. NAME.depth.png."""
+    background: Annotated[str | None, arg(metavar="R,G,B")] = None
+    """Colour behind the scene, each usually 0 to 1; default: that of the run, of a
+    .ply black."""
     overwrite: bool = False
-    """Replace images that exist."""
+    """Replace what exists."""
 
     def run(self) -> int:
-        from gsjax.views import render_views
-
         size = None if self.size is None else parse_size(self.size)
-        kinds, background = parse_kinds(self.what), parse_background(self.background)
+        kinds = parse_kinds(self.what)
+        background = None
+        if self.background is not None:
+            background = parse_background(self.background)
+        movie = self._is_movie(kinds)
+        path = self._path()
         use_all_cores()
-        render_views(
-            self.scene,
-            self.cameras,
-            self.out,
-            preset=self.preset,
-            size=size,
-            kinds=kinds,
-            background=background,
-            npy=self.npy,
-            overwrite=self.overwrite,
+        from gsjax.flights import path_entries, write_flight
+        from gsjax.scene.transforms import load_transforms
+        from gsjax.subjects import open_subject
+        from gsjax.train.run import load_data, load_settings
+        from gsjax.views import write_views
+
+        scene = None
+        if self.cameras is not None:
+            entries = load_transforms(self.cameras, size=size)
+        else:
+            settings = load_settings(self.scene)
+            data = load_data(settings)
+            frames, largest = self.frames or 120, settings.config.max_size
+            entries = path_entries(
+                data, path, frames=frames, max_size=largest, size=size
+            )
+            scene = data.scene
+        if not entries:
+            raise UsageError(f"--path {path}: this run has no such views")
+        subject = open_subject(
+            self.scene, scene=scene, preset=self.preset, background=background
         )
+        if movie:
+            rate = 24.0 if self.fps is None else self.fps
+            count = write_flight(
+                subject, entries, self.out, kind=kinds[0], fps=rate,
+                overwrite=self.overwrite,
+            )  # fmt: skip
+            note(f"{count} frames, {count / rate:.1f} s")
+            say(str(self.out))
+        else:
+            write_views(
+                subject, entries, self.out, kinds=kinds, npy=self.npy,
+                overwrite=self.overwrite,
+            )  # fmt: skip
         return 0
+
+    def _path(self) -> str:
+        """The path to fly, if it is one.
+
+        Raises:
+          UsageError: if what is asked for does not go together.
+        """
+        from gsjax.subjects import is_run
+
+        if self.cameras is not None and self.path is not None:
+            raise UsageError("--cameras and --path exclude each other")
+        if not is_run(self.scene) and self.cameras is None:
+            raise UsageError(
+                f"{self.scene}: --cameras FILE is wanted for a file; --path is for the "
+                "folder of a run, whose views it goes by"
+            )
+        path = self.path or "orbit"
+        if self.frames is not None:
+            if self.cameras is not None or path in ("test", "train"):
+                raise UsageError("--frames goes with orbit, spiral and interpolate")
+            if not 1 <= self.frames <= 100_000:
+                raise UsageError(f"--frames {self.frames}: from 1 to 100000 is wanted")
+        return path
+
+    def _is_movie(self, kinds: tuple[str, ...]) -> bool:
+        from gsjax.flights import MOVIE_SUFFIXES
+
+        suffix = self.out.suffix.lower()
+        movie = suffix in MOVIE_SUFFIXES
+        if suffix in _OTHER_MOVIES:
+            raise UsageError(f"-o {self.out}: {', '.join(MOVIE_SUFFIXES)} are written")
+        if movie and (len(kinds) > 1 or self.npy):
+            raise UsageError(
+                f"-o {self.out}: a movie shows one of --what, and has no --npy; a "
+                "folder takes more"
+            )
+        if self.fps is not None and not (movie and 0.1 <= self.fps <= 1000):
+            raise UsageError(f"--fps {self.fps:g}: of a movie, from 0.1 to 1000")
+        return movie

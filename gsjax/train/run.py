@@ -7,6 +7,7 @@ RUN/splat.ply         the scene, in the coordinates of the dataset
 RUN/eval.json         PSNR and SSIM of the held-out views
 RUN/renders/          those views
 RUN/preview.png       photograph, render, error and depth of some of them
+RUN/curves.png        PSNR by step
 """
 
 import json
@@ -45,6 +46,7 @@ from gsjax.train.fit import (
     fit,
     subset,
 )
+from gsjax.train.history import read_metrics, write_curves
 from gsjax.train.report import Reporter
 from gsjax.train.step import TrainState
 
@@ -83,6 +85,7 @@ class RunFiles(NamedTuple):
     eval: Path
     renders: Path
     preview: Path
+    curves: Path
 
 
 class RunResult(NamedTuple):
@@ -128,6 +131,7 @@ def run_files(folder: Path) -> RunFiles:
         eval=folder / "eval.json",
         renders=folder / "renders",
         preview=folder / "preview.png",
+        curves=folder / "curves.png",
     )
 
 
@@ -255,6 +259,7 @@ def _train(
     seconds = before + (result.progress.seconds if result.progress else 0.0)
     _save_state(files, result.state, result.pair_capacity, seconds)
     save_scene(files.splat, result.gaussians, data.scene, overwrite=True)
+    write_curves(files.curves, read_metrics(files.metrics), len(scene.views))
     finished = int(result.state.step) >= config.steps
     summary = _evaluated(settings, data, photos, result, files) if finished else None
     return RunResult(

@@ -1,0 +1,90 @@
+"""What the commands are given as a scene: a .ply file, or the folder of a run."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from gsjax.errors import InputError
+from gsjax.gaussians import Gaussians
+from gsjax.io import load
+from gsjax.raster.types import RasterConfig
+from gsjax.scene.types import Scene
+from gsjax.train.run import background_of, load_scene, load_settings, run_files
+
+PRESETS = {
+    "compat": RasterConfig.compat,
+    "accurate": RasterConfig.accurate,
+    "fast": RasterConfig.fast,
+}
+
+
+class Subject(NamedTuple):
+    """A scene to be rendered, and how it wants to be.
+
+    Attributes:
+      load: reads the Gaussians; called when all else is found to be well.
+      config: how to render.
+      background: RGB behind the scene.
+    """
+
+    load: Callable[[], Gaussians]
+    config: RasterConfig
+    background: tuple[float, ...]
+
+
+def is_run(path: Path) -> bool:
+    """Whether a name means a run: a folder, or nothing that is there with a suffix."""
+    return path.is_dir() or not (path.exists() or path.suffix)
+
+
+def splat_file(path: Path) -> Path:
+    """The Gaussians of a scene: the file itself, or that of the run.
+
+    Raises:
+      InputError: if it is a run that is none, or that has no Gaussians yet.
+    """
+    if not is_run(path):
+        return path
+    load_settings(path)
+    splat = run_files(path).splat
+    if not splat.exists():
+        raise InputError(
+            f"{splat}: missing; the run did not come to an end: go on with it, "
+            "gsjax train DATASET -o RUN --resume"
+        )
+    return splat
+
+
+def open_subject(
+    path: Path,
+    *,
+    scene: Scene | None = None,
+    preset: str | None = None,
+    background: tuple[float, ...] | None = None,
+) -> Subject:
+    """A scene by its file or run.
+
+    Args:
+      path: a .ply file, or the folder of a run.
+      scene: the dataset of that run: coordinates are then those of its cameras as
+        `load_dataset` gives them, else those of the file.
+      preset: name of the constants to render with; None takes those of the run, for a
+        file "compat".
+      background: RGB; None takes that of the run, for a file black.
+
+    Raises:
+      InputError: as `splat_file`.
+    """
+    config, behind = RasterConfig.compat(), (0.0, 0.0, 0.0)
+    if is_run(path):
+        trained = load_settings(path).config
+        config, behind = trained.raster, background_of(trained)
+    if preset is not None:
+        # Opacities were learnt with or without it: no matter of taste.
+        config = PRESETS[preset](antialias=config.antialias)
+    splat = splat_file(path)
+    reader = (
+        partial(load, splat) if scene is None else partial(load_scene, splat, scene)
+    )
+    return Subject(reader, config, behind if background is None else background)

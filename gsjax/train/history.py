@@ -1,0 +1,56 @@
+"""What a run wrote of its steps, read back, and as a picture."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsjax.curves import Series, curves_png
+
+_NEEDED = {"step", "seconds", "psnr", "gaussians"}
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Lines of a `metrics.jsonl`, but for those cut short; none if it is not there."""
+    if not path.exists():
+        return []
+    lines = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            record = json.loads(line)
+        except ValueError:
+            continue  # cut short by a kill
+        if isinstance(record, dict) and record.keys() >= _NEEDED:
+            lines.append(record)
+    return lines
+
+
+def write_curves(path: Path, metrics: list[dict[str, Any]], window: int) -> None:
+    """PSNR by step: of the view that each step saw, and its mean.
+
+    Args:
+      path: of the PNG; replaced if it exists.
+      metrics: see `read_metrics`.
+      window: steps of the mean: an epoch has seen all views.
+
+    Raises:
+      InputError: if it cannot be written.
+    """
+    steps = np.asarray([record["step"] for record in metrics], float)
+    psnr = np.asarray([record["psnr"] for record in metrics], float)
+    window = max(1, min(window, len(psnr)))
+    good = np.isfinite(psnr)
+    both = np.cumsum([np.where(good, psnr, 0), good], axis=1, dtype=float)
+    both = np.pad(both, ((0, 0), (1, 0)))
+    total, count = both[:, window:] - both[:, :-window]
+    mean = total / np.where(count > 0, count, np.nan)
+    left = int(metrics[-1]["gaussians"]) if metrics else 0
+    curves_png(
+        path,
+        [
+            Series("view of the step", steps, psnr),
+            Series(f"mean of {window}", steps[window // 2 :][: len(mean)], mean),
+        ],
+        title=f"PSNR in training, dB ({left:,} Gaussians)",
+    )

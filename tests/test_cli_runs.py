@@ -1,0 +1,278 @@
+"""The command line on a run: the demonstration makes it, the others show it."""
+
+import contextlib
+import io
+import json
+import shutil
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+
+import gsjax
+from gsjax import cli
+from gsjax.gaussians import activate
+
+WIDTH, HEIGHT, PHOTOS, STEPS = 64, 48, 9, 20
+HELD_OUT = ["photo_000", "photo_008"]
+DEMO = ["--photos", str(PHOTOS), "--size", f"{WIDTH}x{HEIGHT}", "--steps", str(STEPS)]
+
+
+class Demo(NamedTuple):
+    """A small demonstration: its folder, and what it said."""
+
+    folder: Path
+    out: str
+    err: str
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Demo:
+    folder = tmp_path_factory.mktemp("demo") / "out"
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        assert cli.main(["demo", "-o", str(folder), *DEMO]) == 0
+    return Demo(folder, out.getvalue(), err.getvalue())
+
+
+@pytest.fixture
+def demo(made) -> Path:
+    return made.folder
+
+
+def read_image(path: Path) -> np.ndarray:
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    return image[..., ::-1] if image.ndim == 3 else image
+
+
+def read_movie(path: Path) -> np.ndarray:
+    """[F, H, W, 3] RGB."""
+    done, movie = cv2.imreadanimation(str(path))
+    assert done
+    return np.stack([frame[..., 2::-1] for frame in movie.frames])
+
+
+def error_of(capsys) -> str:
+    """The one line on stderr."""
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("gsjax: error: ")
+    return lines[0]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+# --- demo ---
+
+
+@pytest.mark.long
+def test_demo(made, capsys):
+    """Everything that it tells is there, and it learns."""
+    out = made.folder
+    *paths, result = made.out.splitlines()
+    assert all(Path(path).exists() for path in paths)
+    run = out / "run"
+    wanted = [run / "splat.ply", run / "preview.png", run / "curves.png"]
+    assert [Path(p) for p in paths] == [*wanted, out / "turntable.webp"]
+    assert "2 held-out views: PSNR " in result
+    quality = json.loads((run / "eval.json").read_text())
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    losses = [json.loads(line)["loss"] for line in lines]
+    assert len(losses) == STEPS
+    assert np.mean(losses[-5:]) < 0.85 * np.mean(losses[:5])
+    assert quality["psnr"] > 17
+    assert len(names(out / "dataset" / "images")) == PHOTOS
+    turntable = read_movie(out / "turntable.webp")
+    assert turntable.shape == (48, HEIGHT, WIDTH, 3)
+    assert turntable.std() > 20, "the pictures are not empty"
+    assert np.abs(turntable[0].astype(int) - turntable[24]).mean() > 2, "it turns"
+    # The commands that it says to try next are commands.
+    tries = [line.split()[2:] for line in made.err.splitlines() if "  gsjax " in line]
+    assert [line[0] for line in tries] == ["info", "render", "export", "sfm", "train"]
+    for line in tries[:3]:
+        assert cli.main(line) == 0
+    capsys.readouterr()
+    assert cli.main(["demo", "-o", str(out), *DEMO]) == 3
+    assert "exists; pass --overwrite" in error_of(capsys)
+
+
+# --- render ---
+
+
+@pytest.mark.long
+def test_held_out_views_are_those_of_the_evaluation(demo, tmp_path, capsys):
+    args = ["render", str(demo / "run"), "--path", "test", "-o", str(tmp_path)]
+    assert cli.main(args) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == [str(tmp_path / f"{name}.png") for name in HELD_OUT]
+    for name in HELD_OUT:
+        wanted = read_image(demo / "run" / "renders" / "images" / f"{name}.png")
+        found = read_image(tmp_path / f"{name}.png")
+        assert found.shape == (HEIGHT, WIDTH, 3)
+        assert found.std() > 20
+        assert np.abs(found.astype(int) - wanted).max() <= 1
+    assert cli.main(args) == 3
+    assert "exists; pass --overwrite" in error_of(capsys)
+
+
+@pytest.mark.long
+def test_a_path_to_movies(demo, tmp_path, capsys):
+    """By default an orbit; depth in colours, over one range for all frames."""
+    args = ["render", str(demo / "run"), "--frames", "3", "--fps", "2"]
+    for kind in ("rgb", "depth"):
+        path = tmp_path / "new" / f"{kind}.webp"
+        assert cli.main([*args, "-o", str(path), "--what", kind]) == 0
+        said = capsys.readouterr()
+        assert said.out.splitlines() == [str(path)]
+        assert "3 frames, 1.5 s" in said.err
+        assert read_movie(path).shape == (3, HEIGHT, WIDTH, 3)
+    depth = read_movie(tmp_path / "new" / "depth.webp").astype(int)
+    seen = (depth.max(-1) - depth.min(-1)) > 100
+    assert 0.05 < seen.mean() < 0.95
+    assert cli.main([*args, "-o", str(path)]) == 3
+    assert "exists" in error_of(capsys)
+
+
+@pytest.mark.long
+def test_a_path_to_a_folder(demo, tmp_path, capsys):
+    more = ["--path", "interpolate", "--frames", "2", "--size", "32x24", "--npy"]
+    more += ["--what", "rgb,alpha", "--background", "1,1,1"]
+    assert cli.main(["render", str(demo / "run"), "-o", str(tmp_path), *more]) == 0
+    capsys.readouterr()
+    stems = [f"frame_000{n}{kind}" for n in (1, 2) for kind in ("", ".alpha")]
+    wanted = [f"{stem}{suffix}" for stem in stems for suffix in (".npy", ".png")]
+    assert names(tmp_path) == sorted(wanted)
+    rgb = np.load(tmp_path / "frame_0001.npy")
+    alpha = np.load(tmp_path / "frame_0001.alpha.npy")
+    assert rgb.shape == (24, 32, 3)
+    assert 0.05 < (alpha > 0.5).mean() < 0.95
+    assert (rgb[alpha == 0] == 1).all()
+
+
+@pytest.mark.long
+def test_a_run_with_cameras_is_its_file_with_cameras(demo, tmp_path, capsys):
+    cameras = str(demo / "dataset" / "transforms.json")
+    for name, more in (("run", []), ("run/splat.ply", ["--preset", "compat"])):
+        out = tmp_path / Path(name).name
+        args = ["render", str(demo / name), "--cameras", cameras, "-o", str(out)]
+        assert cli.main([*args, *more]) == 0
+    capsys.readouterr()
+    first, second = tmp_path / "run", tmp_path / "splat.ply"
+    assert names(first) == [f"photo_00{n}.png" for n in range(PHOTOS)]
+    for name in names(first):
+        assert (first / name).read_bytes() == (second / name).read_bytes()
+
+
+# --- export, info ---
+
+
+def test_export(demo, tmp_path, capsys):
+    run, out = demo / "run", tmp_path / "new" / "a.ply"
+    whole = gsjax.load(run / "splat.ply")
+    opacities = np.asarray(activate(whole.params)["opacities"])
+    least = float(np.median(opacities))
+    args = ["export", str(run), str(out), "--sh-degree", "0"]
+    assert cli.main([*args, "--min-opacity", repr(least)]) == 0
+    kept = opacities >= least
+    told = f"{out}  {kept.sum():,} of {len(kept):,} Gaussians"
+    assert capsys.readouterr().out.startswith(told)
+    found = gsjax.load(out)
+    assert found.sh_degree == 0
+    np.testing.assert_array_equal(found.params.means, whole.params.means[kept])
+    np.testing.assert_array_equal(found.params.sh, whole.params.sh[kept, :1])
+    assert cli.main(args) == 3
+    assert f"{out}: exists; pass --overwrite" in error_of(capsys)
+    assert cli.main([*args, "--overwrite", "--sh-degree", "3"]) == 0
+    assert f"{out}  {len(kept):,} Gaussians" in capsys.readouterr().out
+    assert gsjax.load(out).sh_degree == 3
+    again = tmp_path / "b.ply"
+    assert cli.main(["export", str(out), str(again)]) == 0
+    assert again.read_bytes() == out.read_bytes()
+    capsys.readouterr()
+    few = ["export", str(run), str(tmp_path / "c.ply"), "--min-opacity", "0.9999"]
+    assert cli.main(few) == 3
+    assert "the greatest is 0." in error_of(capsys)
+    assert not (tmp_path / "c.ply").exists()
+
+
+def test_info_of_a_run(demo, tmp_path, capsys):
+    assert cli.main(["info", str(demo / "run"), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    run, gaussians = facts["run"], gsjax.load(demo / "run" / "splat.ply")
+    assert facts["count"] == gaussians.capacity
+    assert Path(run["dataset"]) == (demo / "dataset").resolve()
+    assert (run["steps_done"], run["steps"]) == (STEPS, STEPS)
+    assert run["evaluation"]["views"] == 2
+    assert cli.main(["info", str(demo / "run")]) == 0
+    text = capsys.readouterr().out
+    assert f"steps             {STEPS} of {STEPS}" in text
+    assert f"PSNR {run['evaluation']['psnr']:.2f} dB" in text
+    assert f"Gaussians         {facts['count']:,}" in text
+    # A run that was killed has no Gaussians yet, and is told of all the same.
+    young = tmp_path / "young"
+    young.mkdir()
+    shutil.copy(demo / "run" / "config.json", young)
+    assert cli.main(["info", str(young)]) == 0
+    assert f"steps             0 of {STEPS}" in capsys.readouterr().out
+
+
+# --- errors ---
+
+
+def no_run(_: Path, tmp_path: Path) -> list[str]:
+    return ["render", str(tmp_path), "-o", str(tmp_path / "o")]
+
+
+def no_splat(demo: Path, tmp_path: Path) -> list[str]:
+    shutil.copy(demo / "run" / "config.json", tmp_path)
+    return ["export", str(tmp_path), str(tmp_path / "a.ply")]
+
+
+def bad_eval(demo: Path, tmp_path: Path) -> list[str]:
+    no_splat(demo, tmp_path)
+    (tmp_path / "eval.json").write_text("[]")
+    return ["info", str(tmp_path)]
+
+
+def no_dataset(demo: Path, tmp_path: Path) -> list[str]:
+    config = json.loads((demo / "run" / "config.json").read_text())
+    config["dataset"] = str(tmp_path / "gone")
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    return ["render", str(tmp_path), "-o", str(tmp_path / "o")]
+
+
+def render(*more: str):
+    """Arguments of `render RUN`."""
+    return lambda demo, _: ["render", str(demo / "run"), *more]
+
+
+BAD = {
+    "no run": (3, no_run, "no run is here"),
+    "missing run": (3, lambda _d, t: ["info", str(t / "none")], "no run is here"),
+    "no splat": (3, no_splat, "--resume"),
+    "bad evaluation": (3, bad_eval, "eval.json: damaged"),
+    "no dataset": (3, no_dataset, "gone: does not exist"),
+    "both": (2, render("--path", "test", "--cameras", "a", "-o", "o"), "exclude"),
+    "frames": (2, render("--path", "train", "--frames", "5", "-o", "o"), "--frames"),
+    "no frames": (2, render("--frames", "0", "-o", "o"), "--frames 0"),
+    "movie": (2, render("-o", "a.mp4"), ".webm are written"),
+    "two kinds": (2, render("-o", "a.gif", "--what", "rgb,depth"), "one of --what"),
+    "arrays": (2, render("-o", "a.gif", "--npy"), "no --npy"),
+    "rate": (2, render("-o", "o", "--fps", "5"), "--fps 5"),
+    "opacity": (2, lambda _d, _t: ["export", "a", "b", "--min-opacity", "1"], "below"),
+    "photos": (2, lambda _d, _t: ["demo", "--photos", "1"], "--photos"),
+    "size": (2, lambda _d, _t: ["demo", "--size", "8x8"], "--size"),
+    "seed": (2, lambda _d, _t: ["demo", "--seed", "-1"], "--seed"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_an_error_is_one_line_and_a_code(name, demo, tmp_path, capsys):
+    code, args, text = BAD[name]
+    assert cli.main(args(demo, tmp_path)) == code
+    assert text in error_of(capsys)
+    assert not (tmp_path / "o").exists()
