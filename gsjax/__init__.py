@@ -8,8 +8,11 @@ from gsjax.cameras import resize_camera as resize_camera
 from gsjax.cameras import stack_cameras as stack_cameras
 from gsjax.devices import use_all_cores as use_all_cores
 from gsjax.errors import CapacityError as CapacityError
+from gsjax.errors import DivergedError as DivergedError
 from gsjax.errors import GsjaxError as GsjaxError
 from gsjax.errors import InputError as InputError
+from gsjax.evaluate import evaluate as evaluate
+from gsjax.evaluate import summarise as summarise
 from gsjax.gaussians import GaussianParams as GaussianParams
 from gsjax.gaussians import Gaussians as Gaussians
 from gsjax.gaussians import capacity_bucket as capacity_bucket
@@ -28,3 +31,12 @@ from gsjax.raster.render import render as render
 from gsjax.raster.render import render_exact as render_exact
 from gsjax.raster.types import RasterConfig as RasterConfig
 from gsjax.raster.types import Render as Render
+from gsjax.scene.dataset import load_dataset as load_dataset
+from gsjax.scene.initialise import init_gaussians as init_gaussians
+from gsjax.scene.photos import load_photos as load_photos
+from gsjax.scene.splits import split_views as split_views
+from gsjax.train.config import TrainConfig as TrainConfig
+from gsjax.train.fit import fit as fit
+from gsjax.train.fit import subset as subset
+from gsjax.train.step import init_state as init_state
+from gsjax.train.step import make_train_step as make_train_step

@@ -18,8 +18,8 @@ _PACKAGES = (
     ("jax", "jax", "everything"),
     ("jaxlib", "jaxlib", "everything"),
     ("numpy", "numpy", "everything"),
-    ("opencv-contrib-python-headless", "cv2", "gsjax render, gsjax demo"),
-    ("pycolmap", "pycolmap", "COLMAP reconstructions"),
+    ("opencv-contrib-python-headless", "cv2", "photographs and images"),
+    ("pycolmap", "pycolmap", "gsjax sfm"),
 )
 _TOLERANCE = 1e-4
 

@@ -10,6 +10,7 @@ Axis legend: R rays or points ([3, R] arrays), H W image, M points, F cameras.
 """
 
 from functools import cache
+from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
@@ -134,7 +135,7 @@ def demo_cameras(
 
 
 def write_demo_dataset(
-    folder: Path,
+    folder: str | PathLike[str],
     settings: DemoDatasetSettings | None = None,
     *,
     overwrite: bool = False,
@@ -150,7 +151,7 @@ def write_demo_dataset(
       InputError: if a file exists and ``overwrite`` is not set, or cannot be written.
       MissingExtraError: if OpenCV is absent.
     """
-    settings = settings or DemoDatasetSettings()
+    folder, settings = Path(folder), settings or DemoDatasetSettings()
     size = settings.width, settings.height
     viewmats, K = demo_cameras(settings.photos, *size)
     names = [f"images/photo_{index:03d}" for index in range(len(viewmats))]
