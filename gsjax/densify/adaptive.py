@@ -110,11 +110,13 @@ def adaptive(settings: AdaptiveSettings, extent: float) -> Densifier:
         norm = jnp.linalg.norm(seen.gradient * half, axis=-1)
         visible = seen.radii > 0
         share = jnp.max(seen.radii, 0) / max(seen.width, seen.height)
-        return AdaptiveStats(
+        seen_now = AdaptiveStats(
             gradient=stats.gradient + jnp.sum(jnp.where(visible, norm, 0), 0),
             views=stats.views + jnp.sum(visible, 0),
             radius=jnp.maximum(stats.radius, share),
         )
+        # Cameras may be of a wider type, which is not to widen the statistics.
+        return jax.tree.map(lambda new, old: new.astype(old.dtype), seen_now, stats)
 
     def due(step: Array) -> Array:
         inside = (step > settings.start) & (step <= settings.stop)

@@ -1,0 +1,109 @@
+"""A capture small enough to train on in a test: 4 views of 32 × 24 px, 60 points."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from conftest import LIGHT
+
+import gsjax
+from gsjax import RasterConfig
+from gsjax.images import to_8_bit
+from gsjax.scene.initialise import init_gaussians
+from gsjax.scene.types import Photo, Scene, View
+from gsjax.train.fit import extent_of
+
+VIEWS, POINTS, WIDTH, HEIGHT = 4, 60, 32, 24
+# Small programs: they take longest in these tests.
+RASTER = RasterConfig(**{**LIGHT, "pair_capacity": 4096}, occlusion=False)
+# No threshold within reach, so that finite differences are those of the gradient.
+SMOOTH = RASTER.replace(alpha_cut=1e-14, alpha_cap=1 - 1e-9, stop=0, stop_rule="after")
+# Compiling takes longest: with these it takes two thirds.
+QUICKLY = {
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+}
+
+
+@cache
+def scene() -> Scene:
+    """Cameras around coloured points; no files."""
+    rng = np.random.default_rng(0)
+    views = []
+    for index in range(VIEWS):
+        turn = 2 * np.pi * index / VIEWS
+        eye = (3 * np.cos(turn), 3 * np.sin(turn), 1.0 + 0.2 * index)
+        K = np.asarray([[30.0, 0, 16.3], [0, 31, 11.8], [0, 0, 1]])
+        viewmat = gsjax.look_at(eye, (0, 0, 0.1))
+        name = f"view_{index}.png"
+        views.append(View(name, Path(name), viewmat, K, WIDTH, HEIGHT))
+    points = rng.uniform(-0.8, 0.8, (POINTS, 3))
+    colors = rng.integers(40, 256, (POINTS, 3)).astype(np.uint8)
+    return Scene(Path("made"), "made", tuple(views), points, colors)
+
+
+EXTENT = extent_of(scene())
+
+
+def true_gaussians() -> gsjax.Gaussians:
+    """What the scene consists of."""
+    return init_gaussians(scene(), sh_degree=0, opacity=0.8, scale=0.6)
+
+
+@cache
+def photos() -> list[Photo]:
+    """Its photographs."""
+    with jax.enable_x64(False):
+        return [photo_of(true_gaussians(), view) for view in scene().views]
+
+
+_render = jax.jit(
+    lambda g, c, b: gsjax.render(g, c, RASTER.replace(outputs=("rgb",)), b).rgb
+)
+
+
+def photo_of(gaussians: gsjax.Gaussians, view: View, background=(0.0, 0.0, 0.0)):
+    """What the view would see."""
+    camera = gsjax.make_camera(
+        viewmat=view.viewmat, K=view.K, width=WIDTH, height=HEIGHT
+    )
+    image = _render(gaussians, camera, jnp.asarray(background))
+    return Photo(to_8_bit(np.asarray(image)), None, None, view.K)
+
+
+def rough_start(sh_degree: int, capacity: int, seed: int = 1) -> gsjax.Gaussians:
+    """Gaussians to learn from, near the true ones: too wide, and of wrong colours."""
+    start = scene()
+    rng = np.random.default_rng(seed)
+    points = start.points + 0.05 * rng.normal(size=start.points.shape)
+    colors = rng.integers(0, 256, start.colors.shape).astype(np.uint8)
+    return init_gaussians(
+        replace(start, points=points, colors=colors),
+        sh_degree=sh_degree,
+        opacity=0.5,
+        capacity=capacity,
+    )
+
+
+def copy(tree):
+    """Arrays of its own, to be donated."""
+    return jax.tree.map(jnp.copy, tree)
+
+
+def bits(tree) -> list[tuple]:
+    """All that the leaves are, random keys included."""
+    out = []
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.random.key_data(leaf)
+        name = jax.tree_util.keystr(path)
+        out.append((name, leaf.dtype, leaf.shape, np.asarray(leaf).tobytes()))
+    return out
+
+
+def changed(first, second) -> list[str]:
+    """Names of the leaves that differ in a bit."""
+    return [a[0] for a, b in zip(bits(first), bits(second), strict=True) if a != b]
