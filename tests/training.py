@@ -80,12 +80,18 @@ def rough_start(sh_degree: int, capacity: int, seed: int = 1) -> gsjax.Gaussians
     rng = np.random.default_rng(seed)
     points = start.points + 0.05 * rng.normal(size=start.points.shape)
     colors = rng.integers(0, 256, start.colors.shape).astype(np.uint8)
-    return init_gaussians(
+    made = init_gaussians(
         replace(start, points=points, colors=colors),
         sh_degree=sh_degree,
         opacity=0.5,
         capacity=capacity,
     )
+    # Of spheres the gradient by the rotation is rounding alone, and Adam follows it.
+    params = made.params
+    stretch = jnp.asarray(rng.normal(0, 0.4, params.log_scales.shape))
+    quats = jnp.asarray(rng.normal(size=params.quats.shape), params.quats.dtype)
+    log_scales = params.log_scales + stretch.astype(params.log_scales.dtype)
+    return made.replace(params=params.replace(quats=quats, log_scales=log_scales))
 
 
 def copy(tree):
