@@ -147,7 +147,7 @@ def project(
         quats=tuple(rows.quats.T),
         log_scales=tuple(rows.log_scales.T),
         logit_opacities=rows.logit_opacities,
-        colors=jnp.moveaxis(colour_rows, 0, -1),
+        colors=tuple(colour_rows.reshape(order.shape[0], -1).T),
         shift=None if probe is None else tuple(probe[order].T),
     )
 
@@ -169,7 +169,7 @@ class _Components(NamedTuple):
     """Parameters of the ranks, [R] each: see `GaussianParams`.
 
     Attributes:
-      colors: [K, 3, R] coefficients, or [C, R] features.
+      colors: 3 K coefficients, the channel running fastest, or C features.
       shift: of the projected mean, px, or None.
     """
 
@@ -177,7 +177,7 @@ class _Components(NamedTuple):
     quats: tuple[Array, ...]
     log_scales: tuple[Array, ...]
     logit_opacities: Array
-    colors: Array
+    colors: tuple[Array, ...]
     shift: tuple[Array, ...] | None
 
 
@@ -198,7 +198,8 @@ def _project_components(
     Gaussians, jax 0.10.2). It is recomputed in the backward pass rather than kept.
     """
     live = lax.iota(jnp.int32, rows.logit_opacities.shape[0]) < count
-    live &= jnp.all(jnp.isfinite(rows.colors), axis=tuple(range(rows.colors.ndim - 1)))
+    for value in rows.colors:
+        live &= jnp.isfinite(value)
     unit, good = safe_normalize(
         tuple(jnp.where(live, q, 1) for q in rows.quats), (1.0, 0.0, 0.0, 0.0)
     )
@@ -229,7 +230,7 @@ def _project_components(
     if harmonic:
         colors = _sh_colors(camera, means, rows.colors, live)
     else:
-        colors = jnp.where(live, rows.colors, 0)
+        colors = jnp.stack([jnp.where(live, value, 0) for value in rows.colors])
     return Projected(
         u=u,
         v=v,
@@ -283,20 +284,26 @@ def _dilate(m1, m2, dilation: float):
     return sharp_a + dilation, b, sharp_c + dilation, det, det_sharp
 
 
-def _sh_colors(camera: Camera, means, sh: Array, live: Array) -> Array:
-    """Colour [3, R] of coefficients [K, 3, R] seen from the camera; + 0.5, ≥ 0."""
-    degree = sh_lib.degree_of(sh.shape[0])
-    coefficients = jnp.where(live, sh, 0)
+def _sh_colors(camera: Camera, means, coefficients, live: Array) -> Array:
+    """Colour [3, R] of 3 K coefficients seen from the camera; + 0.5, ≥ 0.
+
+    Summed in plain sight: as a reduction of [K, 1, R] · [K, 3, R] over K, XLA's CPU
+    backend (jax 0.10.2, YNNPACK) gets it wrong from some 10⁴ Gaussians on.
+    """
+    degree = sh_lib.degree_of(len(coefficients) // 3)
     if degree == 0:
-        raw = sh_lib.C0 * coefficients[0]
+        basis = [sh_lib.C0]
     else:
         centre = camera_centre(camera.viewmat)
         offset = tuple(m - c for m, c in zip(means, centre))
         direction, _ = safe_normalize(offset, (0.0, 0.0, 1.0))
-        basis = jnp.stack(sh_lib.sh_basis(degree, *direction))
-        raw = jnp.sum(basis[:, None] * coefficients, 0)
-    shifted = raw + 0.5
-    return jnp.where(shifted > 0, shifted, 0)
+        basis = sh_lib.sh_basis(degree, *direction)
+    colors = []
+    for channel in range(3):
+        mine = [jnp.where(live, c, 0) for c in coefficients[channel::3]]
+        raw = sum(value * c for value, c in zip(basis, mine)) + 0.5
+        colors.append(jnp.where(raw > 0, raw, 0))
+    return jnp.stack(colors)
 
 
 def conics_of(projected: Projected) -> Array:

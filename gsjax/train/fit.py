@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.errors import DivergedError, InputError
+from gsjax.errors import CapacityError, DivergedError, InputError
 from gsjax.gaussians import Gaussians, capacity_bucket, grow, make_gaussians
 from gsjax.raster.render import exact_config
 from gsjax.raster.types import RasterConfig
@@ -196,7 +196,10 @@ class _Run:
                 frames = make_frames(self.scene.views, self.photos, divisor)
             if pair_capacity is None or finer:
                 pair_capacity = self.pairs_wanted(state, frames)
-            raster = config.raster.replace(pair_capacity=pair_capacity)
+            # No limit of what is visible: only the pairs are regrown.
+            raster = config.raster.replace(
+                pair_capacity=pair_capacity, visible_capacity=None
+            )
             program = self.program(state, frames, raster)
             state, metrics = program(state, frames)
             metrics = jax.device_get(metrics)
@@ -277,7 +280,13 @@ class _Run:
 
 
 def _roomy(count: int, margin: float) -> int:
-    return capacity_bucket(min(int(margin * count), 2**30 - 1))
+    """A pair capacity that holds ``count``, with room to spare where there is."""
+    if count >= 2**30:
+        raise CapacityError(
+            f"a step wants {count:,} or more pairs, above the limit of {2**30 - 1:,}; "
+            "train with smaller images, fewer Gaussians, or larger tiles"
+        )
+    return min(capacity_bucket(int(margin * count)), 2**30 - 1)
 
 
 def grow_state(state: TrainState, capacity: int) -> TrainState:
