@@ -207,6 +207,23 @@ def test_single_batch_and_vmap(report):
         assert batch.demand.visible == mapped.demand.visible.max()
 
 
+def test_a_batch_of_one(report):
+    """It has the leading axis everywhere, radii included."""
+    gaussians, camera = cast(scene_of("random"), jnp.float32)
+    wanted = images(gaussians, camera)
+    batch = images(gaussians, gsjax.stack_cameras([camera]))
+    assert batch.radii.shape == (1, COUNT)
+    np.testing.assert_allclose(batch.radii[0], wanted.radii, rtol=1e-6)
+    assert (wanted.radii > 0).any()
+    for name in ALL:
+        assert getattr(batch, name).shape == (1, *getattr(wanted, name).shape)
+    one = batch._replace(**{name: getattr(batch, name)[0] for name in ALL})
+    error = largest_difference(one, wanted)
+    report("batch of one", error, 1e-6)
+    assert error <= 1e-6
+    assert batch.demand == wanted.demand
+
+
 @pytest.mark.parametrize(
     "changes",
     [

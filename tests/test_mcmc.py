@@ -3,7 +3,6 @@
 import math
 from decimal import Decimal, getcontext
 from fractions import Fraction
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -101,7 +100,6 @@ def scene_with(opacities, active, garbage=0.0, seed=0, scales=0.1, spread=1.0):
     return made.replace(active=jnp.asarray(active))
 
 
-@partial(jax.jit, static_argnames="config")
 def planned(config, key, gaussians):
     return mcmc(config).plan(key, jnp.int32(10), gaussians, ())[0]
 

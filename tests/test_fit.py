@@ -1,0 +1,281 @@
+"""The loop of training: the same bits however it is interrupted, grown or resumed.
+
+In float32, as users have it. Runs share their programs through JAX's cache on disk,
+for each call of `fit` compiles its own.
+"""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import on_cpu
+from jax.experimental.compilation_cache import compilation_cache
+from training import (
+    EXTENT,
+    HEIGHT,
+    POINTS,
+    RASTER,
+    VIEWS,
+    WIDTH,
+    bits,
+    changed,
+    photos,
+    rough_start,
+    scene,
+)
+
+import gsjax.train.fit as fit_module
+from gsjax.densify.adaptive import AdaptiveSettings
+from gsjax.densify.mcmc import McmcSettings
+from gsjax.errors import CapacityError, DivergedError, InputError
+from gsjax.train.checkpoint import load_latest, restore, save_checkpoint
+from gsjax.train.config import Level, TrainConfig
+from gsjax.train.fit import (
+    Hooks,
+    empty_state,
+    fit,
+    grow_state,
+    initial_state,
+    subset,
+)
+from gsjax.train.step import init_state
+
+STEPS, FINER = 60, 30
+CONFIG = TrainConfig(
+    steps=STEPS,
+    levels=(Level(0.0, 2), Level(0.5, 1)),
+    sh_degree=1,
+    sh_every=10,
+    every_checkpoint=7,
+    initial_opacity=0.5,
+    adaptive=AdaptiveSettings(
+        start=0, stop=50, every=7, threshold=1e-5, reset_every=0, max_gaussians=200
+    ),
+    mcmc=McmcSettings(start=0, stop=50, every=7, growth=1.2, max_gaussians=200),
+    exposure=True,
+    raster=RASTER.replace(pair_capacity=None),
+)
+# One resolution for the other: what changes it asks for no strategy.
+CONFIGS = {
+    "adaptive": CONFIG,
+    "mcmc": CONFIG.replace(strategy="mcmc", levels=(Level(0.0, 2),)),
+}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _shared_programs(tmp_path_factory):
+    settings = {  # here, and as everywhere else
+        "jax_compilation_cache_dir": (str(tmp_path_factory.mktemp("programs")), None),
+        "jax_persistent_cache_min_compile_time_secs": (0.5, 1.0),
+        "jax_disable_most_optimizations": (True, False),
+        "jax_enable_x64": (False, True),
+    }
+    for name, (here, _) in settings.items():
+        jax.config.update(name, here)
+    compilation_cache.reset_cache()
+    yield
+    for name, (_, elsewhere) in settings.items():
+        jax.config.update(name, elsewhere)
+    compilation_cache.reset_cache()
+
+
+class Log:
+    """What a run told, and what it was asked to do."""
+
+    def __init__(self, stop_at=None, folder=None):
+        self.records, self.phases, self.saved = [], [], []
+        self.stop_at, self.folder = stop_at, folder
+
+    def hooks(self):
+        return Hooks(self.step, self.phases.append, self.checkpoint, self.stop)
+
+    def step(self, progress):
+        self.records.append(progress.record())
+
+    def stop(self):
+        return self.records[-1]["step"] == self.stop_at
+
+    def checkpoint(self, state, pair_capacity, progress):
+        assert progress.metrics.step == state.step
+        self.saved.append(int(state.step))
+        if self.folder:
+            save_checkpoint(self.folder, state, {"pair_capacity": pair_capacity})
+
+    def told(self, *names):
+        return [tuple(record[name] for name in names) for record in self.records]
+
+
+def run(config, log=None, **kwargs):
+    log = log or Log()
+    return fit(scene(), photos(), config, hooks=log.hooks(), **kwargs), log
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """The uninterrupted run of each strategy."""
+    return {name: run(config) for name, config in CONFIGS.items()}
+
+
+@pytest.mark.parametrize("strategy", CONFIGS)
+def test_it_learns(whole, strategy):
+    result, log = whole[strategy]
+    assert [r["step"] for r in log.records] == list(range(1, STEPS + 1))
+    losses = np.asarray(log.told("loss"))[:, 0]
+    # Of small pictures at first, and blurred ones: large ones are harder.
+    assert losses[-8:].mean() < 0.8 * losses[:8].mean()
+    counts = np.asarray(log.told("gaussians"))[:, 0]
+    assert counts[0] == POINTS
+    assert counts[-1] == int(result.gaussians.active.sum())
+    assert POINTS < counts[-1] <= 200
+    assert all(r["finite"] and not r["overflowed"] for r in log.records)
+    assert log.saved == list(range(7, STEPS, 7))
+    divisors = np.asarray(log.told("divisor"))[:, 0]
+    finer = len(CONFIGS[strategy].levels) > 1
+    wanted = np.where(finer & (np.arange(STEPS) >= FINER), 1, 2)
+    np.testing.assert_array_equal(divisors, wanted)
+    assert f"{WIDTH // 2} × {HEIGHT // 2} px" in log.phases[0]
+    assert result.state.gaussians.params.means.dtype == np.float32
+    for leaf in jax.tree.leaves(result.gaussians.params):
+        assert np.isfinite(leaf).all()
+
+
+@on_cpu
+@pytest.mark.parametrize(
+    ("strategy", "stop_at"),
+    [("adaptive", FINER), ("adaptive", FINER - 1), ("mcmc", 17)],
+)
+def test_stopped_and_taken_up_again(whole, strategy, stop_at, tmp_path):
+    """Across a change of resolution, edits and checkpoints: bit for bit."""
+    config, (wanted, full) = CONFIGS[strategy], whole[strategy]
+    first, log = run(config, Log(stop_at))
+    assert int(first.state.step) == stop_at
+    saved = save_checkpoint(tmp_path, first.state, {"pairs": first.pair_capacity})
+    found = load_latest(saved.parent)
+    template = empty_state(config, EXTENT, VIEWS, found.meta["capacity"])
+    state = restore(found, template)
+    assert changed(state, first.state) == []
+    second, rest = run(config, state=state, pair_capacity=found.meta["pairs"])
+    assert changed(second.state, wanted.state) == []
+    names = ("step", "loss", "psnr", "gaussians", "wanted", "pairs", "capacity")
+    assert log.told(*names) + rest.told(*names) == full.told(*names)
+    assert second.pair_capacity == wanted.pair_capacity
+
+
+@on_cpu
+def test_killed_and_taken_up_from_the_last_checkpoint(whole, tmp_path):
+    config = CONFIGS["adaptive"]
+    run(config, Log(stop_at=22, folder=tmp_path))
+    found = load_latest(tmp_path)
+    assert found.step == 21
+    template = empty_state(config, EXTENT, VIEWS, found.meta["capacity"])
+    pairs = found.meta["pair_capacity"]
+    again, _ = run(config, state=restore(found, template), pair_capacity=pairs)
+    assert changed(again.state, whole["adaptive"][0].state) == []
+
+
+@on_cpu
+def test_too_few_pairs_are_regrown():
+    """Nor is what the caller limits what may be seen."""
+    config = CONFIGS["mcmc"]
+    config = config.replace(raster=config.raster.replace(visible_capacity=2))
+    result, log = run(config, Log(stop_at=4), pair_capacity=7)
+    wanted, full = run(CONFIGS["mcmc"], Log(stop_at=4))
+    assert changed(result.state, wanted.state) == []
+    assert result.pair_capacity > 7
+    assert "7 pairs" in log.phases[0]
+    assert log.told("step", "loss") == full.told("step", "loss")
+    assert full.records == sorted(full.records, key=lambda r: r["step"])
+
+
+@on_cpu
+def test_too_few_slots_are_grown():
+    """Until the first edit the slots do not matter; it tells how many it wants.
+
+    From then on they do: draws are made for all slots at once.
+    """
+    config = CONFIGS["adaptive"]
+    state = init_state(rough_start(1, 64), config, EXTENT, VIEWS)
+    before = bits(state)
+    small, log = run(config, Log(stop_at=6), state=state)
+    large, other = run(config, Log(stop_at=6), state=grow_state(state, 1024))
+    assert changed(grow_state(small.state, 1024), large.state) == []
+    assert log.told("step", "loss", "pairs") == other.told("step", "loss", "pairs")
+    pairs = small.pair_capacity
+    result, log = run(config, Log(stop_at=7), state=small.state, pair_capacity=pairs)
+    (record,) = log.records
+    assert record["wanted"] > 70
+    assert record["gaussians"] == record["capacity"] == 64
+    assert result.gaussians.capacity == 1024
+    assert int(result.gaussians.active.sum()) == 64
+    assert bits(state) == before  # the caller's is still there
+
+
+def test_growing_adds_empty_slots():
+    state = init_state(rough_start(1, 64), CONFIGS["adaptive"], EXTENT, VIEWS)
+    moments = jax.tree.map(lambda a: a + 1, state.moments)
+    state = state.replace(
+        moments=moments, stats=jax.tree.map(jnp.ones_like, state.stats)
+    )
+    grown = grow_state(state, 100)
+    names = ("moments", "stats")
+    for name in names:
+        pairs = zip(
+            jax.tree.leaves(getattr(state, name)), jax.tree.leaves(getattr(grown, name))
+        )
+        for old, new in pairs:
+            if old.ndim:
+                assert new.shape == (100, *old.shape[1:])
+                np.testing.assert_array_equal(new[:64], old)
+                assert (new[64:] == 0).all()
+    assert not grown.gaussians.active[64:].any()
+    template = empty_state(CONFIGS["adaptive"], EXTENT, VIEWS, 100)
+    for a, b in zip(jax.tree.leaves(grown), jax.tree.leaves(template), strict=True):
+        assert (a.shape, a.dtype) == (b.shape, b.dtype)
+
+
+def test_leaving_the_numbers_is_told():
+    config = CONFIGS["mcmc"]
+    state = initial_state(scene(), config)
+    tuning = replace(state.tuning, exposures=state.tuning.exposures * jnp.nan)
+    log = Log()
+    with pytest.raises(DivergedError, match="in 50 steps running, up to step 50"):
+        run(config, log, state=state.replace(tuning=tuning))
+    assert [r["finite"] for r in log.records] == [False] * 49
+
+
+def test_a_finished_run_has_nothing_to_do():
+    config = CONFIGS["adaptive"]
+    state = initial_state(scene(), config).replace(step=jnp.int32(STEPS))
+    result, log = run(config, state=state, pair_capacity=99)
+    assert (result.progress, result.pair_capacity) == (None, 99)
+    assert log.records == log.phases == []
+    assert changed(result.state, state) == []
+
+
+def test_first_states():
+    for name, config in CONFIGS.items():
+        state = initial_state(scene(), config)
+        assert int(state.gaussians.active.sum()) == POINTS
+        assert state.gaussians.capacity == 1024
+        many = config.replace(initial="random", initial_count=500)
+        state = initial_state(scene(), many)
+        assert int(state.gaussians.active.sum()) == 200, name
+
+
+def test_a_photograph_for_each_view():
+    few = subset(scene(), [2, 0])
+    assert [view.name for view in few.views] == ["view_2.png", "view_0.png"]
+    with pytest.raises(InputError, match="4 photos for 2 views"):
+        fit(few, photos(), CONFIG)
+    with pytest.raises(InputError, match="0 photos for 0 views"):
+        fit(subset(scene(), []), [], CONFIG)
+
+
+def test_more_pairs_than_can_be_addressed():
+    roomy = fit_module._roomy
+    assert roomy(1000, 1.5) == 1536
+    assert roomy(2**30 - 9, 1.5) == 2**30 - 1
+    with pytest.raises(CapacityError, match="wants 2,147,483,647 or more pairs"):
+        roomy(2**31 - 1, 1.5)
