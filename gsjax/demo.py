@@ -52,10 +52,10 @@ def demo_config(steps: int = STEPS, seed: int = 0) -> TrainConfig:
     config = scaled(preset("fast"), steps)
     return config.replace(
         seed=seed,
+        strategy="adaptive",
         max_size=None,
         levels=(Level(0.0, 1),),
         adaptive=replace(config.adaptive, max_gaussians=_MAX_GAUSSIANS),
-        raster=config.raster.replace(rungs=1),
     )
 
 

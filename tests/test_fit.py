@@ -49,11 +49,18 @@ CONFIG = TrainConfig(
     sh_degree=1,
     sh_every=10,
     every_checkpoint=7,
-    initial_opacity=0.5,
     adaptive=AdaptiveSettings(
-        start=0, stop=50, every=7, threshold=1e-5, reset_every=0, max_gaussians=200
+        start=0,
+        stop=50,
+        every=7,
+        threshold=1e-5,
+        reset_every=0,
+        max_gaussians=200,
+        initial_opacity=0.5,
+    ),  # fmt: skip
+    mcmc=McmcSettings(
+        start=0, stop=50, every=7, growth=1.2, max_gaussians=200, initial_scale=1.0
     ),
-    mcmc=McmcSettings(start=0, stop=50, every=7, growth=1.2, max_gaussians=200),
     exposure=True,
     raster=RASTER.replace(pair_capacity=None),
 )

@@ -10,9 +10,9 @@ import pytest
 from conftest import COMPAT, oracle_data
 
 import gsjax
-from gsjax.raster.project import conics_of, project
+from gsjax.raster.project import conics_of, depth_order, project
 from gsjax.rotations import covariance
-from gsjax.sh import eval_sh
+from gsjax.sh import eval_sh, sh_basis
 
 VALUE, DERIVATIVE = 1e-9, 1e-8
 # Nothing is culled by its opacity; antialiasing fills in the compensation.
@@ -119,3 +119,41 @@ def test_vector_jacobian_product_agrees(data, report):
         report(f"vjp of {name}, L2", error, DERIVATIVE)
         report(f"vjp of {name}, worst row", rows, DERIVATIVE)
         assert max(error, rows) <= DERIVATIVE, name
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_colours_of_many_gaussians(degree):
+    """In float32 and compiled: some reductions of XLA go wrong for long arrays."""
+    count, bases = 40_000, (degree + 1) ** 2
+    rng = np.random.default_rng(degree)
+    means = rng.uniform(-1, 1, (count, 3)) + (0, 0, 4)
+    sh = rng.normal(size=(count, bases, 3))
+    scene = gsjax.make_gaussians(
+        means=means.astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.full((count, 3), np.float32(-5)),
+        logit_opacities=np.zeros(count, np.float32),
+        sh=sh.astype(np.float32),
+    )
+    K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    camera = gsjax.make_camera(viewmat=np.eye(4), K=K, width=64, height=48)
+    scene, camera = jax.tree.map(
+        lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a,
+        (scene, camera),
+    )
+    config = gsjax.RasterConfig()
+
+    @jax.jit
+    def colours(scene, camera):
+        order, seen = depth_order(scene, camera, config)
+        return order, seen, project(scene, camera, config, order, seen).colors
+
+    order, seen, found = colours(scene, camera)
+    seen = int(seen)
+    assert seen > count // 2
+    chosen = np.asarray(order)[:seen]
+    directions = means / np.linalg.norm(means, axis=1, keepdims=True)
+    basis = np.stack(sh_basis(degree, *jnp.asarray(directions.T)), -1)
+    wanted = np.maximum((basis[..., None] * sh).sum(1) + 0.5, 0)
+    assert wanted.std() > 0.1
+    np.testing.assert_allclose(found.T[:seen], wanted[chosen], atol=2e-5)

@@ -46,6 +46,8 @@ class AdaptiveSettings:
         needed shows, at the first edit from every so many-th step on; 0 never. Not at
         the last edit, which no pruning follows.
       max_gaussians: never more than that.
+      initial_opacity: of the Gaussians that a run starts from.
+      initial_scale: of those, times the distance to the nearest neighbours.
     """
 
     start: int = 500
@@ -62,6 +64,8 @@ class AdaptiveSettings:
     reset_every: int = 3000
     reset_opacity: float = 0.01
     max_gaussians: int = 5_000_000
+    initial_opacity: float = 0.1
+    initial_scale: float = 1.0
 
     def __post_init__(self):
         checks = {

@@ -39,6 +39,8 @@ class McmcSettings:
       dead_opacity: at or below it a Gaussian is dead.
       noise: factor on the rate of the means.
       opacity_penalty, scale_penalty: weights of the means over all Gaussians.
+      initial_opacity: of the Gaussians that a run starts from.
+      initial_scale: of those, times the distance to the nearest neighbours.
     """
 
     start: int = 500
@@ -50,6 +52,8 @@ class McmcSettings:
     noise: float = 5e5
     opacity_penalty: float = 0.01
     scale_penalty: float = 0.01
+    initial_opacity: float = 0.5
+    initial_scale: float = 0.1
 
     def __post_init__(self):
         checks = {

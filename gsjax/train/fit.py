@@ -110,8 +110,8 @@ def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
     gaussians = init_gaussians(
         scene,
         sh_degree=config.sh_degree,
-        opacity=config.initial_opacity,
-        scale=config.initial_scale,
+        opacity=config.chosen.initial_opacity,
+        scale=config.chosen.initial_scale,
         max_count=min(config.max_initial, config.max_gaussians),
         random_count=config.initial_count if config.initial == "random" else None,
         seed=config.seed,
@@ -239,14 +239,14 @@ class _Run:
         """Pair capacity for these images, with room to spare."""
         begun = time.perf_counter()
         few = np.linspace(0, frames.count - 1, min(frames.count, _MAX_PROBED_VIEWS))
-        config = self.config.raster
+        config, most = self.config.raster, 1
         for index in np.unique(few.astype(int)):
             camera = jax.tree.map(lambda a, i=index: a[i], frames.camera)
+            # The same settings for each: one program.
             fitted = exact_config(state.gaussians, camera, config)
-            larger = max(config.pair_capacity or 1, fitted.pair_capacity or 1)
-            config = config.replace(pair_capacity=larger)
+            most = max(most, fitted.pair_capacity or 1)
         self.compile_seconds += time.perf_counter() - begun
-        return _roomy(self.config.batch * (config.pair_capacity or 1), _PAIR_MARGIN)
+        return _roomy(self.config.batch * most, _PAIR_MARGIN)
 
     def program(self, state: TrainState, frames: Frames, raster: RasterConfig):
         """The compiled step for these sizes."""
