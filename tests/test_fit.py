@@ -57,7 +57,7 @@ CONFIG = TrainConfig(
         reset_every=0,
         max_gaussians=200,
         initial_opacity=0.5,
-    ),  # fmt: skip
+    ),
     mcmc=McmcSettings(
         start=0, stop=50, every=7, growth=1.2, max_gaussians=200, initial_scale=1.0
     ),
@@ -183,34 +183,25 @@ def test_killed_and_taken_up_from_the_last_checkpoint(whole, tmp_path):
 
 
 @on_cpu
-def test_too_few_pairs_are_regrown():
-    """Nor is what the caller limits what may be seen."""
-    config = CONFIGS["mcmc"]
-    config = config.replace(raster=config.raster.replace(visible_capacity=2))
-    result, log = run(config, Log(stop_at=4), pair_capacity=7)
-    wanted, full = run(CONFIGS["mcmc"], Log(stop_at=4))
-    assert changed(result.state, wanted.state) == []
-    assert result.pair_capacity > 7
-    assert "7 pairs" in log.phases[0]
-    assert log.told("step", "loss") == full.told("step", "loss")
-    assert full.records == sorted(full.records, key=lambda r: r["step"])
+def test_too_few_pairs_and_slots_are_grown():
+    """Until the first edit no size matters; it tells how many slots it wants.
 
-
-@on_cpu
-def test_too_few_slots_are_grown():
-    """Until the first edit the slots do not matter; it tells how many it wants.
-
-    From then on they do: draws are made for all slots at once.
+    From then on slots do: draws are made for all of them at once.
     """
     config = CONFIGS["adaptive"]
     state = init_state(rough_start(1, 64), config, EXTENT, VIEWS)
     before = bits(state)
-    small, log = run(config, Log(stop_at=6), state=state)
+    # Nor does it matter what the caller says may be visible.
+    limited = config.replace(raster=config.raster.replace(visible_capacity=2))
+    small, log = run(limited, Log(stop_at=6), state=state, pair_capacity=7)
     large, other = run(config, Log(stop_at=6), state=grow_state(state, 1024))
     assert changed(grow_state(small.state, 1024), large.state) == []
     assert log.told("step", "loss", "pairs") == other.told("step", "loss", "pairs")
+    assert len(log.records) == 6
+    assert ["7 pairs" in phase for phase in log.phases] == [True, False]
     pairs = small.pair_capacity
-    result, log = run(config, Log(stop_at=7), state=small.state, pair_capacity=pairs)
+    assert 7 < pairs < large.pair_capacity
+    result, log = run(limited, Log(stop_at=7), state=small.state, pair_capacity=pairs)
     (record,) = log.records
     assert record["wanted"] > 70
     assert record["gaussians"] == record["capacity"] == 64
