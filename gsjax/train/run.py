@@ -11,6 +11,7 @@ RUN/curves.png        PSNR by step
 """
 
 import json
+import math
 import shutil
 import signal
 import threading
@@ -281,13 +282,22 @@ def _hooks(
         reporter.step(progress)
         record = progress.record()
         record["seconds"] = round(before + progress.seconds, 3)
-        log.write(json.dumps(record) + "\n")
+        log.write(json.dumps(_plain(record)) + "\n")
 
     def checkpoint(state: TrainState, pair_capacity: int, progress: Progress) -> None:
         log.flush()
-        _save_state(files, state, pair_capacity, before + progress.seconds)
+        try:
+            _save_state(files, state, pair_capacity, before + progress.seconds)
+        except InputError as error:
+            # A full disk costs the checkpoint, not the run; the older ones are kept.
+            note(f"warning: {error}; going on without this checkpoint")
 
     return Hooks(step, reporter.phase, checkpoint, stopped)
+
+
+def _plain(record: dict) -> dict:
+    """With null for what JSON has no number for."""
+    return {k: v if math.isfinite(v) else None for k, v in record.items()}
 
 
 def _save_state(
