@@ -11,8 +11,8 @@ from gsjax.errors import CapacityError as CapacityError
 from gsjax.errors import DivergedError as DivergedError
 from gsjax.errors import GsjaxError as GsjaxError
 from gsjax.errors import InputError as InputError
-from gsjax.evaluate import evaluate as evaluate
-from gsjax.evaluate import summarise as summarise
+from gsjax.evaluation import evaluate as evaluate
+from gsjax.evaluation import summarise as summarise
 from gsjax.gaussians import GaussianParams as GaussianParams
 from gsjax.gaussians import Gaussians as Gaussians
 from gsjax.gaussians import capacity_bucket as capacity_bucket

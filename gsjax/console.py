@@ -1,9 +1,11 @@
 """What programs say: results on stdout; progress, warnings and errors on stderr."""
 
+import signal
 import sys
+import threading
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -42,6 +44,38 @@ def progress(items: Sequence[T], label: str) -> Iterator[T]:
 def one_line(text: object) -> str:
     """Text without line breaks."""
     return " ".join(str(text).split())
+
+
+def decibels(value: float | None) -> str:
+    """PSNR to read; None is that of an image without any error."""
+    return "∞ dB" if value is None or value == float("inf") else f"{value:.2f} dB"
+
+
+@contextmanager
+def stopping_on_ctrl_c() -> Iterator[Callable[[], bool]]:
+    """Within, Ctrl-C only sets a flag, so that what goes on is never cut in two.
+
+    A second one raises `KeyboardInterrupt` as usual. Off the main thread, where
+    signals cannot be caught, nothing changes.
+    """
+    asked = False
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    previous = signal.getsignal(signal.SIGINT)
+
+    def handle(*_):
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        note("stopping after this step; once more to stop at once")
+
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield lambda: asked
+    finally:
+        signal.signal(signal.SIGINT, previous)
 
 
 @contextmanager

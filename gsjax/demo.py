@@ -13,7 +13,8 @@ from gsjax.flights import path_entries, write_flight
 from gsjax.scene.caster import DemoDatasetSettings, write_demo_dataset
 from gsjax.subjects import open_subject
 from gsjax.train.config import Level, TrainConfig, preset, scaled
-from gsjax.train.run import RunResult, RunSettings, load_data, run_files, start_run
+from gsjax.train.folder import RunSettings, load_data, run_files
+from gsjax.train.run import RunResult, start_run
 
 STEPS = 600
 _TURN_FRAMES, _TURN_SECONDS = 48, 4.0

@@ -21,7 +21,7 @@ from gsjax.scene.transforms import CameraEntry
 from gsjax.scene.types import Scene, View
 from gsjax.sheets import depth_colors
 from gsjax.subjects import Subject
-from gsjax.train.run import Data
+from gsjax.train.folder import Data
 from gsjax.views import rendered
 
 PATHS = ("test", "train", "orbit", "spiral", "interpolate")

@@ -4,9 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from gsjax.console import decibels
 from gsjax.errors import InputError
+from gsjax.train.folder import load_settings, run_files
 from gsjax.train.history import read_metrics
-from gsjax.train.run import load_settings, run_files
 
 
 def describe_run(folder: Path) -> dict[str, Any]:
@@ -58,7 +59,7 @@ def run_text(path: str, facts: dict[str, Any]) -> str:
     if quality is not None:
         which = {"test": "held-out", "train": "training"}[quality["which"]]
         rows["quality"] = (
-            f"PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.4f} "
+            f"PSNR {decibels(quality['psnr'])}, SSIM {quality['ssim']:.4f} "
             f"({quality['views']} {which} views)"
         )
     return "\n".join([path, *(f"  {name:<18}{value}" for name, value in rows.items())])

@@ -10,7 +10,12 @@ from gsjax.gaussians import Gaussians
 from gsjax.io import load
 from gsjax.raster.types import RasterConfig
 from gsjax.scene.types import Scene
-from gsjax.train.run import background_of, load_scene, load_settings, run_files
+from gsjax.train.folder import (
+    background_of,
+    load_scene,
+    load_settings,
+    run_files,
+)
 
 PRESETS = {
     "compat": RasterConfig.compat,

@@ -14,7 +14,7 @@ from gsjax.scene.photos import load_photo
 from gsjax.scene.transforms import CameraEntry
 from gsjax.scene.types import Scene, View
 from gsjax.sheets import depth_colors
-from gsjax.train.run import Data
+from gsjax.train.folder import Data
 
 K = np.asarray([[90.0, 0, 49.5], [0, 91.0, 36.0], [0, 0, 1]])
 

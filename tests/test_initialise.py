@@ -11,10 +11,10 @@ import gsjax
 from gsjax.errors import InputError
 from gsjax.scene.initialise import (
     init_gaussians,
-    looked_at,
     neighbour_distance,
     scene_extent,
 )
+from gsjax.scene.paths import focus_point
 from gsjax.sh import dc_to_rgb
 
 FAR = 1e3  # an extent that clips nothing
@@ -122,7 +122,10 @@ def test_random_ones_are_in_view():
     gaussians = init_gaussians(scene, random_count=3000, seed=3)
     means = np.asarray(gaussians.params.means)
     extent = scene_extent(np.stack([view.centre for view in scene.views]))
-    away = np.linalg.norm(means - looked_at(scene), axis=1) / extent
+    away = (
+        np.linalg.norm(means - focus_point([v.viewmat for v in scene.views]), axis=1)
+        / extent
+    )
     assert away.max() <= 1
     # Even in the ball: the cube of the distance is uniform.
     shares = np.histogram(away**3, 10, (0, 1))[0]
@@ -136,21 +139,3 @@ def test_random_ones_are_in_view():
 def test_no_points():
     with pytest.raises(InputError, match="no points to start from"):
         init_gaussians(scene_of_views(points=0))
-
-
-def test_what_the_cameras_look_at():
-    scene = scene_of_views(count=6)
-    target = np.asarray([1.0, -2.0, 0.5])
-    views = []
-    for view in scene.views:
-        viewmat = gsjax.look_at(view.centre, target)
-        views.append(replace(view, viewmat=viewmat))
-    found = looked_at(replace(scene, views=tuple(views)))
-    assert np.linalg.norm(found - target) < 0.02
-    # Parallel axes: an extent ahead of the mean.
-    views = []
-    for x in (0.0, 1.0, 2.0):
-        viewmat = gsjax.look_at((x, 0, 0), (x, 5, 0))
-        views.append(replace(scene.views[0], viewmat=viewmat))
-    found = looked_at(replace(scene, views=tuple(views)))
-    np.testing.assert_allclose(found, (1, 1.1, 0), atol=1e-6)

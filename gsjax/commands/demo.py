@@ -7,7 +7,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from gsjax.commands.common import Command, UsageError, parse_size, use_all_cores
-from gsjax.console import note, say
+from gsjax.console import decibels, note, say
 
 
 @dataclass(kw_only=True)
@@ -55,7 +55,7 @@ class DemoCommand(Command):
             say(str(path))
         say(
             f"{result.gaussians:,} Gaussians, {result.seconds:.0f} s; "
-            f"{summary.views} held-out views: PSNR {summary.psnr:.2f} dB, "
+            f"{summary.views} held-out views: PSNR {decibels(summary.psnr)}, "
             f"SSIM {summary.ssim:.4f}"
         )
         note("done; next, try")

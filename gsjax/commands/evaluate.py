@@ -8,7 +8,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from gsjax.commands.common import Command, use_all_cores
-from gsjax.console import say
+from gsjax.console import decibels, say
 
 
 @dataclass(kw_only=True)
@@ -24,7 +24,8 @@ class EvalCommand(Command):
 
     def run(self) -> int:
         use_all_cores()
-        from gsjax.train.run import evaluate_run, run_files
+        from gsjax.train.folder import run_files
+        from gsjax.train.held_out import evaluate_run
 
         summary = evaluate_run(self.folder, which=self.views)
         files = run_files(self.folder)
@@ -33,10 +34,13 @@ class EvalCommand(Command):
             say(json.dumps(told, indent=2))
             return 0
         for each in told["each"]:
-            say(f"{each['name']}  PSNR {each['psnr']:.2f} dB  SSIM {each['ssim']:.4f}")
+            say(
+                f"{each['name']}  PSNR {decibels(each['psnr'])}  "
+                f"SSIM {each['ssim']:.4f}"
+            )
         say(
-            f"{summary.views} {self.views} views: PSNR {summary.psnr:.2f} dB, SSIM "
-            f"{summary.ssim:.4f}, LPIPS {summary.lpips}"
+            f"{summary.views} {self.views} views: PSNR {decibels(summary.psnr)}, "
+            f"SSIM {summary.ssim:.4f}, LPIPS {summary.lpips}"
         )
         say(str(files.preview))
         return 0

@@ -26,7 +26,7 @@ class InfoCommand(Command):
         from gsjax.io import load
         from gsjax.runinfo import describe_run, run_text
         from gsjax.subjects import is_run
-        from gsjax.train.run import run_files
+        from gsjax.train.folder import run_files
 
         told: dict[str, Any] = {"path": str(self.scene)}
         texts, splat = [], self.scene

@@ -64,7 +64,12 @@ class RenderCommand(Command):
         from gsjax.flights import path_entries, write_flight
         from gsjax.scene.transforms import load_transforms
         from gsjax.subjects import open_subject
-        from gsjax.train.run import load_data, load_settings
+        from gsjax.train.folder import (
+            load_data,
+            load_settings,
+            refined_data,
+            run_files,
+        )
         from gsjax.views import write_views
 
         scene = None
@@ -72,7 +77,7 @@ class RenderCommand(Command):
             entries = load_transforms(self.cameras, size=size)
         else:
             settings = load_settings(self.scene)
-            data = load_data(settings)
+            data = refined_data(load_data(settings), run_files(self.scene))
             frames, largest = self.frames or 120, settings.config.max_size
             entries = path_entries(
                 data, path, frames=frames, max_size=largest, size=size

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from gsjax.commands.common import Command, UsageError, use_all_cores
-from gsjax.console import note, say
+from gsjax.console import decibels, note, say
 
 
 @dataclass(kw_only=True)
@@ -58,6 +58,8 @@ class TrainCommand(Command):
     """Hold out these views instead."""
     checkpoint_every: int | None = None
     """Steps between checkpoints; 0 only at the end."""
+    eval_every: int | None = None
+    """Steps between measurements on the held-out views; 0 only at the end."""
     resume: bool = False
     """Go on where the run in RUN stopped, with the settings that it has."""
     overwrite: bool = False
@@ -67,7 +69,8 @@ class TrainCommand(Command):
         if self.resume and self.overwrite:
             raise UsageError("--resume and --overwrite exclude each other")
         use_all_cores()
-        from gsjax.train.run import load_settings, resume_run, run_files, start_run
+        from gsjax.train.folder import load_settings, run_files
+        from gsjax.train.run import resume_run, start_run
 
         if self.resume and run_files(self.out).config.exists():
             settings = load_settings(self.out)
@@ -87,7 +90,7 @@ class TrainCommand(Command):
         if result.summary is not None:
             line += (
                 f"; {result.summary.views} held-out views: "
-                f"PSNR {result.summary.psnr:.2f} dB, SSIM {result.summary.ssim:.4f}"
+                f"PSNR {decibels(result.summary.psnr)}, SSIM {result.summary.ssim:.4f}"
             )
         say(line)
         say(str(result.files.preview))
@@ -95,7 +98,7 @@ class TrainCommand(Command):
 
     def _settings(self):
         from gsjax.train.config import preset, scaled
-        from gsjax.train.run import RunSettings
+        from gsjax.train.folder import RunSettings
 
         config = preset(self.preset)
         if self.steps is not None:
@@ -109,6 +112,7 @@ class TrainCommand(Command):
             "background": self.background,
             "initial": self.initial,
             "every_checkpoint": self.checkpoint_every,
+            "every_eval": self.eval_every,
         }
         changes = {name: value for name, value in changes.items() if value is not None}
         config = config.replace(

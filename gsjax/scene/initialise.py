@@ -4,6 +4,7 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, make_gaussians
+from gsjax.scene.paths import focus_point
 from gsjax.scene.types import Scene
 from gsjax.sh import C0, num_bases
 
@@ -97,24 +98,8 @@ def neighbour_distance(points: np.ndarray, extent: float) -> np.ndarray:
 def _random_points(scene: Scene, count: int, rng) -> tuple[np.ndarray, np.ndarray]:
     centres = np.stack([view.centre for view in scene.views])
     extent = scene_extent(centres)
-    middle = looked_at(scene)
+    middle = focus_point([view.viewmat for view in scene.views], depth=extent)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     radius = extent * rng.uniform(size=(count, 1)) ** (1 / 3)
     return middle + radius * direction, rng.uniform(size=(count, 3))
-
-
-def looked_at(scene: Scene) -> np.ndarray:
-    """[3] the point nearest to all optical axes, in front of the cameras.
-
-    Least squares, drawn to the cameras' mean a little, so that parallel axes have an
-    answer: an extent in front of it.
-    """
-    centres = np.stack([view.centre for view in scene.views])
-    axes = np.stack([view.viewmat[2, :3] for view in scene.views])
-    ahead = centres.mean(0) + scene_extent(centres) * axes.mean(0)
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    weight = 1e-3
-    left = across.sum(0) + weight * len(axes) * np.eye(3)
-    right = np.einsum("vij,vj->i", across, centres) + weight * len(axes) * ahead
-    return np.linalg.solve(left, right)

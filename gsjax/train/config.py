@@ -3,7 +3,6 @@
 import json
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import pairwise
-from typing import Any
 
 from gsjax.densify.adaptive import AdaptiveSettings, adaptive
 from gsjax.densify.mcmc import McmcSettings, mcmc
@@ -45,7 +44,7 @@ class TrainConfig:
       refine_poses, refine_intrinsics: learn small corrections of the cameras.
       exposure: learn an affine correction of the colours of each photograph.
       pose_rate, intrinsics_rate, exposure_rate: of Adam, for those.
-      every_eval: evaluate the held-out views that often as well; 0 only at the end.
+      every_eval: in steps, measure the held-out views; 0 only at the end.
       every_checkpoint: in steps; 0 only at the end.
       raster: how to render; sizes in it are set by the run.
     """
@@ -145,12 +144,6 @@ def from_json(text: str) -> TrainConfig:
     Raises:
       InputError: if it is not one, or of another version.
     """
-    rooms: dict[str, Any] = {
-        "adaptive": AdaptiveSettings,
-        "mcmc": McmcSettings,
-        "raster": RasterConfig,
-        "rates": Rates,
-    }
     try:
         data = json.loads(text)
         unknown = set(data) - {f.name for f in fields(TrainConfig)}
@@ -159,9 +152,9 @@ def from_json(text: str) -> TrainConfig:
         if "rates" in data:  # a NamedTuple: a list in JSON
             rates = data["rates"]
             data["rates"] = Rates(tuple(rates[0]), *rates[1:])
-        for name in ("adaptive", "mcmc"):
+        for name, kind in (("adaptive", AdaptiveSettings), ("mcmc", McmcSettings)):
             if name in data:
-                data[name] = rooms[name](**data[name])
+                data[name] = kind(**data[name])
         if "raster" in data:
             outputs = tuple(data["raster"].pop("outputs", ("rgb",)))
             data["raster"] = RasterConfig(outputs=outputs, **data["raster"])

@@ -67,12 +67,15 @@ class Hooks:
       phase: before something that takes a while, with what it is.
       checkpoint: every ``config.every_checkpoint`` steps: state, pair capacity, and
         the record of that step.
+      measure: every ``config.every_eval`` steps: state and record; the time that it
+        takes does not count.
       stop: asked after each step; True ends the run there.
     """
 
     step: Callable[[Progress], None] = lambda _: None
     phase: Callable[[str], None] = lambda _: None
     checkpoint: Callable[[TrainState, int, Progress], None] = lambda *_: None
+    measure: Callable[[TrainState, Progress], None] = lambda *_: None
     stop: Callable[[], bool] = lambda: False
 
 
@@ -221,6 +224,11 @@ class _Run:
             every = config.every_checkpoint
             if every and step % every == 0 and step < config.steps:
                 hooks.checkpoint(state, pair_capacity, progress)
+            every = config.every_eval
+            if every and step % every == 0 and step < config.steps:
+                begun = time.perf_counter()
+                hooks.measure(state, progress)
+                self.start += time.perf_counter() - begun
             if hooks.stop():
                 break
         return FitResult(state, pair_capacity or 0, progress)

@@ -1,18 +1,34 @@
 """What a run wrote of its steps, read back, and as a picture."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsjax.curves import Series, curves_png
+from gsjax.images import write_file
 
 _NEEDED = {"step", "seconds", "psnr", "gaussians"}
 
 
+def finite_or_none(value: float) -> float | None:
+    """For JSON, which has no number for infinity or NaN."""
+    return value if math.isfinite(value) else None
+
+
+def record_line(record: dict[str, Any]) -> str:
+    """A line of a `.jsonl`."""
+    plain = {
+        k: finite_or_none(v) if isinstance(v, float) else v for k, v in record.items()
+    }
+    return json.dumps(plain, allow_nan=False) + "\n"
+
+
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Lines of a `metrics.jsonl`, but for those cut short; none if it is not there."""
+    """Lines of a `metrics.jsonl` or `held_out.jsonl`, but for those that were cut short
+    by a kill; none if it is not there."""
     if not path.exists():
         return []
     lines = []
@@ -20,10 +36,21 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
         try:
             record = json.loads(line)
         except ValueError:
-            continue  # cut short by a kill
+            continue
         if isinstance(record, dict) and record.keys() >= _NEEDED:
             lines.append(record)
     return lines
+
+
+def keep_steps(path: Path, steps: int) -> None:
+    """Drop what was logged after the checkpoint that a run goes on from.
+
+    Raises:
+      InputError: if it cannot be written.
+    """
+    if path.exists():
+        kept = [record_line(r) for r in read_metrics(path) if r["step"] <= steps]
+        write_file(path, "".join(kept).encode())
 
 
 def write_curves(path: Path, metrics: list[dict[str, Any]], window: int) -> None:

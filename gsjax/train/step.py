@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 from jax import lax
 
-from gsjax.densify.types import Observation, apply_edit
+from gsjax.densify.types import Densifier, Observation, apply_edit
 from gsjax.gaussians import Gaussians, num_active
 from gsjax.losses import photometric
 from gsjax.metrics import psnr
@@ -182,7 +182,8 @@ def make_train_step(
 
         def update():
             moved = _optimise(state, grads, config, extent)
-            return _densify(moved, observation, (by_noise, by_plan), config, extent)
+            rate = means_rate(config.rates, moved.step / config.steps, extent)
+            return _densify(moved, observation, (by_noise, by_plan), densifier, rate)
 
         state, wanted = lax.cond(
             overflowed, keep, lambda: lax.cond(finite, update, skip)
@@ -249,14 +250,12 @@ def _optimise(
 
 
 def _densify(
-    state: TrainState, observation: Observation, keys, config: TrainConfig, extent
+    state: TrainState, observation: Observation, keys, densifier: Densifier, rate: Array
 ) -> tuple[TrainState, Array]:
     """What the strategy does after a step; also how many Gaussians it wanted."""
     by_noise, by_plan = keys
-    densifier = config.densifier(extent)
     gaussians = state.gaussians
     if densifier.perturb is not None:
-        rate = means_rate(config.rates, state.step / config.steps, extent)
         moved = densifier.perturb(by_noise, gaussians, rate)
         gaussians = gaussians.replace(params=moved)  # pyright: ignore
     stats = densifier.observe(state.stats, observation)

@@ -8,7 +8,7 @@ from conftest import LIGHT, assert_not_empty
 
 import gsjax
 from gsjax import RasterConfig
-from gsjax.evaluate import LPIPS_NOTE, ViewResult, evaluate, summarise
+from gsjax.evaluation import LPIPS_NOTE, ViewResult, evaluate, summarise
 from gsjax.metrics import psnr, ssim
 from gsjax.scene.initialise import init_gaussians
 from gsjax.scene.types import Photo

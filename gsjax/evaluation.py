@@ -3,7 +3,7 @@
 Axis legend: H W image.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -110,10 +110,6 @@ def _over(photo: Photo, background: np.ndarray) -> np.ndarray:
 
 def summarise(results: Sequence[ViewResult]) -> Summary:
     """Means; of no views NaN."""
-    count = len(results)
-    mean: Callable[[list[float]], float] = lambda v: float(np.mean(v)) if v else np.nan  # noqa: E731
-    return Summary(
-        views=count,
-        psnr=mean([r.psnr for r in results]),
-        ssim=mean([r.ssim for r in results]),
-    )
+    scores = np.array([(r.psnr, r.ssim) for r in results]).reshape(-1, 2)
+    means = scores.mean(0) if results else np.full(2, np.nan)
+    return Summary(len(results), psnr=float(means[0]), ssim=float(means[1]))

@@ -1,0 +1,201 @@
+"""The folder of a run: what it was made from, and where it keeps what.
+
+RUN/config.json       settings, and which dataset and views
+RUN/metrics.jsonl     one line a step: loss, PSNR, counts, seconds, compilations
+RUN/checkpoints/      the two latest
+RUN/splat.ply         the scene, in the coordinates of the dataset
+RUN/cameras.json      its cameras, where they were refined
+RUN/eval.json         PSNR and SSIM of the held-out views
+RUN/held_out.jsonl    the same by step, where that was asked for
+RUN/renders/          those views
+RUN/preview.png       photograph, render, error and depth of some of them
+RUN/curves.png        PSNR by step
+"""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax import images
+from gsjax.errors import InputError
+from gsjax.gaussians import Gaussians
+from gsjax.io import load, save
+from gsjax.scene.dataset import load_dataset
+from gsjax.scene.splits import split_views
+from gsjax.scene.types import Scene
+from gsjax.train.config import TrainConfig, from_json, to_json
+from gsjax.train.refined import with_cameras
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What a run is made from.
+
+    Attributes:
+      dataset: folder or file.
+      config: of the training.
+      images, factor, skip_missing: as for `load_dataset`.
+      every: hold out every so many-th view; 0 for none.
+      test_images: hold out these instead.
+    """
+
+    dataset: Path
+    config: TrainConfig = field(default_factory=TrainConfig)
+    images: str | None = None
+    factor: int | None = None
+    skip_missing: bool = False
+    every: int = 8
+    test_images: tuple[str, ...] = ()
+
+
+class RunFiles(NamedTuple):
+    """Where a run keeps what."""
+
+    config: Path
+    metrics: Path
+    checkpoints: Path
+    splat: Path
+    cameras: Path
+    eval: Path
+    held_out: Path
+    renders: Path
+    preview: Path
+    curves: Path
+
+
+class Data(NamedTuple):
+    """A dataset, ready to train on.
+
+    Attributes:
+      scene: all of it.
+      train, test: indices of its views.
+    """
+
+    scene: Scene
+    train: list[int]
+    test: list[int]
+
+
+def run_files(folder: Path) -> RunFiles:
+    """Names inside ``folder``."""
+    return RunFiles(
+        config=folder / "config.json",
+        metrics=folder / "metrics.jsonl",
+        checkpoints=folder / "checkpoints",
+        splat=folder / "splat.ply",
+        cameras=folder / "cameras.json",
+        eval=folder / "eval.json",
+        held_out=folder / "held_out.jsonl",
+        renders=folder / "renders",
+        preview=folder / "preview.png",
+        curves=folder / "curves.png",
+    )
+
+
+def load_data(settings: RunSettings) -> Data:
+    """The dataset of a run as it was given, and which views are for what.
+
+    Raises:
+      InputError: as `load_dataset` and `split_views`.
+    """
+    scene = load_dataset(
+        settings.dataset,
+        images=settings.images,
+        skip_missing=settings.skip_missing,
+        factor=settings.factor,
+    )
+    return Data(scene, *split_views(scene.views, settings.every, settings.test_images))
+
+
+def refined_data(data: Data, files: RunFiles) -> Data:
+    """The same with its cameras as the run left them.
+
+    Raises:
+      InputError: if their file is damaged.
+    """
+    if not files.cameras.exists():
+        return data
+    return data._replace(scene=with_cameras(data.scene, files.cameras))
+
+
+def background_of(config: TrainConfig) -> tuple[float, float, float]:
+    """Behind the scene where it is looked at."""
+    return (1.0, 1.0, 1.0) if config.background == "white" else (0.0, 0.0, 0.0)
+
+
+def load_settings(folder: Path) -> RunSettings:
+    """The settings of a run.
+
+    Raises:
+      InputError: if the folder holds none, or they are damaged.
+    """
+    path = run_files(folder).config
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if data["format"] != _FORMAT:
+            raise ValueError(f"format {data['format']}; {_FORMAT} is wanted")
+        rest = {k: v for k, v in data.items() if k not in ("format", "train")}
+        rest["dataset"] = Path(rest["dataset"])
+        rest["test_images"] = tuple(rest["test_images"])
+        config = from_json(json.dumps(data["train"]))
+        return RunSettings(config=config, **rest)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: no run is here ({path.name}: {error.strerror or error}); pass "
+            "the folder that `gsjax train -o` made"
+        ) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: damaged: {error}") from error
+
+
+def save_settings(folder: Path, settings: RunSettings) -> None:
+    """Write what `load_settings` reads.
+
+    Raises:
+      InputError: if it cannot be written.
+    """
+    data = {k: v for k, v in vars(settings).items() if k != "config"}
+    data["dataset"] = str(settings.dataset.resolve())
+    train = json.loads(to_json(settings.config))
+    text = json.dumps({"format": _FORMAT, **data, "train": train}, indent=2)
+    images.write_file(run_files(folder).config, f"{text}\n".encode())
+
+
+def save_scene(
+    path: Path, gaussians: Gaussians, scene: Scene, *, overwrite: bool = False
+) -> None:
+    """Write Gaussians in the coordinates of the dataset's files.
+
+    Raises:
+      InputError: as `gsjax.save`.
+    """
+    if not np.any(scene.origin):
+        save(path, gaussians, overwrite=overwrite)
+        return
+    with jax.enable_x64(True):
+        means = np.asarray(gaussians.params.means, np.float64) + scene.origin
+        params = gaussians.params.replace(means=means)  # pyright: ignore
+        save(path, gaussians.replace(params=params), overwrite=overwrite)  # pyright: ignore
+
+
+def load_scene(path: Path, scene: Scene) -> Gaussians:
+    """Gaussians of a file that `save_scene` wrote, in the scene's coordinates.
+
+    Raises:
+      InputError: as `gsjax.load`.
+    """
+    if not np.any(scene.origin):
+        return load(path)
+    with jax.enable_x64(True):
+        wide = load(path)
+        means = np.asarray(wide.params.means, np.float64) - scene.origin
+        params = wide.params.replace(means=means)  # pyright: ignore
+    narrow = jax.tree.map(lambda a: np.asarray(a, np.float32), params)
+    return jax.tree.map(jnp.asarray, wide.replace(params=narrow))  # pyright: ignore

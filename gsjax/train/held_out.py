@@ -1,0 +1,140 @@
+"""How well a run shows the views it did not see, and the files that tell of it."""
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+
+from gsjax import images
+from gsjax.errors import InputError
+from gsjax.evaluation import Summary, ViewResult, evaluate, summarise
+from gsjax.gaussians import Gaussians
+from gsjax.scene.photos import load_photos
+from gsjax.scene.types import Photo, Scene
+from gsjax.sheets import SheetRow, comparison
+from gsjax.train.config import TrainConfig
+from gsjax.train.fit import subset
+from gsjax.train.folder import (
+    RunFiles,
+    background_of,
+    load_data,
+    load_scene,
+    load_settings,
+    refined_data,
+    run_files,
+)
+from gsjax.train.history import finite_or_none
+from gsjax.train.refined import refined_photos
+
+_PREVIEWED = 4
+
+
+def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
+    """Evaluate a run anew from its `splat.ply`, and write what `RunFiles` lists.
+
+    Args:
+      folder: of the run.
+      which: "test", or "train" where nothing was held out.
+
+    Raises:
+      InputError: if there is no run or no such view.
+    """
+    settings, files = load_settings(folder), run_files(folder)
+    given = load_data(settings)
+    data = refined_data(given, files)
+    chosen = data.test if which == "test" else data.train
+    if not chosen:
+        raise InputError(
+            f"no {which} views in this run; evaluate the others with --views "
+            f"{'train' if which == 'test' else 'test'}"
+        )
+    gaussians = load_scene(files.splat, data.scene)
+    scene = subset(data.scene, chosen)
+    before = subset(given.scene, chosen).views
+    photos = load_photos(before, settings.config.max_size)
+    photos = refined_photos(photos, before, scene.views)
+    return write_evaluation(files, settings.config, gaussians, scene, photos, which)
+
+
+def results_of(
+    gaussians: Gaussians, scene: Scene, photos: list[Photo], config: TrainConfig
+):
+    """`evaluate`, of all views of the scene as the run renders them."""
+    return evaluate(
+        gaussians,
+        scene.views,
+        photos,
+        config=config.raster,
+        background=background_of(config),
+    )
+
+
+def write_evaluation(
+    files: RunFiles,
+    config: TrainConfig,
+    gaussians: Gaussians,
+    scene: Scene,
+    photos: list[Photo],
+    which: str,
+) -> Summary:
+    """Evaluate all views of ``scene``: numbers, renders and preview.
+
+    Raises:
+      InputError: if something cannot be written.
+    """
+    images.make_folder(files.renders)
+    begun, results = time.perf_counter(), []
+    for result in results_of(gaussians, scene, photos, config):
+        path = files.renders / f"{Path(result.name).with_suffix('')}.png"
+        images.make_folder(path.parent)
+        images.write_file(path, images.encode_png(images.to_8_bit(result.render)))
+        results.append(result)
+    summary = summarise(results)
+    told = {
+        "which": which,
+        **summary._asdict(),
+        "psnr": finite_or_none(summary.psnr),
+        "seconds": round(time.perf_counter() - begun, 3),
+        "gaussians": int(np.sum(gaussians.active)),
+        "each": [_told(result) for result in results],
+    }
+    images.write_file(files.eval, (json.dumps(told, indent=2) + "\n").encode())
+    _write_preview(files, results)
+    return summary
+
+
+def _told(result: ViewResult) -> dict:
+    """Of one view, for JSON; PSNR null where the render is the photograph itself."""
+    return {
+        "name": result.name,
+        "psnr": finite_or_none(result.psnr),
+        "ssim": result.ssim,
+        "size": result.depth.shape[::-1],
+    }
+
+
+def write_preview(
+    files: RunFiles,
+    config: TrainConfig,
+    gaussians: Gaussians,
+    scene: Scene,
+    photos: list[Photo],
+) -> None:
+    """The preview alone, of the first views of ``scene``.
+
+    Raises:
+      InputError: if it cannot be written.
+    """
+    few = subset(scene, range(min(_PREVIEWED, len(scene.views))))
+    shown = photos[: len(few.views)]
+    _write_preview(files, list(results_of(gaussians, few, shown, config)))
+
+
+def _write_preview(files: RunFiles, results: list[ViewResult]) -> None:
+    few = np.unique(np.linspace(0, len(results) - 1, _PREVIEWED).astype(int))
+    rows = [
+        SheetRow(results[i].name, results[i].truth, results[i].render, results[i].depth)
+        for i in few
+    ]
+    images.write_file(files.preview, images.encode_png(comparison(rows)))
