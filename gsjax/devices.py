@@ -1,10 +1,18 @@
-"""One host device for each core: XLA's CPU backend hardly uses a second core inside
-the compositor's loop, so the tiles are spread over several devices instead.
+"""How JAX is set up for a program: its devices, and what it keeps of its compiling.
+
+One host device for each core: XLA's CPU backend hardly uses a second core inside the
+compositor's loop, so the tiles are spread over several devices instead.
 """
 
+import hashlib
 import os
+import platform
+from pathlib import Path
 
 import jax
+
+# Programs are a few hundred kB each; a folder of more than this loses its oldest.
+_MAX_KEPT_BYTES = 500_000_000
 
 
 def use_all_cores(count: int | None = None) -> int:
@@ -33,3 +41,49 @@ def use_all_cores(count: int | None = None) -> int:
             "computation, right after import gsjax"
         ) from error
     return jax.local_device_count()
+
+
+def keep_programs() -> Path | None:
+    """Let JAX keep compiled programs on disk, so that the next process starts at once.
+
+    In a folder of the user's cache (`XDG_CACHE_HOME`, else ``~/.cache``), one for each
+    kind of processor: programs are compiled for it. Nothing is changed where JAX has
+    a folder already (`JAX_COMPILATION_CACHE_DIR`), or is told to keep nothing
+    (`JAX_ENABLE_COMPILATION_CACHE=false`), or none can be made.
+
+    Returns:
+      The folder in use, or None.
+    """
+    chosen = jax.config.jax_compilation_cache_dir  # pyright: ignore
+    if chosen or not jax.config.jax_enable_compilation_cache:  # pyright: ignore
+        return Path(chosen) if chosen else None
+    try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(home) / "gsjax" / f"programs-{_processor()}"
+        folder.mkdir(parents=True, exist_ok=True)
+        _drop_oldest(folder, _MAX_KEPT_BYTES)
+    except (OSError, RuntimeError):  # RuntimeError: there is no home
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    return folder
+
+
+def _processor() -> str:
+    """What this machine's programs do not run without, as a short name."""
+    told = [platform.machine(), platform.processor()]
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        lines = info.read_text(errors="replace").splitlines()
+        told += sorted({x for x in lines if x.startswith(("model name", "flags"))})
+    return hashlib.sha256("\n".join(told).encode()).hexdigest()[:12]
+
+
+def _drop_oldest(folder: Path, most: int) -> None:
+    """Remove the files longest not written until ``most`` bytes are left."""
+    files = [(path, path.stat()) for path in folder.iterdir() if path.is_file()]
+    total = sum(stat.st_size for _, stat in files)
+    for path, stat in sorted(files, key=lambda file: file[1].st_mtime):
+        if total <= most:
+            return
+        path.unlink(missing_ok=True)
+        total -= stat.st_size

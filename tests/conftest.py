@@ -4,6 +4,8 @@ Compiling dominates the run time, so every scene of the catalogue has the same n
 of Gaussians and the same image size, and all tests call the same jitted functions.
 """
 
+import os
+import tempfile
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +15,9 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
+# Commands keep what they compile: for as long as these tests run, and not at home.
+_CACHE = tempfile.TemporaryDirectory(prefix="gsjax-tests-")
+os.environ["XDG_CACHE_HOME"] = _CACHE.name
 
 import jax.numpy as jnp
 

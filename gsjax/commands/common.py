@@ -63,10 +63,11 @@ def parse_background(text: str) -> tuple[float, ...]:
     return tuple(float(value) for value in text.split(","))
 
 
-def use_all_cores() -> None:
-    """Give JAX a device for each core, as `gsjax.use_all_cores`."""
+def start_jax() -> None:
+    """Give JAX a device for each core, and a place for what it compiles."""
     from gsjax import devices
 
+    devices.keep_programs()
     # Called from a program in which JAX has started, its devices are used.
     with contextlib.suppress(RuntimeError):
         devices.use_all_cores()

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from gsjax.commands.common import Command, UsageError, parse_size, use_all_cores
+from gsjax.commands.common import Command, UsageError, parse_size, start_jax
 from gsjax.console import decibels, note, say
 
 
@@ -35,7 +35,7 @@ class DemoCommand(Command):
             raise UsageError("--steps from 1, --photos from 2 to 1000")
         if not 0 <= self.seed < 2**31:
             raise UsageError(f"--seed {self.seed}: from 0 to {2**31 - 1} is wanted")
-        use_all_cores()
+        start_jax()
         from gsjax.demo import DemoSettings, run_demo
 
         settings = DemoSettings(self.photos, width, height, self.steps, self.seed)

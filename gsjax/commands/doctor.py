@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from gsjax.commands.common import Command, use_all_cores
+from gsjax.commands.common import Command, start_jax
 from gsjax.console import say
 
 
@@ -11,7 +11,7 @@ class DoctorCommand(Command):
     """Check the installation: versions, devices, and a tiny render."""
 
     def run(self) -> int:
-        use_all_cores()
+        start_jax()
         from gsjax.doctor import doctor_lines
 
         lines, good = doctor_lines()

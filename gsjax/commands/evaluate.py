@@ -7,7 +7,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from gsjax.commands.common import Command, use_all_cores
+from gsjax.commands.common import Command, start_jax
 from gsjax.console import decibels, say
 
 
@@ -23,7 +23,7 @@ class EvalCommand(Command):
     """Print JSON."""
 
     def run(self) -> int:
-        use_all_cores()
+        start_jax()
         from gsjax.train.folder import run_files
         from gsjax.train.held_out import evaluate_run
 

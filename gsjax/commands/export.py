@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.commands.common import Command, UsageError, use_all_cores
+from gsjax.commands.common import Command, UsageError, start_jax
 from gsjax.console import say
 
 
@@ -29,7 +29,7 @@ class ExportCommand(Command):
     def run(self) -> int:
         if not 0 <= self.min_opacity < 1:
             raise UsageError(f"--min-opacity {self.min_opacity:g}: from 0 to below 1")
-        use_all_cores()
+        start_jax()
         from gsjax.export import export_scene
 
         written, found = export_scene(

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from gsjax.commands.common import Command, use_all_cores
+from gsjax.commands.common import Command, start_jax
 from gsjax.console import say
 
 
@@ -21,7 +21,7 @@ class InfoCommand(Command):
     """Print JSON."""
 
     def run(self) -> int:
-        use_all_cores()
+        start_jax()
         from gsjax.info import describe, info_text
         from gsjax.io import load
         from gsjax.runinfo import describe_run, run_text

@@ -12,7 +12,7 @@ from gsjax.commands.common import (
     parse_background,
     parse_kinds,
     parse_size,
-    use_all_cores,
+    start_jax,
 )
 from gsjax.console import note, say
 
@@ -60,7 +60,7 @@ class RenderCommand(Command):
             background = parse_background(self.background)
         movie = self._is_movie(kinds)
         path = self._path()
-        use_all_cores()
+        start_jax()
         from gsjax.flights import path_entries, write_flight
         from gsjax.scene.transforms import load_transforms
         from gsjax.subjects import open_subject

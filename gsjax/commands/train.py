@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.commands.common import Command, UsageError, use_all_cores
+from gsjax.commands.common import Command, UsageError, start_jax
 from gsjax.console import decibels, note, say
 
 
@@ -68,7 +68,7 @@ class TrainCommand(Command):
     def run(self) -> int:
         if self.resume and self.overwrite:
             raise UsageError("--resume and --overwrite exclude each other")
-        use_all_cores()
+        start_jax()
         from gsjax.train.folder import load_settings, run_files
         from gsjax.train.run import resume_run, start_run
 

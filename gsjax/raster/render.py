@@ -8,19 +8,14 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
-from jax.sharding import Mesh, PartitionSpec
 
 from gsjax.cameras import Camera
 from gsjax.errors import CapacityError, InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.numerics import safe_divide
-from gsjax.raster import bins
-from gsjax.raster.composite import composite
-from gsjax.raster.ladder import on_ladder
-from gsjax.raster.occlude import hidden
 from gsjax.raster.project import depth_order, project, radii_of
+from gsjax.raster.rasterise import rasterise
 from gsjax.raster.types import Array, Demand, Projected, RasterConfig, Render
 
 DEFAULT_CONFIG = RasterConfig()
@@ -143,136 +138,6 @@ def _flatten_cameras(projected: Projected) -> Projected:
         return value.reshape(*value.shape[:-2], -1)
 
     return jax.tree.map(flatten, projected)
-
-
-def default_pair_capacity(ranks: int, grid: bins.Grid) -> int:
-    """Room for eight tiles a Gaussian and two Gaussians a tile, as a bucket."""
-    return capacity_bucket(8 * ranks + 2 * grid.tiles * grid.stride)
-
-
-def rasterise(
-    projected: Projected, cameras: int, width: int, height: int, config: RasterConfig
-) -> tuple[dict[str, Array], Demand, Array]:
-    """Bin and composite what was projected, over all devices.
-
-    Args:
-      projected: [R], ranks of all cameras one after another, R / B each.
-      cameras: B.
-      width, height: image size.
-      config: static settings.
-
-    Returns:
-      Images before the background, {"sums": [B, H, W, C], "median": [B, H, W]};
-      the demand (``visible`` is left at 0); whether the capacity was too small.
-    """
-    devices = config.devices or jax.local_device_count()
-    grid = bins.make_grid(width, height, config.tile_size, cameras, devices)
-    ranks = projected.u.shape[0]
-    capacity = config.pair_capacity or default_pair_capacity(ranks, grid)
-    share = -(-capacity // devices)
-    seen = _unhidden(lax.stop_gradient(projected), cameras, width, height, config)
-    local = partial(_rasterise_local, grid=grid, config=config, capacity=share)
-    if devices == 1:
-        images, pairs, wanted = local(jnp.zeros(1, jnp.int32), projected, seen)
-    else:
-        mesh = Mesh(np.array(jax.local_devices()[:devices]), ("tiles",))
-        images, pairs, wanted = jax.shard_map(
-            local,
-            mesh=mesh,
-            in_specs=(PartitionSpec("tiles"), PartitionSpec(), PartitionSpec()),
-            out_specs=PartitionSpec("tiles"),
-            check_vma=False,
-        )(jnp.arange(devices, dtype=jnp.int32), projected, seen)
-    images = {name: _untile(image, grid) for name, image in images.items()}
-    overflowed = jnp.any(wanted > share)
-    wanted = jnp.max(wanted)
-    limit = bins.COUNT_LIMIT // devices
-    capacity_wanted = jnp.where(wanted < limit, wanted * devices, 2**31 - 1)
-    pairs_float = jnp.sum(pairs.astype(jnp.float32))
-    total = jnp.where(
-        pairs_float < bins.COUNT_LIMIT, jnp.sum(pairs, dtype=jnp.int32), 2**31 - 1
-    )
-    demand = Demand(visible=jnp.int32(0), pairs=total, capacity=capacity_wanted)
-    return images, demand, overflowed
-
-
-def _unhidden(
-    projected: Projected, cameras: int, width: int, height: int, config: RasterConfig
-) -> Projected:
-    """``projected`` with no reach for what is hidden."""
-    if config.stop <= 0 or not config.occlusion:
-        return projected
-
-    def split(value):  # [..., B · R] → [B, ..., R]
-        value = value.reshape(*value.shape[:-1], cameras, -1)
-        return jnp.moveaxis(value, -2, 0)
-
-    per_camera = jax.tree.map(split, projected)
-    behind = lax.map(lambda one: hidden(one, width, height, config), per_camera)
-    return projected._replace(reach=jnp.where(behind.ravel(), 0, projected.reach))
-
-
-def _rasterise_local(
-    device: Array,
-    projected: Projected,
-    geometry: Projected,
-    *,
-    grid: bins.Grid,
-    config: RasterConfig,
-    capacity: int,
-):
-    """One device's tiles; ``device`` is [1]. Results gain a leading device axis.
-
-    ``geometry`` is what to bin: ``projected`` without derivatives and without what
-    is hidden.
-    """
-    device = device[0]
-    ranks = projected.u.shape[0]
-    group = bins.tiles_per_step(config, grid, jax.default_backend())
-    camera = lax.iota(jnp.int32, ranks) // (ranks // grid.cameras)
-    spans = bins.row_spans(geometry, camera, grid, device)
-    # The boxes bound the pairs from above, for no more than a sum.
-    bound = jnp.sum(spans.rows.astype(jnp.float32) * spans.cols)
-
-    def sort(room):
-        lists = bins.make_lists(geometry, spans, grid, device, room)
-        return lists._replace(ranks=jnp.pad(lists.ranks, (0, capacity - room)))
-
-    lists = on_ladder(bound, capacity, config.rungs, sort)
-    schedule = bins.make_schedule(lists.length, grid, group, config.chunk_size)
-
-    def blend(room):
-        work = bins.make_work(lists, schedule, config.chunk_size, ranks, room)
-        return composite(projected, work, schedule, grid, device, config)
-
-    room = bins.step_capacity(capacity, grid, group, config.chunk_size)
-    images = on_ladder(schedule.steps, room, config.rungs, blend)
-    for_steps = bins.pairs_for_steps(schedule.steps, grid, group, config.chunk_size)
-    wanted = jnp.maximum(jnp.maximum(lists.items, lists.pairs), for_steps)
-    images = {name: image[None] for name, image in images.items()}
-    return images, lists.pairs[None], wanted[None]
-
-
-def _untile(image: Array, grid: bins.Grid) -> Array:
-    """[D, T, (C,) P] to [B, H, W, (C)]: rows of tiles were dealt out to D devices."""
-    channels = image.shape[2:-1]
-    image = image.reshape(
-        grid.stride,
-        grid.cameras,
-        grid.rows,
-        grid.cols,
-        int(np.prod(channels)),
-        grid.tile,
-        grid.tile,
-    )
-    image = image.transpose(1, 2, 0, 5, 3, 6, 4)
-    image = image.reshape(
-        grid.cameras,
-        grid.rows * grid.stride * grid.tile,
-        grid.cols * grid.tile,
-        *channels,
-    )
-    return image[:, : grid.height, : grid.width]
 
 
 def _finish(

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,12 +54,17 @@ def keep_steps(path: Path, steps: int) -> None:
         write_file(path, "".join(kept).encode())
 
 
-def write_curves(path: Path, metrics: list[dict[str, Any]], window: int) -> None:
-    """PSNR by step: of the view that each step saw, and its mean.
+def write_curves(
+    path: Path,
+    metrics: list[dict[str, Any]],
+    window: int,
+    held_out: Sequence[dict[str, Any]] = (),
+) -> None:
+    """PSNR by step: of the view that each step saw, its mean, and of held-out views.
 
     Args:
       path: of the PNG; replaced if it exists.
-      metrics: see `read_metrics`.
+      metrics, held_out: see `read_metrics`.
       window: steps of the mean: an epoch has seen all views.
 
     Raises:
@@ -73,11 +79,15 @@ def write_curves(path: Path, metrics: list[dict[str, Any]], window: int) -> None
     total, count = both[:, window:] - both[:, :-window]
     mean = total / np.where(count > 0, count, np.nan)
     left = int(metrics[-1]["gaussians"]) if metrics else 0
+    series = [
+        Series("view of the step", steps, psnr),
+        Series(f"mean of {window}", steps[window // 2 :][: len(mean)], mean),
+    ]
+    if held_out:
+        points = [[r["step"] for r in held_out], [r["psnr"] for r in held_out]]
+        series.append(Series("held out", *np.asarray(points, float)))
     curves_png(
         path,
-        [
-            Series("view of the step", steps, psnr),
-            Series(f"mean of {window}", steps[window // 2 :][: len(mean)], mean),
-        ],
+        series,
         title=f"PSNR in training, dB ({left:,} Gaussians)",
     )

@@ -192,13 +192,16 @@ def _train(sitting: _Sitting) -> RunResult:
         )
     finished = int(result.state.step) >= config.steps
     _save(sitting, result)
+    summary = _evaluate(sitting, result, photos) if finished else None
+    metrics, held_out = (read_metrics(p) for p in (files.metrics, files.held_out))
+    write_curves(files.curves, metrics, len(photos), held_out)
     return RunResult(
         files=files,
         finished=finished,
         step=int(result.state.step),
         seconds=sitting.seconds(result.progress),
         gaussians=int(np.sum(result.gaussians.active)),
-        summary=_evaluate(sitting, result, photos) if finished else None,
+        summary=summary,
     )
 
 
@@ -250,7 +253,6 @@ def _save(sitting: _Sitting, result: FitResult) -> None:
     cameras = sitting.cameras(result.state)
     if cameras is not scene:
         save_cameras(files.cameras, cameras)
-    write_curves(files.curves, read_metrics(files.metrics), len(sitting.scene.views))
 
 
 def _evaluate(
