@@ -275,17 +275,18 @@ def make_schedule(length: Array, grid: Grid, group: int, chunk: int) -> Schedule
 
 
 def step_capacity(capacity: int, grid: Grid, group: int, chunk: int) -> int:
-    """Room for steps that goes with a pair capacity: half as much again as if every
-    chunk were full, and one more for each block.
+    """Room for steps that goes with a pair capacity: as if every chunk were full but
+    for an eighth, and half a chunk more for each block.
     """
-    return -(-grid.tiles // group) + -(-3 * capacity // (2 * group * chunk))
+    blocks = -(-grid.tiles // group)
+    return -(-blocks // 2) + -(-9 * capacity // (8 * group * chunk))
 
 
 def pairs_for_steps(steps: Array, grid: Grid, group: int, chunk: int) -> Array:
     """Pair capacity whose `step_capacity` holds ``steps``; saturating int32."""
     blocks = -(-grid.tiles // group)
-    extra = jnp.maximum(steps - blocks, 0).astype(jnp.float32)
-    wanted = jnp.ceil(extra * (2 * group * chunk / 3) * (1 + 1e-6))
+    extra = jnp.maximum(steps - -(-blocks // 2), 0).astype(jnp.float32)
+    wanted = jnp.ceil(extra * (8 * group * chunk / 9) * (1 + 1e-6))
     huge = wanted >= COUNT_LIMIT
     return jnp.where(huge, 2**31 - 1, jnp.where(huge, 0, wanted).astype(jnp.int32))
 
