@@ -49,12 +49,10 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
 
         axis = PartitionSpec("tiles")
         specs = tuple(axis if s else PartitionSpec() for s in sharded)
-        return jax.jit(
-            lambda *a: jax.shard_map(
-                local, mesh=mesh, in_specs=(axis, *specs), out_specs=axis,
-                check_vma=False,
-            )(index, *a)
-        )  # fmt: skip
+        return lambda *a: jax.shard_map(
+            local, mesh=mesh, in_specs=(axis, *specs), out_specs=axis,
+            check_vma=False,
+        )(index, *a)  # fmt: skip
 
     @jax.jit
     def projected_of(gaussians, camera):
@@ -75,15 +73,17 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
         work = bins.make_work(lists, schedule, config.chunk_size, ranks, steps)
         return composite(projected, work, schedule, grid, device, config)
 
-    binning = spread(bin_local, False)
-    compositing = spread(composite_local, False, True, True)
+    binning = jax.jit(spread(bin_local, False))
+    spread_composite = spread(composite_local, False, True, True)
+    compositing = jax.jit(spread_composite)
     projected = projected_of(gaussians, camera)
     lists, schedule = binning(projected)
     image = compositing(projected, lists, schedule)
     cotangent = jax.random.normal(jax.random.key(0), image["sums"].shape)
 
     def loss(projected, lists, schedule, cotangent):
-        return jnp.sum(compositing(projected, lists, schedule)["sums"] * cotangent)
+        image = spread_composite(projected, lists, schedule)
+        return jnp.sum(image["sums"] * cotangent)
 
     gradient = jax.jit(jax.value_and_grad(loss))
     render = jax.jit(gsjax.render, static_argnames="config")

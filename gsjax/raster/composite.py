@@ -28,12 +28,27 @@ _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
 def _running_product(alpha: Array) -> tuple[Array, Array]:
     """(Π over all K, Π over those before k [G, K, P]) of 1 − alpha [G, K, P]."""
-
-    product, before = jnp.ones_like(alpha[:, 0]), []
-    for k in range(alpha.shape[1]):
+    product, before = jnp.ones_like(alpha[:, :1]), []
+    for part in _parts(alpha):
         before.append(product)
-        product = product * (1 - alpha[:, k])
-    return product, jnp.stack(before, 1)
+        product = product * (1 - part)
+    return product[:, 0], lax.concatenate(before, 1)
+
+
+def _running_sum(values: Array) -> tuple[Array, Array]:
+    """(Σ over all K, Σ over those before k [G, K, P]) of values [G, K, P]."""
+    total, before = jnp.zeros_like(values[:, :1]), []
+    for part in _parts(values):
+        before.append(total)
+        total = total + part
+    return total[:, 0], lax.concatenate(before, 1)
+
+
+def _parts(values: Array) -> list[Array]:
+    """[G, 1, P] for each k. By `lax.split`, whose transpose is one concatenation; that
+    of K slices would be a sum of K padded arrays.
+    """
+    return lax.split(values, [1] * values.shape[1], axis=1)
 
 
 @jax.custom_jvp
@@ -52,12 +67,8 @@ def _transmittance_jvp(primals, tangents):
     (alpha,), (d_alpha,) = primals, tangents
     total, before = transmittance(alpha)
 
-    def step(running, d):
-        return running + d, running
-
-    rate = d_alpha / (1 - alpha)
-    summed, sums = lax.scan(step, jnp.zeros_like(rate[:, 0]), jnp.moveaxis(rate, 1, 0))
-    return (total, before), (-total * summed, -before * jnp.moveaxis(sums, 0, 1))
+    summed, sums = _running_sum(d_alpha / (1 - alpha))
+    return (total, before), (-total * summed, -before * sums)
 
 
 @jax.custom_vjp
@@ -86,7 +97,7 @@ _collect_absolute.defvjp(_collect_forward, _collect_backward)
 
 
 @jax.custom_jvp
-def _offsets(ellipse: tuple[Array, ...], pixels: Array) -> tuple[Array, Array]:
+def _offsets(ellipse: tuple[Array, ...], pixels: np.ndarray) -> tuple[Array, Array]:
     """y1, y2 [G, K, P] of Gaussians at the pixels [3, P], x, y and 1.
 
     Args:
@@ -109,16 +120,14 @@ def _linear_forms(*ellipse: Array) -> tuple[Array, Array]:
 
 @_offsets.defjvp
 def _offsets_jvp(primals, tangents):
-    """By matrix products: their transposes sum over the pixels three times as fast as
-    those of the elementwise form, and they are more exact. The pixels do not vary.
-    """
+    """By matrix products: their transposes sum over the pixels. Those do not vary."""
     ellipse, pixels = primals
-    _, moved = jax.jvp(_linear_forms, ellipse, tangents[0])
-    tangent = tuple(_einsum("fp,gfk->gkp", pixels, form) for form in moved)
-    return _offsets(ellipse, pixels), tangent
+    _, forms = jax.jvp(_linear_forms, ellipse, tangents[0])
+    by1, by2 = (_einsum("fp,gfk->gkp", pixels, form) for form in forms)
+    return _offsets(ellipse, pixels), (by1, by2)
 
 
-def _alphas(chunk: dict[str, Array], pixels: Array, config: RasterConfig) -> Array:
+def _alphas(chunk: dict[str, Array], pixels: np.ndarray, config: RasterConfig) -> Array:
     """α [G, K, P] of a chunk of Gaussians at the pixels [3, P], x, y and 1."""
     ellipse = tuple(chunk[name] for name in ("inv_sx", "inv_sy", "slope", "x", "y"))
     y1, y2 = _offsets(ellipse, pixels)
@@ -132,7 +141,7 @@ def _alphas(chunk: dict[str, Array], pixels: Array, config: RasterConfig) -> Arr
 
 
 def _composite_chunk(
-    carried: Array, chunk: dict[str, Array], pixels: Array, config: RasterConfig
+    carried: Array, chunk: dict[str, Array], pixels: np.ndarray, config: RasterConfig
 ) -> tuple[Array, dict[str, Array]]:
     """Blend one chunk behind the transmittance ``carried`` [G, P].
 
@@ -225,15 +234,16 @@ def composite(
     if "median_depth" in config.outputs:
         fresh["median"] = jnp.zeros((group, count), dtype)
 
+    # In the branch as well: what the backward pass recomputes there is compiled together
+    # with what uses it, and nothing but the inputs crosses the `cond`.
+    blend = jax.checkpoint(partial(_composite_chunk, pixels=pixels, config=config))
+
+    def skip(carried, _):
+        return carried, jax.tree.map(jnp.zeros_like, fresh)
+
     @jax.checkpoint
     def advance(go, carried, chunk):
-        def blend():
-            return _composite_chunk(carried, chunk, pixels, config)
-
-        def skip():
-            return carried, jax.tree.map(jnp.zeros_like, fresh)
-
-        return lax.cond(go, blend, skip)
+        return lax.cond(go, blend, skip, carried, chunk)
 
     # Every step hands out what its block has summed so far, and the last one of the
     # block is picked afterwards. An image carried along and updated in place would

@@ -1,8 +1,9 @@
 """Exact sorts by a single packed key without payload.
 
 Measured on CPU: a sort of keys alone is four to five times faster than one that
-carries a payload or compares twice (100 k: 6 ms against 28 ms), and on GPU it is the
-one that XLA hands to a radix sort. Where two parts fit into 32 bits one uint32 is
+carries a payload or compares twice (100 k: 6 ms against 28 ms), the stable sort (by
+merging) an eighth faster than the other, and on GPU it is the one that XLA hands to a
+radix sort. Where two parts fit into 32 bits one uint32 is
 sorted, else one uint64, which is built inside `jax.enable_x64` so that it exists
 whatever the user's setting; both are exact.
 """
@@ -29,7 +30,7 @@ def sort_pairs(high: Array, low: Array, high_count: int, low_count: int) -> Arra
     if bits_for(high_count) + low_bits <= 32:
         key = (high.astype(jnp.uint32) << low_bits) | low.astype(jnp.uint32)
         mask = jnp.uint32(2**low_bits - 1)
-        return (lax.sort(key, is_stable=False) & mask).astype(jnp.int32)
+        return (lax.sort(key, is_stable=True) & mask).astype(jnp.int32)
     return _sort_wide(high.astype(jnp.uint32), low)
 
 
@@ -53,5 +54,5 @@ def _sort_wide(high: Array, low: Array) -> Array:
     with jax.enable_x64(True):
         wide = lax.convert_element_type(high, jnp.uint64) << np.uint64(32)
         key = wide | lax.convert_element_type(low, jnp.uint64)
-        low_bits = lax.sort(key, is_stable=False) & np.uint64(2**32 - 1)
+        low_bits = lax.sort(key, is_stable=True) & np.uint64(2**32 - 1)
         return lax.convert_element_type(low_bits, jnp.int32)
