@@ -5,8 +5,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax import images
 from gsjax.errors import InputError
+from gsjax.files import make_folder
 from gsjax.gaussians import num_active, select, with_sh_degree
 from gsjax.io import load, save
 from gsjax.subjects import splat_file
@@ -53,6 +53,6 @@ def export_scene(
         )
     if sh_degree is not None:
         gaussians = with_sh_degree(gaussians, sh_degree)
-    images.make_folder(out.parent)
+    make_folder(out.parent)
     save(out, gaussians, overwrite=True)
     return written, found

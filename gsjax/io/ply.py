@@ -10,9 +10,6 @@ than the arrays it returns (and once more on the way to the device).
 """
 
 import math
-import os
-import secrets
-import stat
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -22,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.files import opened, replacing
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.io.ply_header import Header, check_properties, check_size, read_header, warn
 from gsjax.io.ply_rows import CHUNK_ROWS, read_rows
@@ -53,19 +51,11 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
         finite; the message names what was found and what was wanted.
     """
     path = Path(path)
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise InputError(f"{path}: not a regular file; pass a .ply file")
-        with path.open("rb") as file:
-            header = read_header(file, path)
-            bases = check_properties(header, _views(_allocate(0, 1, np.float32)))
-            check_size(header)
-            fields = _read_body(file, header, bases)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read: {error.strerror or error}; check path and "
-            "permissions"
-        ) from error
+    with opened(path, "a .ply file") as file:
+        header = read_header(file, path)
+        bases = check_properties(header, _views(_allocate(0, 1, np.float32)))
+        check_size(header)
+        fields = _read_body(file, header, bases)
     _check_values(path, fields, drop_nonfinite)
     return make_gaussians(**fields, capacity=None)
 
@@ -183,20 +173,8 @@ def write_ply(
         raise InputError(f"{path}: exists; pass overwrite=True or another name")
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} is missing; create it")
-    temporary = path.parent / f".gsjax-{secrets.token_hex(6)}.tmp"
-    try:
-        with temporary.open("xb") as file:
-            nonfinite = _write_body(file, gaussians)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written: {error.strerror or error}; check permissions "
-            "and space"
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path, durable=True) as file:
+        nonfinite = _write_body(file, gaussians)
     if nonfinite:
         warn(f"{path}: {nonfinite} of the Gaussians written are NaN or infinite")
 

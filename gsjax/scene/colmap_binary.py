@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.files import read_bytes
 from gsjax.scene.colmap_model import (
     MAX_NAME_BYTES,
     ColmapCamera,
@@ -35,13 +36,7 @@ class _Data:
     """The bytes of a file and how far they are read."""
 
     def __init__(self, path: Path, least: int, records: str):
-        try:
-            self.bytes = path.read_bytes()
-        except OSError as error:
-            raise InputError(
-                f"{path}: cannot be read: {error.strerror or error}; check the path "
-                "and its permissions"
-            ) from error
+        self.bytes = read_bytes(path, "a file of COLMAP")
         self.path, self.offset = path, 0
         self.size = len(self.bytes)
         (self.count,) = self.take(_COUNT, "the count")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.files import reading
 from gsjax.scene.colmap_model import (
     MAX_NAME_BYTES,
     ColmapCamera,
@@ -26,14 +27,12 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """(number, line) of all lines, comments and blank ones too, without their ends."""
     number = 0
     try:
-        with path.open(encoding="utf-8") as file:
+        with (
+            reading(path, "a file of COLMAP"),
+            path.open(encoding="utf-8") as file,
+        ):
             for number, line in enumerate(file, 1):
                 yield number, line.strip()
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read: {error.strerror or error}; check the path and "
-            "its permissions"
-        ) from error
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: after line {number}: not UTF-8 text; the file is damaged, or a "

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.files import read_bytes
 from gsjax.scene.colmap_model import MAX_COORDINATE, MAX_SIDE
 from gsjax.scene.image_files import SUFFIXES, image_folder
 from gsjax.scene.transforms_fields import rigid
@@ -71,13 +72,7 @@ def _view(where: str, row: np.ndarray, file: Path) -> View:
 
 def read_poses(path: Path) -> np.ndarray:
     """[N, 17] float64 of a .npy file, which is held against its size first."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read: {error.strerror or error}; check the path and "
-            "its permissions"
-        ) from error
+    data = read_bytes(path, "a poses_bounds.npy")
     order, rows, fortran, start = _header(path, data)
     wanted = rows * _COLUMNS * order.itemsize
     if len(data) - start != wanted:

@@ -5,7 +5,6 @@ are flipped, then the matrix is inverted, which gives our world → camera in Op
 axes.
 """
 
-import json
 import math
 import warnings
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.files import read_json
 
 _RIGID_TOLERANCE = 1e-3
 
@@ -36,7 +36,7 @@ def shown(value) -> str:
 
 def read_frames(path: Path) -> list[Frame]:
     """The frames of a file, at least one."""
-    data = _read_json(path)
+    data = read_json(path, "a transforms.json")
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(
@@ -49,29 +49,6 @@ def read_frames(path: Path) -> list[Frame]:
                 f"{path}: frames[{index}] is {shown(content)}; an object is wanted"
             )
     return [Frame(f"{path}: frames[{i}]", (f, data)) for i, f in enumerate(frames)]
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        if path.exists() and not path.is_file():
-            raise InputError(f"{path}: not a regular file; pass a transforms.json")
-        raw = path.read_bytes()
-    except OSError as error:
-        reason = error.strerror or error
-        raise InputError(
-            f"{path}: cannot be read: {reason}; check the path and its permissions"
-        ) from error
-    try:
-        data = json.loads(raw)
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path}: not JSON: {str(error)[:120]}; pass a transforms.json"
-        ) from error
-    if not isinstance(data, dict):
-        raise InputError(
-            f"{path}: the top is {shown(data)}; an object with 'frames' is wanted"
-        )
-    return data
 
 
 def _is_number(value) -> bool:

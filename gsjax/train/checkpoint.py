@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.images import make_folder, write_file
+from gsjax.files import make_folder, write_file
 from gsjax.train.step import TrainState
 
 _KEEP = 2
