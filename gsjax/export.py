@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -39,6 +40,13 @@ def export_scene(
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists; pass --overwrite, or another name")
     path = splat_file(source)
+    with jax.enable_x64(True):  # what is stored in float64 stays so
+        return _thinned(path, out, sh_degree, min_opacity)
+
+
+def _thinned(
+    path: Path, out: Path, sh_degree: int | None, min_opacity: float
+) -> tuple[int, int]:
     gaussians = load(path)
     found = int(num_active(gaussians))
     logits = np.asarray(gaussians.params.logit_opacities, np.float64)

@@ -25,6 +25,7 @@ from gsjax.io.ply_header import Header, check_properties, check_size, read_heade
 from gsjax.io.ply_rows import CHUNK_ROWS, read_rows
 
 _NORMALS = ("nx", "ny", "nz")
+_MAX_SHIFT = 0.1  # of a Gaussian's size by rounding, before it is told
 # Exporters write ±inf for opacities of exactly 0 and 1; the range of `logit`.
 _MAX_LOGIT = math.log((1 - 2.0**-24) / 2.0**-24)
 
@@ -90,12 +91,26 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
     dtype = np.dtype(jnp.result_type(float)) if wide else np.dtype(np.float32)
     fields = _allocate(header.vertex.rows, bases, dtype)
     views = _views(fields)
-    start = 0
+    start, displaced, furthest = 0, 0, 0.0
     with np.errstate(over="ignore", invalid="ignore"):  # _check_values finds them
         for size, columns in read_rows(file, header):
+            rows = slice(start, start + size)
             for name, view in views.items():
-                view[start : start + size] = columns[name]
+                view[rows] = columns[name]
+            if wide and dtype == np.float32:
+                shift = np.max([abs(columns[a] - views[a][rows]) for a in "xyz"], 0)
+                sizes = np.exp(np.max([views[f"scale_{i}"][rows] for i in range(3)], 0))
+                moved = np.isfinite(shift) & (shift > _MAX_SHIFT * sizes)
+                displaced += int(moved.sum())
+                furthest = max(furthest, shift[moved].max(initial=0.0))
             start += size
+    if displaced:
+        warn(
+            f"{header.path}: {displaced} of {start} Gaussians lie so far from the "
+            f"origin that float32 moves them, by up to {furthest:.3g}, more than "
+            f"{_MAX_SHIFT:g} of their size; read the file with jax_enable_x64, or move "
+            "the scene to the origin"
+        )
     return fields
 
 
@@ -154,8 +169,10 @@ def write_ply(
     """Write the active Gaussians, in their order, as a standard 3DGS PLY.
 
     Binary, little-endian, float32; x y z nx ny nz f_dc f_rest opacity scale rot,
-    normals zero. Written beside ``path`` and then renamed: it appears complete or
-    not at all. Values that are not finite are written, with a warning.
+    normals zero. Only x y z are float64, where means are given in it that float32
+    would round: those of a scene far from the origin come back bit by bit. Written
+    beside ``path`` and then renamed: it appears complete or not at all. Values that
+    are not finite are written, with a warning.
 
     Args:
       path: the file to write.
@@ -186,16 +203,35 @@ def _write_body(file: BinaryIO, gaussians: Gaussians) -> int:
     names = [*"xyz", *_NORMALS, *(name for name in views if name not in "xyz")]
     slots = np.flatnonzero(np.asarray(gaussians.active))
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(slots)}"]
-    lines += [f"property float {name}" for name in names]
+    means = [views[axis] for axis in "xyz"]
+    wide = "xyz" if any(_is_rounded(mean, slots) for mean in means) else ""
+    kinds = {name: "double" if name in wide else "float" for name in names}
+    lines += [f"property {kind} {name}" for name, kind in kinds.items()]
     file.write("\n".join([*lines, "end_header", ""]).encode())
+    codes = {"float": "<f4", "double": "<f8"}
+    dtype = np.dtype([(name, codes[kind]) for name, kind in kinds.items()])
     nonfinite = 0
     for start in range(0, len(slots), CHUNK_ROWS):
         chosen = slots[start : start + CHUNK_ROWS]
-        table = np.zeros((len(chosen), len(names)), "<f4")
+        table = np.zeros(len(chosen), dtype)
+        finite = np.ones(len(chosen), bool)
         with np.errstate(over="ignore"):
-            for column, name in enumerate(names):
-                if name in views:
-                    table[:, column] = views[name][chosen]
-        nonfinite += int((~np.isfinite(table).all(axis=1)).sum())
+            for name, view in views.items():
+                table[name] = view[chosen]
+                finite &= np.isfinite(table[name])
+        nonfinite += int((~finite).sum())
         file.write(table.tobytes())
     return nonfinite
+
+
+def _is_rounded(values: np.ndarray, slots: np.ndarray) -> bool:
+    """Whether float32 does not hold all ``values`` in ``slots``."""
+    if values.dtype != np.float64:
+        return False
+    for start in range(0, len(slots), CHUNK_ROWS):
+        chosen = values[slots[start : start + CHUNK_ROWS]]
+        with np.errstate(over="ignore"):
+            narrow = chosen.astype(np.float32)
+        if not np.array_equal(narrow, chosen, equal_nan=True):
+            return True
+    return False
