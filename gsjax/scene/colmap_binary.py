@@ -29,6 +29,7 @@ _POINT_2D_BYTES = 24  # x, y as float64, id of the point as int64
 _POINT = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")]
 )
+_PIECE = 1 << 12  # records gathered at a time
 _TRACK_BYTES = 8  # image and index of the observation, uint32 each
 
 
@@ -130,17 +131,19 @@ def read_points(path: Path) -> ColmapPoints:
     data = _Data(path, _POINT.itemsize, "points")
     starts = _point_starts(data)
     data.finish("points")
-    # One gather of the fixed part of all records: [M, 51] bytes.
     raw = np.frombuffer(data.bytes, np.uint8)
-    table = np.empty((data.count, _POINT.itemsize), np.uint8)
-    piece = 1 << 18
-    for first in range(0, data.count, piece):
-        rows = starts[first : first + piece, None] + np.arange(_POINT.itemsize)
-        table[first : first + piece] = raw[rows]
-    points = table.view(_POINT)[:, 0]
-    fields = (points[name] for name in ("id", "xyz", "rgb", "error", "n"))
-    identities, xyz, rgb, errors, lengths = (np.ascontiguousarray(f) for f in fields)
-    lengths = lengths.astype(np.int64)
+    kinds = [_POINT.fields[name][0] for name in _POINT.names or ()]
+    fields = [np.empty((data.count, *kind.shape), kind.base) for kind in kinds]
+    for first in range(0, data.count, _PIECE):
+        piece = slice(first, first + _PIECE)
+        # A gather of the fixed part of records: [·, 51] bytes.
+        rows = raw[starts[piece, None] + np.arange(_POINT.itemsize)].view(_POINT)[:, 0]
+        for field, name in zip(fields, _POINT.names or ()):
+            field[piece] = rows[name]
+    # Sorting copies: what was read must not be held as well.
+    del data, raw, starts
+    identities, xyz, rgb, errors, lengths = fields
+    lengths = lengths.view(np.int64)
     return sorted_points(str(path), ColmapPoints(identities, xyz, rgb, errors, lengths))
 
 

@@ -174,8 +174,9 @@ def make_colmap_image(
 
 def sorted_points(where: str, points: ColmapPoints) -> ColmapPoints:
     """Points in the order of their ids, which are checked, as are the coordinates."""
-    order = np.argsort(points.ids, kind="stable")
-    points = ColmapPoints(*(values[order] for values in points))
+    if (points.ids[1:] < points.ids[:-1]).any():
+        order = np.argsort(points.ids, kind="stable")
+        points = ColmapPoints(*(values[order] for values in points))
     twice = np.flatnonzero(points.ids[1:] == points.ids[:-1])
     if len(twice):
         raise InputError(

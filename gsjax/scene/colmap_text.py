@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,7 +26,7 @@ _UINT32, _UINT64 = (1 << 32) - 1, (1 << 64) - 1
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """(number, line) of all lines, comments and blank ones too, without their ends."""
-    number = 0
+    number, line = 0, "\n"
     try:
         with (
             reading(path, "a file of COLMAP"),
@@ -38,6 +39,13 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
             f"{path}: after line {number}: not UTF-8 text; the file is damaged, or a "
             "binary one with the wrong suffix"
         ) from error
+    if not line.endswith("\n"):
+        warnings.warn(
+            f"{path}: line {number}, the last one, has no end; the file may be "
+            "truncated: export or copy it again",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def _is_record(line: str) -> bool:
@@ -54,6 +62,8 @@ def _whole(where: str, what: str, text: str, most: int) -> int:
 
 def _floats(where: str, texts: list[str]) -> tuple[float, ...]:
     try:
+        if any("_" in text for text in texts):  # which Python takes
+            raise ValueError(f"an underscore in {' '.join(texts)}")
         return tuple(float(text) for text in texts)
     except ValueError as error:
         raise InputError(f"{where}: {str(error)[:80]}; pass numbers") from error
@@ -72,8 +82,10 @@ def _words(where: str, line: str, least: int, wanted: str, split: int = -1):
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
     """Cameras of a cameras.txt, by id."""
     cameras: dict[int, ColmapCamera] = {}
+    declared = None
     for number, line in _lines(path):
         if not _is_record(line):
+            declared = _declared(line, "cameras", declared)
             continue
         where = f"{path}: line {number}"
         words = _words(where, line, 4, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
@@ -91,6 +103,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
         if identity in cameras:
             raise InputError(f"{where}: the id {identity} is that of another camera")
         cameras[identity] = make_colmap_camera(where, kind, size, params)
+    _compare(path, "cameras", len(cameras), declared)
     return cameras
 
 
@@ -125,12 +138,21 @@ def read_images(path: Path) -> list[ColmapImage]:
         images.append(make_colmap_image(where, words[9], camera, pose))
         observations = True
     _compare(path, "images", len(images), declared)
+    if observations:
+        warnings.warn(
+            f"{path}: the line of 2D points (which may be empty) of the last image is "
+            "missing; the file may be truncated: export or copy it again",
+            UserWarning,
+            stacklevel=2,
+        )
     return images
 
 
 def read_points(path: Path) -> ColmapPoints:
     """Points of a points3D.txt, sorted by id; of the tracks only the length."""
-    identities, values, lengths, numbers = [], [], [], []
+    # Arrays, as lists of Python's numbers take five times the file.
+    identities, values = array("Q"), array("d")
+    lengths, numbers = array("q"), array("q")
     declared = None
     for number, line in _lines(path):
         if not _is_record(line):
@@ -142,14 +164,21 @@ def read_points(path: Path) -> ColmapPoints:
             identity = int(words[0])
         except ValueError:
             row, identity = [], -1
-        if len(row) < 7 or len(words) % 2 or not 0 <= identity <= _UINT64:
+        odd = len(row) < 7 or len(words) % 2 or "_" in line
+        if odd or not 0 <= identity <= _UINT64:
             raise _bad_point(f"{path}: line {number}", words)
         identities.append(identity)
-        values.append(row)
+        values.extend(row)
         lengths.append((len(words) - 8) // 2)
         numbers.append(number)
-    _compare(path, "points", len(values), declared)
-    table = np.asarray(values, np.float64).reshape(-1, 7)
+    _compare(path, "points", len(identities), declared)
+    if not identities:
+        warnings.warn(
+            f"{path}: no points are in it; the scene has none to start from",
+            UserWarning,
+            stacklevel=2,
+        )
+    table = np.frombuffer(values, np.float64).reshape(-1, 7)
     colors = table[:, 3:6]
     bad = ~((colors >= 0) & (colors <= 255) & (colors == np.rint(colors))).all(axis=1)
     if bad.any():
@@ -159,11 +188,11 @@ def read_points(path: Path) -> ColmapPoints:
             "numbers from 0 to 255 are wanted"
         )
     points = ColmapPoints(
-        ids=np.asarray(identities, np.uint64),
+        ids=np.frombuffer(identities, np.uint64),
         xyz=np.ascontiguousarray(table[:, :3]),
         colors=colors.astype(np.uint8),
         errors=table[:, 6].copy(),
-        track_lengths=np.asarray(lengths, np.int64),
+        track_lengths=np.frombuffer(lengths, np.int64),
     )
     return sorted_points(str(path), points)
 
@@ -175,7 +204,7 @@ def _bad_point(where: str, words: list[str]) -> InputError:
             wanted = "POINT3D_ID X Y Z R G B ERROR TRACK is wanted"
             return InputError(f"{where}: found {len(words)} values, {wanted}")
         _whole(where, "the point id", words[0], _UINT64)
-        _floats(where, words[1:8])
+        _floats(where, words[1:])
     except InputError as error:
         return error
     return InputError(
