@@ -20,15 +20,18 @@ from gsjax.scene.colmap_model import (
     make_colmap_camera,
     make_colmap_image,
     sorted_points,
+    twice,
 )
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters
 _IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, camera; then the name
 _POINT_2D_BYTES = 24  # x, y as float64, id of the point as int64
-_POINT = np.dtype(
-    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")]
+_FIELDS = (
+    *(("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)),
+    *(("error", "<f8"), ("n", "<u8")),
 )
+_POINT = np.dtype([*_FIELDS])
 _PIECE = 1 << 12  # records gathered at a time
 _TRACK_BYTES = 8  # image and index of the observation, uint32 each
 
@@ -85,7 +88,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
         form = struct.Struct(f"<{kind.size}d")
         params = data.take(form, f"{kind.name} camera {index}")
         if identity in cameras:
-            raise InputError(f"{where}: the id {identity} is that of another camera")
+            raise twice(where, identity, "camera")
         cameras[identity] = make_colmap_camera(where, kind, (size[0], size[1]), params)
     data.finish("cameras")
     return cameras
@@ -103,7 +106,7 @@ def read_images(path: Path) -> list[ColmapImage]:
         (points,) = data.take(_COUNT, f"the number of 2D points of image {index}")
         data.skip(points * _POINT_2D_BYTES, f"the {points} 2D points of image {index}")
         if identity in identities:
-            raise InputError(f"{where}: the id {identity} is that of another image")
+            raise twice(where, identity, "image")
         identities.add(identity)
         images.append(make_colmap_image(where, name, camera, tuple(pose)))
     data.finish("images")
@@ -116,14 +119,18 @@ def _name(data: _Data, where: str) -> str:
     if end < 0:
         raise InputError(
             f"{where}: its name (byte {data.offset}) has no end within "
-            f"{MAX_NAME_BYTES} bytes; the file is truncated or damaged"
+            f"{MAX_NAME_BYTES} bytes; the file is truncated or damaged: export or copy "
+            "it again"
         )
     raw = data.bytes[data.offset : end]
     data.offset = end + 1
     try:
         return raw.decode()
     except UnicodeDecodeError as error:
-        raise InputError(f"{where}: its name {raw[:80]!r} is not UTF-8") from error
+        raise InputError(
+            f"{where}: its name {raw[:80]!r} is not UTF-8; the file is damaged, or the "
+            "photograph is to be renamed"
+        ) from error
 
 
 def read_points(path: Path) -> ColmapPoints:
@@ -132,17 +139,16 @@ def read_points(path: Path) -> ColmapPoints:
     starts = _point_starts(data)
     data.finish("points")
     raw = np.frombuffer(data.bytes, np.uint8)
-    kinds = [_POINT.fields[name][0] for name in _POINT.names or ()]
-    fields = [np.empty((data.count, *kind.shape), kind.base) for kind in kinds]
+    fields = {name: np.empty((data.count, *s), kind) for name, kind, *s in _FIELDS}
     for first in range(0, data.count, _PIECE):
         piece = slice(first, first + _PIECE)
         # A gather of the fixed part of records: [·, 51] bytes.
         rows = raw[starts[piece, None] + np.arange(_POINT.itemsize)].view(_POINT)[:, 0]
-        for field, name in zip(fields, _POINT.names or ()):
+        for name, field in fields.items():
             field[piece] = rows[name]
     # Sorting copies: what was read must not be held as well.
     del data, raw, starts
-    identities, xyz, rgb, errors, lengths = fields
+    identities, xyz, rgb, errors, lengths = fields.values()
     lengths = lengths.view(np.int64)
     return sorted_points(str(path), ColmapPoints(identities, xyz, rgb, errors, lengths))
 

@@ -19,6 +19,7 @@ from gsjax.scene.colmap_model import (
     make_colmap_camera,
     make_colmap_image,
     sorted_points,
+    twice,
 )
 
 _UINT32, _UINT64 = (1 << 32) - 1, (1 << 64) - 1
@@ -37,7 +38,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: after line {number}: not UTF-8 text; the file is damaged, or a "
-            "binary one with the wrong suffix"
+            "binary one with the wrong suffix: export or copy it again"
         ) from error
     if not line.endswith("\n"):
         warnings.warn(
@@ -74,7 +75,7 @@ def _words(where: str, line: str, least: int, wanted: str, split: int = -1):
     if len(words) < least:
         raise InputError(
             f"{where}: found {len(words)} values, {wanted} is wanted; the file is "
-            "truncated or damaged"
+            "truncated or damaged: export or copy it again"
         )
     return words
 
@@ -98,10 +99,11 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
         params = _floats(where, words[4:])
         if len(params) != kind.size:
             raise InputError(
-                f"{where}: found {len(params)} parameters, {kind.name} has {kind.size}"
+                f"{where}: found {len(params)} parameters, {kind.name} has "
+                f"{kind.size}; the file is truncated or damaged: export it again"
             )
         if identity in cameras:
-            raise InputError(f"{where}: the id {identity} is that of another camera")
+            raise twice(where, identity, "camera")
         cameras[identity] = make_colmap_camera(where, kind, size, params)
     _compare(path, "cameras", len(cameras), declared)
     return cameras
@@ -130,9 +132,11 @@ def read_images(path: Path) -> list[ColmapImage]:
         identity = _whole(where, "the image id", words[0], _UINT32)
         camera = _whole(where, "the camera id", words[8], _UINT32)
         if identity in identities:
-            raise InputError(f"{where}: the id {identity} is that of another image")
+            raise twice(where, identity, "image")
         if len(words[9].encode()) > MAX_NAME_BYTES:
-            raise InputError(f"{where}: a name of more than {MAX_NAME_BYTES} bytes")
+            raise InputError(
+                f"{where}: a name of more than {MAX_NAME_BYTES} bytes; rename it"
+            )
         identities.add(identity)
         pose = _floats(where, words[1:8])
         images.append(make_colmap_image(where, words[9], camera, pose))
@@ -201,7 +205,7 @@ def _bad_point(where: str, words: list[str]) -> InputError:
     """What is wrong with a line of points3D.txt."""
     try:
         if len(words) < 8:
-            wanted = "POINT3D_ID X Y Z R G B ERROR TRACK is wanted"
+            wanted = "POINT3D_ID X Y Z R G B ERROR TRACK is wanted; export it again"
             return InputError(f"{where}: found {len(words)} values, {wanted}")
         _whole(where, "the point id", words[0], _UINT64)
         _floats(where, words[1:])
@@ -209,7 +213,8 @@ def _bad_point(where: str, words: list[str]) -> InputError:
         return error
     return InputError(
         f"{where}: the track has {len(words) - 8} values; pairs of IMAGE_ID "
-        "POINT2D_IDX are wanted; the file is truncated or damaged"
+        "POINT2D_IDX are wanted; the file is truncated or damaged: export or copy it "
+        "again"
     )
 
 

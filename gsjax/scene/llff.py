@@ -50,7 +50,10 @@ def load_llff(
 
 def _view(where: str, row: np.ndarray, file: Path) -> View:
     if not (np.abs(row) < MAX_COORDINATE).all():
-        raise InputError(f"{where}: values that are no finite numbers: {row.tolist()}")
+        raise InputError(
+            f"{where}: values that are no finite numbers: {row.tolist()}; remove the "
+            "row and its photograph"
+        )
     matrix = row[:15].reshape(3, 5)
     height, width, focal = matrix[:, 4].tolist()
     sides = (width, height)

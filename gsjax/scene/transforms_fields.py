@@ -14,6 +14,7 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.files import read_json
+from gsjax.scene.colmap_model import MAX_COORDINATE, MAX_SIDE
 
 _RIGID_TOLERANCE = 1e-3
 
@@ -61,11 +62,13 @@ def number(frame: Frame, source: dict[str, Any], key: str) -> float | None:
     if value is None:
         return None
     try:
-        if _is_number(value) and math.isfinite(value):
+        if _is_number(value) and abs(value) < MAX_COORDINATE:
             return float(value)
     except OverflowError:  # an integer beyond float64
         pass
-    raise InputError(f"{frame.where}: {key} is {shown(value)}; a number is wanted")
+    raise InputError(
+        f"{frame.where}: {key} is {shown(value)}; a finite number is wanted"
+    )
 
 
 def first_number(frame: Frame, key: str) -> float | None:
@@ -100,10 +103,10 @@ def size_of(frame: Frame) -> tuple[int, int] | None:
             f"{shown(height)}; give both in the file, or pass size=(width, height), "
             "on the command line --size WxH"
         )
-    if not (width >= 1 and height >= 1 and width % 1 == 0 and height % 1 == 0):
+    if not all(1 <= side <= MAX_SIDE and side % 1 == 0 for side in (width, height)):
         raise InputError(
-            f"{frame.where}: image size w {width:g}, h {height:g}; whole and ≥ 1 is "
-            "wanted"
+            f"{frame.where}: image size w {width:g}, h {height:g}; whole and ≥ 1, at "
+            f"most {MAX_SIDE}, is wanted"
         )
     return int(width), int(height)
 
@@ -148,10 +151,10 @@ def _matrix(frame: Frame) -> np.ndarray:
             matrix = np.asarray(rows, np.float64)
     except OverflowError:  # an integer beyond float64
         pass
-    # Bounded, so that products stay finite and float32 holds the result.
-    if not (np.abs(matrix) < 1e30).all():
+    if not (np.abs(matrix) < MAX_COORDINATE).all():
         raise InputError(
-            f"{where} has values that are no finite numbers: {shown(rows)}"
+            f"{where} has values that are no finite numbers: {shown(rows)}; remove the "
+            "frame"
         )
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise InputError(
