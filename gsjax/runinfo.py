@@ -46,7 +46,10 @@ def _evaluation(path: Path) -> dict[str, Any] | None:
     told = read_json(path, "what `gsjax eval` writes anew")
     for key, kinds in _TOLD.items():
         value = told.get(key, "missing")
-        if type(value) not in kinds or (key == "which" and value not in _VIEWS):
+        good = type(value) in kinds
+        if good and type(value) in (int, float):
+            good = abs(value) < 1e30
+        if not good or (key == "which" and value not in _VIEWS):
             raise InputError(
                 f"{path}: damaged: {key} is {repr(value)[:80]}; `gsjax eval` writes it "
                 "anew"

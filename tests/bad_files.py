@@ -366,16 +366,21 @@ BAD = {
         at("train", "adaptive", "threshold", to=np.nan),
         "threshold is nan",
     ),
+    "config huge": Bad("config.json", at("every", to=10**400), "every is 1000"),
     "config rates": Bad("config.json", at("train", "rates", to=[]), "not the settings"),
     "evaluation": Bad(
         "eval.json", at("psnr", to="good"), "psnr is 'good'; .*gsjax eval"
     ),
+    "evaluation huge": Bad("eval.json", at("psnr", to=10**400), "psnr is 1000"),
     "evaluation views": Bad("eval.json", at("which", to=[]), r"which is \[\]"),
     "cameras missing": Bad(
         "cameras.json", changed(lambda c: c["views"].pop()), "view_01.png"
     ),
     "cameras sheared": Bad(
         "cameras.json", at("views", 0, "viewmat", 0, 0, to=2.0), "00.png: no rigid pose"
+    ),
+    "cameras huge": Bad(
+        "cameras.json", at("views", 1, "K", 0, 0, to=10**400), "too large to convert"
     ),
     "cameras ragged": Bad("cameras.json", at("views", 0, "K", to=[[1]]), "reshape"),
 }

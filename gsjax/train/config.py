@@ -17,6 +17,7 @@ from gsjax.raster.types import RasterConfig
 
 STRATEGIES = ("adaptive", "mcmc")
 BACKGROUNDS = ("black", "white", "random")
+_MAX_WHOLE = 1 << 63
 
 
 @dataclass(frozen=True)
@@ -207,6 +208,8 @@ def _is_kind(value, hint) -> bool:
         if arguments[1:] == (...,):
             arguments = arguments[:1] * len(value)
         return len(value) == len(arguments) and all(map(_is_kind, value, arguments))
+    if type(value) is int and abs(value) > _MAX_WHOLE:  # nor does float64 hold all
+        return False
     if hint is float:
         return type(value) in (int, float) and not math.isnan(value)
     if hint is Path:

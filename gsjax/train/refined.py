@@ -107,7 +107,7 @@ def with_cameras(scene: Scene, path: Path) -> Scene:
             viewmat = _moved(viewmat, scene.origin)
             views.append(replace(view, viewmat=viewmat, K=K))
         return replace(scene, views=tuple(views))
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(
             f"{path}: damaged, or of another dataset: {error!r}; remove it to use the "
             "cameras of the dataset"
