@@ -9,8 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.errors import InputError, MissingExtraError
-from gsjax.files import make_folder as make_folder
-from gsjax.files import write_file as write_file
 
 _MAX_16 = 65535
 

@@ -66,9 +66,7 @@ def number(frame: Frame, source: dict[str, Any], key: str) -> float | None:
             return float(value)
     except OverflowError:  # an integer beyond float64
         pass
-    raise InputError(
-        f"{frame.where}: {key} is {shown(value)}; a finite number is wanted"
-    )
+    raise InputError(f"{frame.where}: {key} is {shown(value)}; a number is wanted")
 
 
 def first_number(frame: Frame, key: str) -> float | None:
