@@ -8,6 +8,7 @@ traceback.
 
 import contextlib
 import io
+import os
 import re
 import sys
 import traceback
@@ -50,6 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"gsjax {version('gsjax')}")
         return 0
     debug = "--debug" in argv
+    # OpenCV tells of bad photographs on its own, on top of our one line.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     try:
         with warnings_as_lines():
             return _parse(argv).run()

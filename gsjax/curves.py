@@ -8,6 +8,7 @@ import numpy as np
 
 from gsjax import images
 from gsjax.errors import InputError
+from gsjax.files import write_file
 from gsjax.sheets import put_text, text_width
 
 _PAPER, _INK, _GRID = (255, 255, 255), (70, 74, 82), (228, 230, 234)
@@ -33,7 +34,7 @@ def curves_png(
       InputError: as `curves`, or if the file cannot be written.
     """
     pixels = curves(series, title=title, x_label=x_label)
-    images.write_file(path, images.encode_png(pixels))
+    write_file(path, images.encode_png(pixels))
 
 
 def curves(

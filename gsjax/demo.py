@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from gsjax import images
 from gsjax.console import note
+from gsjax.files import refuse_existing
 from gsjax.flights import path_entries, write_flight
 from gsjax.scene.caster import DemoDatasetSettings, write_demo_dataset
 from gsjax.subjects import open_subject
@@ -95,9 +96,7 @@ def run_demo(
 
 def _refuse_existing(files: DemoFiles, overwrite: bool) -> None:
     photos = files.dataset / "transforms.json"
-    images.refuse_existing(
-        [photos, run_files(files.run).config, files.turntable], overwrite
-    )
+    refuse_existing([photos, run_files(files.run).config, files.turntable], overwrite)
 
 
 def _turn(files: DemoFiles, run: RunSettings, overwrite: bool) -> None:

@@ -2,11 +2,12 @@
 
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax import images
 from gsjax.errors import InputError
+from gsjax.files import make_folder
 from gsjax.gaussians import num_active, select, with_sh_degree
 from gsjax.io import load, save
 from gsjax.subjects import splat_file
@@ -39,6 +40,13 @@ def export_scene(
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists; pass --overwrite, or another name")
     path = splat_file(source)
+    with jax.enable_x64(True):  # what is stored in float64 stays so
+        return _thinned(path, out, sh_degree, min_opacity)
+
+
+def _thinned(
+    path: Path, out: Path, sh_degree: int | None, min_opacity: float
+) -> tuple[int, int]:
     gaussians = load(path)
     found = int(num_active(gaussians))
     logits = np.asarray(gaussians.params.logit_opacities, np.float64)
@@ -53,6 +61,6 @@ def export_scene(
         )
     if sh_degree is not None:
         gaussians = with_sh_degree(gaussians, sh_degree)
-    images.make_folder(out.parent)
+    make_folder(out.parent)
     save(out, gaussians, overwrite=True)
     return written, found

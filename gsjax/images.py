@@ -1,14 +1,9 @@
-"""Images to files: what a render returns, as PNG and .npy.
+"""Images as bytes of files: what a render returns, as PNG and .npy.
 
-OpenCV encodes and is loaded when first needed. Files are written beside their name
-and then renamed: they appear complete or not at all.
+OpenCV encodes and is loaded when first needed.
 """
 
 import io
-import os
-import secrets
-from collections.abc import Iterable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -80,63 +75,3 @@ def encode_npy(image: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, np.asarray(image, np.float32), allow_pickle=False)
     return buffer.getvalue()
-
-
-def refuse_existing(paths: Iterable[Path], overwrite: bool) -> None:
-    """Check names before the work that would fill them.
-
-    Raises:
-      InputError: if one exists and ``overwrite`` is not set, or is a folder.
-    """
-    found = [path for path in paths if path.exists()]
-    folders = [path for path in found if path.is_dir()]
-    if folders:
-        raise InputError(f"{folders[0]}: is a folder; a file is to be written there")
-    if found and not overwrite:
-        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-        raise InputError(
-            f"{found[0]}{more}: exists; pass --overwrite, or another folder with -o"
-        )
-
-
-def make_folder(path: Path) -> None:
-    """Create a folder and those above it.
-
-    Raises:
-      InputError: if that cannot be.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be made a folder: {error.strerror or error}"
-        ) from error
-
-
-def write_file(path: Path, data: bytes, *, durable: bool = False) -> None:
-    """Write ``data``, in place of what may be there.
-
-    Args:
-      path: of the file.
-      data: all of it.
-      durable: wait until it is on the disk before it gets its name, so that a power
-        cut leaves the one file or the other.
-
-    Raises:
-      InputError: if it cannot be written.
-    """
-    temporary = path.parent / f".gsjax-{secrets.token_hex(6)}.tmp"
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            if durable:
-                file.flush()
-                os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written: {error.strerror or error}; check permissions "
-            "and space"
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)

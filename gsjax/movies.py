@@ -18,6 +18,7 @@ import numpy as np
 
 from gsjax import images
 from gsjax.errors import InputError
+from gsjax.files import make_folder, refuse_existing, write_file, writing
 
 MOVIE_KINDS = (".gif", ".webp", ".webm", ".png")
 
@@ -35,7 +36,7 @@ def check_movie(path: Path, *, overwrite: bool = False) -> None:
         )
     folder = _png_folder(path)
     if folder is None:
-        images.refuse_existing([path], overwrite)
+        refuse_existing([path], overwrite)
     elif folder.exists():
         _refuse_folder(folder, overwrite)
 
@@ -74,13 +75,13 @@ def write_movie(
         raise InputError(f"{path}: there are no frames to write")
     checked = chain([first], checked)
     folder, suffix = _png_folder(path), path.suffix.lower()
-    images.make_folder((folder or path).parent)
+    make_folder((folder or path).parent)
     if folder is not None:
         return _write_folder(folder, checked)
     if suffix == ".webm":
         return _write_vp9(path, checked, fps)
     pictures = list(checked)
-    images.write_file(path, encode_animation(suffix, pictures, fps))
+    write_file(path, encode_animation(suffix, pictures, fps))
     return len(pictures)
 
 
@@ -155,15 +156,14 @@ def _write_folder(folder: Path, frames: Iterable[np.ndarray]) -> int:
     temporary = _temporary(folder)
     count = 0
     try:
-        images.make_folder(temporary)
+        make_folder(temporary)
         for count, frame in enumerate(frames, start=1):
             data = images.encode_png(frame)
-            images.write_file(temporary / f"frame_{count:04d}.png", data)
-        if folder.exists():  # nothing but frames, which may be replaced
-            shutil.rmtree(folder)
-        os.replace(temporary, folder)
-    except OSError as error:
-        raise _cannot(folder, error) from error
+            write_file(temporary / f"frame_{count:04d}.png", data)
+        with writing(folder):
+            if folder.exists():  # nothing but frames, which may be replaced
+                shutil.rmtree(folder)
+            os.replace(temporary, folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     return count
@@ -189,9 +189,8 @@ def _write_vp9(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
                 f"{path}: {written:g} of {count} frames could be written; check the "
                 "space that is left"
             )
-        os.replace(temporary, path)
-    except OSError as error:
-        raise _cannot(path, error) from error
+        with writing(path):
+            os.replace(temporary, path)
     finally:
         if writer is not None:
             writer.release()
@@ -215,13 +214,6 @@ def _vp9_writer(path: Path, frame: np.ndarray, fps: float):
 def _temporary(path: Path) -> Path:
     """A name beside ``path`` with its suffix, which tells OpenCV the container."""
     return path.parent / f".gsjax-{secrets.token_hex(6)}{path.suffix.lower()}"
-
-
-def _cannot(path: Path, error: OSError) -> InputError:
-    return InputError(
-        f"{path}: cannot be written: {error.strerror or error}; check permissions and "
-        "space"
-    )
 
 
 @contextmanager

@@ -1,13 +1,18 @@
 """How a run went, in numbers: what `gsjax info` says of a run's folder."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from gsjax.console import decibels
 from gsjax.errors import InputError
+from gsjax.files import read_json
 from gsjax.train.folder import load_settings, run_files
 from gsjax.train.history import read_metrics
+
+_VIEWS = {"test": "held-out", "train": "training"}
+# Of an evaluation, what is told of it, and what that may be.
+_TOLD = {"which": (str,), "views": (int,), "ssim": (float, int)}
+_TOLD["psnr"] = (float, int, type(None))  # null where it is infinite
 
 
 def describe_run(folder: Path) -> dict[str, Any]:
@@ -38,13 +43,18 @@ def describe_run(folder: Path) -> dict[str, Any]:
 def _evaluation(path: Path) -> dict[str, Any] | None:
     if not path.exists():
         return None
-    try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        return {key: told[key] for key in ("which", "views", "psnr", "ssim")}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{path}: damaged: {error}; `gsjax eval` writes it anew"
-        ) from error
+    told = read_json(path, "what `gsjax eval` writes anew")
+    for key, kinds in _TOLD.items():
+        value = told.get(key, "missing")
+        good = type(value) in kinds
+        if good and type(value) in (int, float):
+            good = abs(value) < 1e30
+        if not good or (key == "which" and value not in _VIEWS):
+            raise InputError(
+                f"{path}: damaged: {key} is {repr(value)[:80]}; `gsjax eval` writes it "
+                "anew"
+            )
+    return {key: told[key] for key in _TOLD}
 
 
 def run_text(path: str, facts: dict[str, Any]) -> str:
@@ -57,7 +67,7 @@ def run_text(path: str, facts: dict[str, Any]) -> str:
     }
     quality = facts["evaluation"]
     if quality is not None:
-        which = {"test": "held-out", "train": "training"}[quality["which"]]
+        which = _VIEWS[quality["which"]]
         rows["quality"] = (
             f"PSNR {decibels(quality['psnr'])}, SSIM {quality['ssim']:.4f} "
             f"({quality['views']} {which} views)"

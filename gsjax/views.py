@@ -11,6 +11,7 @@ from gsjax import images
 from gsjax.cameras import Camera
 from gsjax.console import progress, say
 from gsjax.errors import InputError
+from gsjax.files import make_folder, refuse_existing, write_file
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.raster.render import exact_config, render_exact
 from gsjax.raster.types import RasterConfig, Render
@@ -57,7 +58,7 @@ def write_views(
     targets = [_targets(folder, entry.name, kinds, npy) for entry in entries]
     _refuse_conflicts(targets, overwrite)
     gaussians = subject.load()
-    images.make_folder(folder)
+    make_folder(folder)
     config = subject.config.replace(outputs=tuple(kinds))
     cameras = [entry.camera for entry in entries]
     views = rendered(gaussians, cameras, config, subject.background)
@@ -110,7 +111,7 @@ def _refuse_conflicts(targets: list[list[_Target]], overwrite: bool) -> None:
                 "camera file, or ask for one kind of image at a time"
             )
         seen.add(str(path).casefold())
-    images.refuse_existing(paths, overwrite)
+    refuse_existing(paths, overwrite)
 
 
 def _write(target: _Target, image: np.ndarray) -> None:
@@ -121,7 +122,7 @@ def _write(target: _Target, image: np.ndarray) -> None:
         line += f"  depth {depth.near:.6g} (1) to {depth.far:.6g} (65535), 0: nothing"
     else:
         pixels = images.to_8_bit(image)
-    images.write_file(target.png, images.encode_png(pixels))
+    write_file(target.png, images.encode_png(pixels))
     if target.npy is not None:
-        images.write_file(target.npy, images.encode_npy(image))
+        write_file(target.npy, images.encode_npy(image))
     say(line)

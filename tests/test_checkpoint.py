@@ -199,7 +199,7 @@ def test_archives_of_others(load_bytes):
     other = np.frombuffer(b'{"format": 99, "step": 1}', np.uint8)
     with pytest.raises(InputError, match="format 99; 1 is wanted"):
         load_bytes(archive(**{"meta.json": other}))
-    with pytest.raises(InputError, match="allow_pickle"):
+    with pytest.raises(InputError, match=r"not that of an array of numbers \(descr\)"):
         load_bytes(archive(a=np.asarray([{}], object)))
     text = np.frombuffer(b"[1, 2", np.uint8)
     with pytest.raises(InputError):
@@ -210,7 +210,7 @@ def test_a_bomb_is_not_unpacked(load_bytes):
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as made:
         made.writestr("a.npy", bytes(10**8))
-    with pytest.raises(InputError, match="more than it can hold"):
+    with pytest.raises(InputError, match="compressed, in 100000000 bytes"):
         load_bytes(buffer.getvalue())
 
 

@@ -254,7 +254,7 @@ BAD = {
     "no run": (3, no_run, "no run is here"),
     "missing run": (3, lambda _d, t: ["info", str(t / "none")], "no run is here"),
     "no splat": (3, no_splat, "--resume"),
-    "bad evaluation": (3, bad_eval, "eval.json: damaged"),
+    "bad evaluation": (3, bad_eval, "eval.json: the top is [], an object is wanted"),
     "no dataset": (3, no_dataset, "gone: does not exist"),
     "both": (2, render("--path", "test", "--cameras", "a", "-o", "o"), "exclude"),
     "frames": (2, render("--path", "train", "--frames", "5", "-o", "o"), "--frames"),

@@ -111,12 +111,13 @@ IMAGE = "1 1 0 0 0 0 0 3 1 a.png"
 POINT = "7 1 2 3 255 0 9 0.5 1 0 2 5"
 
 
-def write_text(folder, cameras=CAMERA, images=IMAGE + "\n", points=POINT):
+def write_text(folder, cameras=CAMERA, images=IMAGE, points=POINT):
     folder.mkdir(exist_ok=True, parents=True)
     contents = {"cameras": cameras, "images": images, "points3D": points}
     for name, text in contents.items():
         if text is not None:
-            (folder / f"{name}.txt").write_text(text + "\n")
+            ends = "\n" * (2 if name == "images" else 1)  # a line of 2D points
+            (folder / f"{name}.txt").write_text(text + ends)
     return folder
 
 

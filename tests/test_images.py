@@ -17,15 +17,6 @@ def test_depth_picture_of_nothing_and_of_a_plane():
     assert (flat.near, flat.far) == (2, 2)
 
 
-def test_a_failed_write_leaves_nothing(tmp_path):
-    with pytest.raises(gsjax.InputError, match="cannot be written"):
-        images.write_file(tmp_path / "none" / "a.png", b"")
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(gsjax.InputError, match="cannot be written"):
-        images.write_file(tmp_path / "folder", b"")
-    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
-
-
 def test_camera_file_round_trip(tmp_path):
     viewmat = gsjax.look_at((1, 2, 3), (0.5, 0, 0))
     cameras = [

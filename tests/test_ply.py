@@ -4,6 +4,7 @@ import os
 import time
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsjax.errors import InputError
+from gsjax.export import export_scene
 from gsjax.gaussians import Gaussians, grow, make_gaussians, select
 from gsjax.io import load, save
 from gsjax.io.ply import read_ply, write_ply
@@ -110,6 +112,62 @@ def test_written_bytes_are_the_standard_layout(tmp_path):
     write_ply(tmp_path / "a.ply", make_gaussians(**fields))
     wanted = encode(table_of(fields)).replace(b"comment made by a test\n", b"")
     assert (tmp_path / "a.ply").read_bytes() == wanted
+
+
+@pytest.mark.parametrize("count", [1, 40_000])
+def test_far_means_come_back_bit_by_bit(tmp_path, count):
+    fields = random_fields(count, 0)
+    near, origin = fields["means"], np.asarray([4e6, -5e6, 123.456])
+    path = tmp_path / "a.ply"
+    with jax.enable_x64(True):
+        far = fields | {"means": near + origin}
+        save(path, make_gaussians(**far))
+        back = np.asarray(load(path).params.means)
+    assert back.tobytes() == far["means"].tobytes()
+    assert np.abs(back - origin - near).max() < 1e-8
+    kinds = [line.split()[1:] for line in path.read_bytes().split(b"\n")[3:20]]
+    wide = [name for kind, name in kinds if kind == b"double"]
+    assert wide == [b"x", b"y", b"z"]
+
+
+def test_float64_that_float32_holds_is_written_as_the_standard_layout(tmp_path):
+    fields = random_fields(7, 1)
+    fields["means"][3] = np.nan, np.inf, -0.0
+    with jax.enable_x64(True):
+        wide = make_gaussians(**{k: v.astype(np.float64) for k, v in fields.items()})
+        assert wide.params.means.dtype == np.float64
+        with pytest.warns(UserWarning, match="1 of the Gaussians"):
+            save(tmp_path / "a.ply", wide)
+    assert (tmp_path / "a.ply").read_bytes() == encode(table_of(fields)).replace(
+        b"comment made by a test\n", b""
+    )
+
+
+def test_means_that_float32_moves_are_told(tmp_path):
+    fields = random_fields(50, 0)
+    fields["log_scales"][:] = -3
+    near = tmp_path / "near.ply"
+    shifted = {"near": 0.1, "far": 1e6}
+    with jax.enable_x64(True):
+        for name, by in shifted.items():
+            moved = fields | {"means": fields["means"].astype(np.float64) + by}
+            save(tmp_path / f"{name}.ply", make_gaussians(**moved))
+    with jax.enable_x64(False):
+        assert load(near).params.means.dtype == np.float32
+        wanted = r"far\.ply: \d+ of 50 .*float32 moves them, by up to 0\.03.*x64"
+        with pytest.warns(UserWarning, match=wanted):
+            means = np.asarray(load(tmp_path / "far.ply").params.means)
+    np.testing.assert_allclose(means, fields["means"] + 1e6, rtol=1e-7)
+
+
+def test_an_export_loses_nothing(tmp_path):
+    fields = random_fields(5, 0)
+    first, second = tmp_path / "a.ply", tmp_path / "b.ply"
+    with jax.enable_x64(True):
+        far = fields["means"] + np.asarray([1e7, 0, 0.1])
+        save(first, make_gaussians(**fields | {"means": far}))
+    assert export_scene(first, second) == (5, 5)
+    assert second.read_bytes() == first.read_bytes()
 
 
 def test_more_rows_than_a_piece(tmp_path):

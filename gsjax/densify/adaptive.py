@@ -14,6 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from gsjax.densify.schedule import is_due
 from gsjax.densify.slots import assign, copy_into, where_slots
 from gsjax.densify.types import Densifier, Observation, SlotEdit
 from gsjax.errors import InputError
@@ -123,8 +124,7 @@ def adaptive(settings: AdaptiveSettings, extent: float) -> Densifier:
         return jax.tree.map(lambda new, old: new.astype(old.dtype), seen_now, stats)
 
     def due(step: Array) -> Array:
-        inside = (step > settings.start) & (step <= settings.stop)
-        return inside & (step % settings.every == 0)
+        return is_due(step, settings.start, settings.stop, settings.every)
 
     def plan(key: Array, step: Array, gaussians: Gaussians, stats: AdaptiveStats):
         dense = _densified(settings, extent, key, step, gaussians, stats)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from gsjax.densify.schedule import is_due
 from gsjax.densify.slots import copy_into
 from gsjax.densify.types import Densifier, SlotEdit
 from gsjax.errors import InputError
@@ -117,8 +118,7 @@ def mcmc(settings: McmcSettings) -> Densifier:
         return params.replace(means=means)  # pyright: ignore
 
     def due(step: Array) -> Array:
-        inside = (step > settings.start) & (step <= settings.stop)
-        return inside & (step % settings.every == 0)
+        return is_due(step, settings.start, settings.stop, settings.every)
 
     return Densifier(
         init=lambda _: (),

@@ -10,9 +10,6 @@ than the arrays it returns (and once more on the way to the device).
 """
 
 import math
-import os
-import secrets
-import stat
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -22,11 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.files import opened, replacing
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.io.ply_header import Header, check_properties, check_size, read_header, warn
 from gsjax.io.ply_rows import CHUNK_ROWS, read_rows
 
 _NORMALS = ("nx", "ny", "nz")
+_MAX_SHIFT = 0.1  # of a Gaussian's size by rounding, before it is told
 # Exporters write ±inf for opacities of exactly 0 and 1; the range of `logit`.
 _MAX_LOGIT = math.log((1 - 2.0**-24) / 2.0**-24)
 
@@ -53,19 +52,11 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
         finite; the message names what was found and what was wanted.
     """
     path = Path(path)
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise InputError(f"{path}: not a regular file; pass a .ply file")
-        with path.open("rb") as file:
-            header = read_header(file, path)
-            bases = check_properties(header, _views(_allocate(0, 1, np.float32)))
-            check_size(header)
-            fields = _read_body(file, header, bases)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read: {error.strerror or error}; check path and "
-            "permissions"
-        ) from error
+    with opened(path, "a .ply file") as file:
+        header = read_header(file, path)
+        bases = check_properties(header, _views(_allocate(0, 1, np.float32)))
+        check_size(header)
+        fields = _read_body(file, header, bases)
     _check_values(path, fields, drop_nonfinite)
     return make_gaussians(**fields, capacity=None)
 
@@ -100,12 +91,26 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
     dtype = np.dtype(jnp.result_type(float)) if wide else np.dtype(np.float32)
     fields = _allocate(header.vertex.rows, bases, dtype)
     views = _views(fields)
-    start = 0
+    start, displaced, furthest = 0, 0, 0.0
     with np.errstate(over="ignore", invalid="ignore"):  # _check_values finds them
         for size, columns in read_rows(file, header):
+            rows = slice(start, start + size)
             for name, view in views.items():
-                view[start : start + size] = columns[name]
+                view[rows] = columns[name]
+            if wide and dtype == np.float32:
+                shift = np.max([abs(columns[a] - views[a][rows]) for a in "xyz"], 0)
+                sizes = np.exp(np.max([views[f"scale_{i}"][rows] for i in range(3)], 0))
+                moved = np.isfinite(shift) & (shift > _MAX_SHIFT * sizes)
+                displaced += int(moved.sum())
+                furthest = max(furthest, shift[moved].max(initial=0.0))
             start += size
+    if displaced:
+        warn(
+            f"{header.path}: {displaced} of {start} Gaussians lie so far from the "
+            f"origin that float32 moves them, by up to {furthest:.3g}, more than "
+            f"{_MAX_SHIFT:g} of their size; read the file with jax_enable_x64, or move "
+            "the scene to the origin"
+        )
     return fields
 
 
@@ -164,8 +169,10 @@ def write_ply(
     """Write the active Gaussians, in their order, as a standard 3DGS PLY.
 
     Binary, little-endian, float32; x y z nx ny nz f_dc f_rest opacity scale rot,
-    normals zero. Written beside ``path`` and then renamed: it appears complete or
-    not at all. Values that are not finite are written, with a warning.
+    normals zero. Only x y z are float64, where means are given in it that float32
+    would round: those of a scene far from the origin come back bit by bit. Written
+    beside ``path`` and then renamed: it appears complete or not at all. Values that
+    are not finite are written, with a warning.
 
     Args:
       path: the file to write.
@@ -183,20 +190,8 @@ def write_ply(
         raise InputError(f"{path}: exists; pass overwrite=True or another name")
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} is missing; create it")
-    temporary = path.parent / f".gsjax-{secrets.token_hex(6)}.tmp"
-    try:
-        with temporary.open("xb") as file:
-            nonfinite = _write_body(file, gaussians)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written: {error.strerror or error}; check permissions "
-            "and space"
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path, durable=True) as file:
+        nonfinite = _write_body(file, gaussians)
     if nonfinite:
         warn(f"{path}: {nonfinite} of the Gaussians written are NaN or infinite")
 
@@ -208,16 +203,35 @@ def _write_body(file: BinaryIO, gaussians: Gaussians) -> int:
     names = [*"xyz", *_NORMALS, *(name for name in views if name not in "xyz")]
     slots = np.flatnonzero(np.asarray(gaussians.active))
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(slots)}"]
-    lines += [f"property float {name}" for name in names]
+    means = [views[axis] for axis in "xyz"]
+    wide = "xyz" if any(_is_rounded(mean, slots) for mean in means) else ""
+    kinds = {name: "double" if name in wide else "float" for name in names}
+    lines += [f"property {kind} {name}" for name, kind in kinds.items()]
     file.write("\n".join([*lines, "end_header", ""]).encode())
+    codes = {"float": "<f4", "double": "<f8"}
+    dtype = np.dtype([(name, codes[kind]) for name, kind in kinds.items()])
     nonfinite = 0
     for start in range(0, len(slots), CHUNK_ROWS):
         chosen = slots[start : start + CHUNK_ROWS]
-        table = np.zeros((len(chosen), len(names)), "<f4")
+        table = np.zeros(len(chosen), dtype)
+        finite = np.ones(len(chosen), bool)
         with np.errstate(over="ignore"):
-            for column, name in enumerate(names):
-                if name in views:
-                    table[:, column] = views[name][chosen]
-        nonfinite += int((~np.isfinite(table).all(axis=1)).sum())
+            for name, view in views.items():
+                table[name] = view[chosen]
+                finite &= np.isfinite(table[name])
+        nonfinite += int((~finite).sum())
         file.write(table.tobytes())
     return nonfinite
+
+
+def _is_rounded(values: np.ndarray, slots: np.ndarray) -> bool:
+    """Whether float32 does not hold all ``values`` in ``slots``."""
+    if values.dtype != np.float64:
+        return False
+    for start in range(0, len(slots), CHUNK_ROWS):
+        chosen = values[slots[start : start + CHUNK_ROWS]]
+        with np.errstate(over="ignore"):
+            narrow = chosen.astype(np.float32)
+        if not np.array_equal(narrow, chosen, equal_nan=True):
+            return True
+    return False

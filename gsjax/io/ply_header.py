@@ -76,7 +76,8 @@ def read_header(file: BinaryIO, path: Path) -> Header:
     if magic is None:
         raise InputError(
             f"{path}: byte 0: found {head[:16]!r} where a PLY file has the line "
-            "'ply'; the file is empty, damaged or of another format"
+            "'ply'; the file is empty, damaged or of another format: export it "
+            "again"
         )
     eol = magic[1]
     pattern = re.compile(re.escape(eol) + rb"end_header[ \t]*" + re.escape(eol))

@@ -55,9 +55,11 @@ def _ascii_rows(
             if len(words) != len(vertex.types):
                 raise InputError(
                     f"{where}: found {len(words)} values, {len(vertex.types)} are "
-                    "wanted; the file is truncated or damaged"
+                    "wanted; the file is truncated or damaged: export it again"
                 )
             try:
+                if b"_" in line:  # which Python takes
+                    raise ValueError(f"an underscore in {line[:60]!r}")
                 table[row] = [float(word) for word in words]
             except ValueError as error:
                 raise InputError(f"{where}: {str(error)[:80]}; pass numbers") from error

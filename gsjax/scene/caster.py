@@ -19,6 +19,7 @@ import numpy as np
 from gsjax import images
 from gsjax.cameras import look_at, make_camera
 from gsjax.errors import InputError
+from gsjax.files import make_folder, refuse_existing, write_file
 from gsjax.scene import paints
 from gsjax.scene.shapes import Solid, box, disc, dot, sphere, torus
 from gsjax.scene.transforms import CameraEntry
@@ -157,19 +158,19 @@ def write_demo_dataset(
     names = [f"images/photo_{index:03d}" for index in range(len(viewmats))]
     photos = [folder / f"{name}.png" for name in names]
     cameras, points = folder / "transforms.json", folder / "points.ply"
-    images.refuse_existing([*photos, cameras, points], overwrite)
+    refuse_existing([*photos, cameras, points], overwrite)
     images.opencv()
-    images.make_folder(folder / "images")
+    make_folder(folder / "images")
     entries = []
     for name, photo, viewmat in zip(names, photos, viewmats):
         rgb = _picture(viewmat, K, size, settings.samples, settings.background)
-        images.write_file(photo, images.encode_png(images.to_8_bit(rgb)))
+        write_file(photo, images.encode_png(images.to_8_bit(rgb)))
         camera = make_camera(viewmat=viewmat, K=K, width=size[0], height=size[1])
         entries.append(CameraEntry(name, camera))
     cloud = _points_ply(*surface_points(settings.points, settings.seed))
-    images.write_file(points, cloud)
+    write_file(points, cloud)
     text = transforms_json(entries, ply_file_path=points.name)
-    images.write_file(cameras, text.encode())
+    write_file(cameras, text.encode())
 
 
 @cache

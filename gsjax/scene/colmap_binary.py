@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.files import read_bytes
 from gsjax.scene.colmap_model import (
     MAX_NAME_BYTES,
     ColmapCamera,
@@ -19,15 +20,19 @@ from gsjax.scene.colmap_model import (
     make_colmap_camera,
     make_colmap_image,
     sorted_points,
+    twice,
 )
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters
 _IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, camera; then the name
 _POINT_2D_BYTES = 24  # x, y as float64, id of the point as int64
-_POINT = np.dtype(
-    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")]
+_FIELDS = (
+    *(("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)),
+    *(("error", "<f8"), ("n", "<u8")),
 )
+_POINT = np.dtype([*_FIELDS])
+_PIECE = 1 << 12  # records gathered at a time
 _TRACK_BYTES = 8  # image and index of the observation, uint32 each
 
 
@@ -35,13 +40,7 @@ class _Data:
     """The bytes of a file and how far they are read."""
 
     def __init__(self, path: Path, least: int, records: str):
-        try:
-            self.bytes = path.read_bytes()
-        except OSError as error:
-            raise InputError(
-                f"{path}: cannot be read: {error.strerror or error}; check the path "
-                "and its permissions"
-            ) from error
+        self.bytes = read_bytes(path, "a file of COLMAP")
         self.path, self.offset = path, 0
         self.size = len(self.bytes)
         (self.count,) = self.take(_COUNT, "the count")
@@ -89,7 +88,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
         form = struct.Struct(f"<{kind.size}d")
         params = data.take(form, f"{kind.name} camera {index}")
         if identity in cameras:
-            raise InputError(f"{where}: the id {identity} is that of another camera")
+            raise twice(where, identity, "camera")
         cameras[identity] = make_colmap_camera(where, kind, (size[0], size[1]), params)
     data.finish("cameras")
     return cameras
@@ -107,7 +106,7 @@ def read_images(path: Path) -> list[ColmapImage]:
         (points,) = data.take(_COUNT, f"the number of 2D points of image {index}")
         data.skip(points * _POINT_2D_BYTES, f"the {points} 2D points of image {index}")
         if identity in identities:
-            raise InputError(f"{where}: the id {identity} is that of another image")
+            raise twice(where, identity, "image")
         identities.add(identity)
         images.append(make_colmap_image(where, name, camera, tuple(pose)))
     data.finish("images")
@@ -120,14 +119,18 @@ def _name(data: _Data, where: str) -> str:
     if end < 0:
         raise InputError(
             f"{where}: its name (byte {data.offset}) has no end within "
-            f"{MAX_NAME_BYTES} bytes; the file is truncated or damaged"
+            f"{MAX_NAME_BYTES} bytes; the file is truncated or damaged: export or copy "
+            "it again"
         )
     raw = data.bytes[data.offset : end]
     data.offset = end + 1
     try:
         return raw.decode()
     except UnicodeDecodeError as error:
-        raise InputError(f"{where}: its name {raw[:80]!r} is not UTF-8") from error
+        raise InputError(
+            f"{where}: its name {raw[:80]!r} is not UTF-8; the file is damaged, or the "
+            "photograph is to be renamed"
+        ) from error
 
 
 def read_points(path: Path) -> ColmapPoints:
@@ -135,17 +138,18 @@ def read_points(path: Path) -> ColmapPoints:
     data = _Data(path, _POINT.itemsize, "points")
     starts = _point_starts(data)
     data.finish("points")
-    # One gather of the fixed part of all records: [M, 51] bytes.
     raw = np.frombuffer(data.bytes, np.uint8)
-    table = np.empty((data.count, _POINT.itemsize), np.uint8)
-    piece = 1 << 18
-    for first in range(0, data.count, piece):
-        rows = starts[first : first + piece, None] + np.arange(_POINT.itemsize)
-        table[first : first + piece] = raw[rows]
-    points = table.view(_POINT)[:, 0]
-    fields = (points[name] for name in ("id", "xyz", "rgb", "error", "n"))
-    identities, xyz, rgb, errors, lengths = (np.ascontiguousarray(f) for f in fields)
-    lengths = lengths.astype(np.int64)
+    fields = {name: np.empty((data.count, *s), kind) for name, kind, *s in _FIELDS}
+    for first in range(0, data.count, _PIECE):
+        piece = slice(first, first + _PIECE)
+        # A gather of the fixed part of records: [·, 51] bytes.
+        rows = raw[starts[piece, None] + np.arange(_POINT.itemsize)].view(_POINT)[:, 0]
+        for name, field in fields.items():
+            field[piece] = rows[name]
+    # Sorting copies: what was read must not be held as well.
+    del data, raw, starts
+    identities, xyz, rgb, errors, lengths = fields.values()
+    lengths = lengths.view(np.int64)
     return sorted_points(str(path), ColmapPoints(identities, xyz, rgb, errors, lengths))
 
 

@@ -105,7 +105,8 @@ def kind_of(where: str, key: int | str) -> CameraKind:
     if kind is None:
         raise InputError(
             f"{where}: camera model {key!r} is unknown; the file is damaged, or newer "
-            "than this reader"
+            "than this reader: export it again, with a model of "
+            f"{', '.join(k.name for k in CAMERA_KINDS if k.lens is not None)}"
         )
     return kind
 
@@ -124,10 +125,13 @@ def make_colmap_camera(
     if not all(1 <= side <= MAX_SIDE for side in size):
         raise InputError(
             f"{where}: image size {size[0]} × {size[1]}; 1 to {MAX_SIDE} px a side is "
-            "wanted; the file is damaged"
+            "wanted; the file is damaged: export or copy it again"
         )
     if not all(math.isfinite(p) and abs(p) < MAX_COORDINATE for p in params):
-        raise InputError(f"{where}: parameters {params}; finite numbers are wanted")
+        raise InputError(
+            f"{where}: parameters {params}; finite numbers are wanted: estimate the "
+            "camera again"
+        )
     fx, fy = params[0], params[kind.focals - 1]
     if not (fx > 0 and fy > 0):
         raise InputError(f"{where}: focal lengths {fx:g}, {fy:g}; above 0 is wanted")
@@ -165,22 +169,34 @@ def make_colmap_image(
             "remove the image from the model"
         )
     if not name:
-        raise InputError(f"{where}: the name of the image is empty")
+        raise InputError(
+            f"{where}: the name of the image is empty; remove it from the model"
+        )
     norm = np.linalg.norm(quat)
     # A norm that is 1 but for rounding is left alone: the pose is then the file's.
     quat = quat if abs(norm - 1) < 1e-12 else quat / norm
     return ColmapImage(name, camera, quat, values[4:])
 
 
+def twice(where: str, identity: int, what: str) -> InputError:
+    """The error of an id that another camera or image has."""
+    return InputError(
+        f"{where}: the id {identity} is that of another {what}; the file is damaged: "
+        "export or copy it again"
+    )
+
+
 def sorted_points(where: str, points: ColmapPoints) -> ColmapPoints:
     """Points in the order of their ids, which are checked, as are the coordinates."""
-    order = np.argsort(points.ids, kind="stable")
-    points = ColmapPoints(*(values[order] for values in points))
-    twice = np.flatnonzero(points.ids[1:] == points.ids[:-1])
-    if len(twice):
+    if (points.ids[1:] < points.ids[:-1]).any():
+        order = np.argsort(points.ids, kind="stable")
+        points = ColmapPoints(*(values[order] for values in points))
+    again = np.flatnonzero(points.ids[1:] == points.ids[:-1])
+    if len(again):
         raise InputError(
-            f"{where}: {len(twice)} points have an id that another one has, the first: "
-            f"{points.ids[twice[:5]].tolist()}; the file is damaged"
+            f"{where}: {len(again)} points have an id that another one has, the first: "
+            f"{points.ids[again[:5]].tolist()}; the file is damaged: export or copy it "
+            "again"
         )
     wild = ~(np.abs(points.xyz) < MAX_COORDINATE).all(axis=1)
     if wild.any():

@@ -2,12 +2,14 @@
 
 import re
 import warnings
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.files import reading
 from gsjax.scene.colmap_model import (
     MAX_NAME_BYTES,
     ColmapCamera,
@@ -17,6 +19,7 @@ from gsjax.scene.colmap_model import (
     make_colmap_camera,
     make_colmap_image,
     sorted_points,
+    twice,
 )
 
 _UINT32, _UINT64 = (1 << 32) - 1, (1 << 64) - 1
@@ -24,21 +27,26 @@ _UINT32, _UINT64 = (1 << 32) - 1, (1 << 64) - 1
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """(number, line) of all lines, comments and blank ones too, without their ends."""
-    number = 0
+    number, line = 0, "\n"
     try:
-        with path.open(encoding="utf-8") as file:
+        with (
+            reading(path, "a file of COLMAP"),
+            path.open(encoding="utf-8") as file,
+        ):
             for number, line in enumerate(file, 1):
                 yield number, line.strip()
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read: {error.strerror or error}; check the path and "
-            "its permissions"
-        ) from error
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: after line {number}: not UTF-8 text; the file is damaged, or a "
-            "binary one with the wrong suffix"
+            "binary one with the wrong suffix: export or copy it again"
         ) from error
+    if not line.endswith("\n"):
+        warnings.warn(
+            f"{path}: line {number}, the last one, has no end; the file may be "
+            "truncated: export or copy it again",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def _is_record(line: str) -> bool:
@@ -55,6 +63,8 @@ def _whole(where: str, what: str, text: str, most: int) -> int:
 
 def _floats(where: str, texts: list[str]) -> tuple[float, ...]:
     try:
+        if any("_" in text for text in texts):  # which Python takes
+            raise ValueError(f"an underscore in {' '.join(texts)}")
         return tuple(float(text) for text in texts)
     except ValueError as error:
         raise InputError(f"{where}: {str(error)[:80]}; pass numbers") from error
@@ -65,7 +75,7 @@ def _words(where: str, line: str, least: int, wanted: str, split: int = -1):
     if len(words) < least:
         raise InputError(
             f"{where}: found {len(words)} values, {wanted} is wanted; the file is "
-            "truncated or damaged"
+            "truncated or damaged: export or copy it again"
         )
     return words
 
@@ -73,8 +83,10 @@ def _words(where: str, line: str, least: int, wanted: str, split: int = -1):
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
     """Cameras of a cameras.txt, by id."""
     cameras: dict[int, ColmapCamera] = {}
+    declared = None
     for number, line in _lines(path):
         if not _is_record(line):
+            declared = _declared(line, "cameras", declared)
             continue
         where = f"{path}: line {number}"
         words = _words(where, line, 4, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
@@ -87,11 +99,13 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
         params = _floats(where, words[4:])
         if len(params) != kind.size:
             raise InputError(
-                f"{where}: found {len(params)} parameters, {kind.name} has {kind.size}"
+                f"{where}: found {len(params)} parameters, {kind.name} has "
+                f"{kind.size}; the file is truncated or damaged: export it again"
             )
         if identity in cameras:
-            raise InputError(f"{where}: the id {identity} is that of another camera")
+            raise twice(where, identity, "camera")
         cameras[identity] = make_colmap_camera(where, kind, size, params)
+    _compare(path, "cameras", len(cameras), declared)
     return cameras
 
 
@@ -118,20 +132,31 @@ def read_images(path: Path) -> list[ColmapImage]:
         identity = _whole(where, "the image id", words[0], _UINT32)
         camera = _whole(where, "the camera id", words[8], _UINT32)
         if identity in identities:
-            raise InputError(f"{where}: the id {identity} is that of another image")
+            raise twice(where, identity, "image")
         if len(words[9].encode()) > MAX_NAME_BYTES:
-            raise InputError(f"{where}: a name of more than {MAX_NAME_BYTES} bytes")
+            raise InputError(
+                f"{where}: a name of more than {MAX_NAME_BYTES} bytes; rename it"
+            )
         identities.add(identity)
         pose = _floats(where, words[1:8])
         images.append(make_colmap_image(where, words[9], camera, pose))
         observations = True
     _compare(path, "images", len(images), declared)
+    if observations:
+        warnings.warn(
+            f"{path}: the line of 2D points (which may be empty) of the last image is "
+            "missing; the file may be truncated: export or copy it again",
+            UserWarning,
+            stacklevel=2,
+        )
     return images
 
 
 def read_points(path: Path) -> ColmapPoints:
     """Points of a points3D.txt, sorted by id; of the tracks only the length."""
-    identities, values, lengths, numbers = [], [], [], []
+    # Arrays, as lists of Python's numbers take five times the file.
+    identities, values = array("Q"), array("d")
+    lengths, numbers = array("q"), array("q")
     declared = None
     for number, line in _lines(path):
         if not _is_record(line):
@@ -143,14 +168,21 @@ def read_points(path: Path) -> ColmapPoints:
             identity = int(words[0])
         except ValueError:
             row, identity = [], -1
-        if len(row) < 7 or len(words) % 2 or not 0 <= identity <= _UINT64:
+        odd = len(row) < 7 or len(words) % 2 or "_" in line
+        if odd or not 0 <= identity <= _UINT64:
             raise _bad_point(f"{path}: line {number}", words)
         identities.append(identity)
-        values.append(row)
+        values.extend(row)
         lengths.append((len(words) - 8) // 2)
         numbers.append(number)
-    _compare(path, "points", len(values), declared)
-    table = np.asarray(values, np.float64).reshape(-1, 7)
+    _compare(path, "points", len(identities), declared)
+    if not identities:
+        warnings.warn(
+            f"{path}: no points are in it; the scene has none to start from",
+            UserWarning,
+            stacklevel=2,
+        )
+    table = np.frombuffer(values, np.float64).reshape(-1, 7)
     colors = table[:, 3:6]
     bad = ~((colors >= 0) & (colors <= 255) & (colors == np.rint(colors))).all(axis=1)
     if bad.any():
@@ -160,11 +192,11 @@ def read_points(path: Path) -> ColmapPoints:
             "numbers from 0 to 255 are wanted"
         )
     points = ColmapPoints(
-        ids=np.asarray(identities, np.uint64),
+        ids=np.frombuffer(identities, np.uint64),
         xyz=np.ascontiguousarray(table[:, :3]),
         colors=colors.astype(np.uint8),
         errors=table[:, 6].copy(),
-        track_lengths=np.asarray(lengths, np.int64),
+        track_lengths=np.frombuffer(lengths, np.int64),
     )
     return sorted_points(str(path), points)
 
@@ -173,15 +205,16 @@ def _bad_point(where: str, words: list[str]) -> InputError:
     """What is wrong with a line of points3D.txt."""
     try:
         if len(words) < 8:
-            wanted = "POINT3D_ID X Y Z R G B ERROR TRACK is wanted"
+            wanted = "POINT3D_ID X Y Z R G B ERROR TRACK is wanted; export it again"
             return InputError(f"{where}: found {len(words)} values, {wanted}")
         _whole(where, "the point id", words[0], _UINT64)
-        _floats(where, words[1:8])
+        _floats(where, words[1:])
     except InputError as error:
         return error
     return InputError(
         f"{where}: the track has {len(words) - 8} values; pairs of IMAGE_ID "
-        "POINT2D_IDX are wanted; the file is truncated or damaged"
+        "POINT2D_IDX are wanted; the file is truncated or damaged: export or copy it "
+        "again"
     )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.images import make_folder, refuse_existing, write_file
+from gsjax.files import make_folder, refuse_existing, write_file
 from gsjax.scene.colmap_model import KIND_OF_NAME, MAX_NAME_BYTES, quat_of
 from gsjax.scene.types import Scene, View
 

@@ -10,6 +10,7 @@ from gsjax.errors import InputError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _SHOWN = 5
+_MAX_NAME, _MAX_PART = 1024, 251  # bytes; masks have ".png" appended
 
 
 def image_folder(
@@ -47,10 +48,19 @@ def inside(where: str, name: str) -> PurePosixPath:
     """A relative path that stays in its folder; raises on one that would leave it."""
     path = PurePosixPath(name.replace("\\", "/"))
     absolute = path.is_absolute() or re.match("[A-Za-z]:", name)
-    if absolute or ".." in path.parts or "\0" in name or not path.parts:
+    strange = "\0" in name or any("\ud800" <= letter <= "\udfff" for letter in name)
+    if absolute or ".." in path.parts or strange or not path.parts:
         raise InputError(
             f"{where}: the name {name[:120]!r} is not that of a file within the "
             "dataset's folder; copy the file there and name it relative to the folder"
+        )
+    # Longer ones the system refuses, with an error of its own that names no remedy.
+    sizes = [len(part.encode()) for part in path.parts]
+    if max(sizes) > _MAX_PART or sum(sizes) > _MAX_NAME:
+        raise InputError(
+            f"{where}: the name {name[:120]!r}… has {sum(sizes)} bytes, {max(sizes)} "
+            f"in one part; at most {_MAX_NAME} and {_MAX_PART} are wanted: rename the "
+            "file"
         )
     return path
 

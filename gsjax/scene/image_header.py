@@ -10,6 +10,7 @@ import struct
 from pathlib import Path
 
 from gsjax.errors import InputError
+from gsjax.files import opened
 
 Buffer = bytes | mmap.mmap
 
@@ -30,17 +31,11 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
       InputError: as `check_image`, and if the file cannot be read.
     """
-    try:
-        with path.open("rb") as file:
-            if not file.read(1):
-                return check_image(path, b"")
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                return check_image(path, data)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read: {error.strerror or error}; check the path and "
-            "its permissions"
-        ) from error
+    with opened(path, "a photograph") as file:
+        if not file.read(1):
+            return check_image(path, b"")
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            return check_image(path, data)
 
 
 def check_image(path: Path, data: Buffer) -> tuple[int, int]:

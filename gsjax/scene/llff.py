@@ -5,15 +5,14 @@ back; the camera's position; image height, width and focal length in px), then t
 nearest and farthest depth, which are not used.
 """
 
-import ast
-import re
-import struct
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.files import read_bytes
+from gsjax.io.npy import read_npy
 from gsjax.scene.colmap_model import MAX_COORDINATE, MAX_SIDE
 from gsjax.scene.image_files import SUFFIXES, image_folder
 from gsjax.scene.transforms_fields import rigid
@@ -51,7 +50,10 @@ def load_llff(
 
 def _view(where: str, row: np.ndarray, file: Path) -> View:
     if not (np.abs(row) < MAX_COORDINATE).all():
-        raise InputError(f"{where}: values that are no finite numbers: {row.tolist()}")
+        raise InputError(
+            f"{where}: values that are no finite numbers: {row.tolist()}; remove the "
+            "row and its photograph"
+        )
     matrix = row[:15].reshape(3, 5)
     height, width, focal = matrix[:, 4].tolist()
     sides = (width, height)
@@ -71,49 +73,10 @@ def _view(where: str, row: np.ndarray, file: Path) -> View:
 
 def read_poses(path: Path) -> np.ndarray:
     """[N, 17] float64 of a .npy file, which is held against its size first."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
+    table = read_npy(str(path), read_bytes(path, "a poses_bounds.npy"))
+    if table.shape[1:] != (_COLUMNS,) or table.dtype.kind != "f":
         raise InputError(
-            f"{path}: cannot be read: {error.strerror or error}; check the path and "
-            "its permissions"
-        ) from error
-    order, rows, fortran, start = _header(path, data)
-    wanted = rows * _COLUMNS * order.itemsize
-    if len(data) - start != wanted:
-        raise InputError(
-            f"{path}: {len(data) - start} bytes follow the header, {rows} × {_COLUMNS} "
-            f"numbers take {wanted}; the file is truncated or damaged: export or copy "
-            "it again"
+            f"{path}: the header is that of {table.dtype} {list(table.shape)}; floats "
+            f"[N, {_COLUMNS}] are wanted: is it a poses_bounds.npy?"
         )
-    values = np.frombuffer(data, order, offset=start).astype(np.float64)
-    shape = (rows, _COLUMNS)
-    return values.reshape(shape, order="F" if fortran else "C")
-
-
-def _header(path: Path, data: bytes) -> tuple[np.dtype, int, bool, int]:
-    """Type, rows, order and start of the body."""
-    wide = data[6:7] in (b"\2", b"\3")
-    form, start = ("<I", 12) if wide else ("<H", 10)
-    if not data.startswith(b"\x93NUMPY") or len(data) < start:
-        raise InputError(
-            f"{path}: starts with {data[:8]!r}, which is no .npy file; an array of "
-            f"[N, {_COLUMNS}] numbers is wanted"
-        )
-    (length,) = struct.unpack_from(form, data, 8)
-    text = data[start : start + min(length, 10_000)].decode("latin-1")
-    found = {
-        key: re.search(rf"'{key}': *({value})", text)
-        for key, value in (
-            ("descr", "'[<>]f[48]'"),
-            ("fortran_order", "True|False"),
-            ("shape", rf"\( *[0-9]{{1,9}} *, *{_COLUMNS} *,? *\)"),
-        )
-    }
-    if start + length > len(data) or not all(found.values()):
-        raise InputError(
-            f"{path}: the header {text[:120]!r} is not that of [N, {_COLUMNS}] float32 "
-            "or float64 numbers; the file is truncated, damaged or another one"
-        )
-    descr, fortran, shape = (ast.literal_eval(m[1]) for m in found.values() if m)
-    return np.dtype(descr), shape[0], fortran, start + length
+    return table.astype(np.float64)

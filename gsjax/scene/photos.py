@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.files import read_bytes
 from gsjax.images import opencv
 from gsjax.scene.image_header import check_image
 from gsjax.scene.types import Lens, Photo, View
@@ -99,13 +100,7 @@ def load_photos(
 
 def _decode(path: Path, *, grey: bool = False) -> np.ndarray:
     """Pixels as stored, in OpenCV's order of channels."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read: {error.strerror or error}; check the path and "
-            "its permissions"
-        ) from error
+    data = read_bytes(path, "a photograph")
     check_image(path, data)
     cv2 = opencv()
     flags = cv2.IMREAD_UNCHANGED  # does not rotate

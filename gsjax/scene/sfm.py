@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsjax.errors import InputError, SfmError
-from gsjax.images import write_file
+from gsjax.files import write_file
 from gsjax.scene.sfm_colmap import (
     Shot,
     Tell,

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.images import encode_png, make_folder, opencv, write_file
+from gsjax.files import make_folder, write_file, writing
+from gsjax.images import encode_png, opencv
 from gsjax.scene.sfm_colmap import colmap
 from gsjax.scene.sfm_photos import Photograph, Workshop, read_upright
 
@@ -163,7 +164,7 @@ def install(dataset: Path, output: Path, stage: Path) -> None:
     Raises:
       InputError: if files cannot be moved.
     """
-    try:
+    with writing(output):
         if not output.exists():
             dataset.rename(output)
             return
@@ -175,7 +176,3 @@ def install(dataset: Path, output: Path, stage: Path) -> None:
         for entry in ENTRIES:
             if (dataset / entry).exists():
                 (dataset / entry).rename(output / entry)
-    except OSError as error:
-        raise InputError(
-            f"{output}: cannot be written: {error.strerror or error}; check permissions"
-        ) from error

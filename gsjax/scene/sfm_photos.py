@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.images import encode_png, opencv, write_file
+from gsjax.files import write_file
+from gsjax.images import encode_png, opencv
 from gsjax.scene.image_files import find_mask
 from gsjax.scene.sfm_colmap import Shot, exif_camera
 

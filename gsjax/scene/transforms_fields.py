@@ -5,7 +5,6 @@ are flipped, then the matrix is inverted, which gives our world → camera in Op
 axes.
 """
 
-import json
 import math
 import warnings
 from pathlib import Path
@@ -14,6 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.files import read_json
+from gsjax.scene.colmap_model import MAX_COORDINATE, MAX_SIDE
 
 _RIGID_TOLERANCE = 1e-3
 
@@ -36,7 +37,7 @@ def shown(value) -> str:
 
 def read_frames(path: Path) -> list[Frame]:
     """The frames of a file, at least one."""
-    data = _read_json(path)
+    data = read_json(path, "a transforms.json")
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(
@@ -51,29 +52,6 @@ def read_frames(path: Path) -> list[Frame]:
     return [Frame(f"{path}: frames[{i}]", (f, data)) for i, f in enumerate(frames)]
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        if path.exists() and not path.is_file():
-            raise InputError(f"{path}: not a regular file; pass a transforms.json")
-        raw = path.read_bytes()
-    except OSError as error:
-        reason = error.strerror or error
-        raise InputError(
-            f"{path}: cannot be read: {reason}; check the path and its permissions"
-        ) from error
-    try:
-        data = json.loads(raw)
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path}: not JSON: {str(error)[:120]}; pass a transforms.json"
-        ) from error
-    if not isinstance(data, dict):
-        raise InputError(
-            f"{path}: the top is {shown(data)}; an object with 'frames' is wanted"
-        )
-    return data
-
-
 def _is_number(value) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
@@ -84,7 +62,7 @@ def number(frame: Frame, source: dict[str, Any], key: str) -> float | None:
     if value is None:
         return None
     try:
-        if _is_number(value) and math.isfinite(value):
+        if _is_number(value) and abs(value) < MAX_COORDINATE:
             return float(value)
     except OverflowError:  # an integer beyond float64
         pass
@@ -123,10 +101,10 @@ def size_of(frame: Frame) -> tuple[int, int] | None:
             f"{shown(height)}; give both in the file, or pass size=(width, height), "
             "on the command line --size WxH"
         )
-    if not (width >= 1 and height >= 1 and width % 1 == 0 and height % 1 == 0):
+    if not all(1 <= side <= MAX_SIDE and side % 1 == 0 for side in (width, height)):
         raise InputError(
-            f"{frame.where}: image size w {width:g}, h {height:g}; whole and ≥ 1 is "
-            "wanted"
+            f"{frame.where}: image size w {width:g}, h {height:g}; whole and ≥ 1, at "
+            f"most {MAX_SIDE}, is wanted"
         )
     return int(width), int(height)
 
@@ -171,10 +149,10 @@ def _matrix(frame: Frame) -> np.ndarray:
             matrix = np.asarray(rows, np.float64)
     except OverflowError:  # an integer beyond float64
         pass
-    # Bounded, so that products stay finite and float32 holds the result.
-    if not (np.abs(matrix) < 1e30).all():
+    if not (np.abs(matrix) < MAX_COORDINATE).all():
         raise InputError(
-            f"{where} has values that are no finite numbers: {shown(rows)}"
+            f"{where} has values that are no finite numbers: {shown(rows)}; remove the "
+            "frame"
         )
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise InputError(

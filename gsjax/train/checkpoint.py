@@ -8,9 +8,10 @@ kept, so that a file that was damaged later costs one interval, not the run.
 import io
 import json
 import re
+import struct
 import warnings
 import zipfile
-import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,12 +20,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.images import make_folder, write_file
+from gsjax.files import make_folder, opened, write_file
+from gsjax.io.npy import read_npy
 from gsjax.train.step import TrainState
 
 _KEEP = 2
 _FORMAT = 1
 _META = "meta.json"
+_REMEDY = "remove it to go on from the one before, or train anew"
+# What zipfile raises of damaged archives.
+_ZIP_ERRORS = (
+    *(zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError),
+    *(EOFError, KeyError, OverflowError, struct.error),
+)
 
 
 class Checkpoint(NamedTuple):
@@ -113,27 +121,70 @@ def load_checkpoint(path: Path) -> Checkpoint:
     Raises:
       InputError: if it is damaged, cut short or no checkpoint.
     """
+    where = f"{path}: no readable checkpoint"
+    arrays = {
+        name.removesuffix(".npy"): read_npy(f"{path}: {name}", data)
+        for name, data in _entries(path)
+    }
+    if _META not in arrays:
+        raise InputError(f"{where}: {_META} is not in it; {_REMEDY}")
+    text = arrays.pop(_META).tobytes()
     try:
-        with zipfile.ZipFile(path) as archive:
-            declared = sum(entry.file_size for entry in archive.infolist())
-            if declared > 2 * path.stat().st_size + 4096:
-                raise ValueError(f"declares {declared} bytes, more than it can hold")
-            # Before NumPy reads headers: those are checked by nothing else.
-            damaged = archive.testzip()
-        if damaged is not None:
-            raise ValueError(f"the checksum of {damaged} does not match")
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
-        meta = json.loads(arrays.pop(_META).tobytes())
-        if meta["format"] != _FORMAT:
-            raise ValueError(f"format {meta['format']}; {_FORMAT} is wanted")
-        if meta["arrays"] != sorted(arrays):
-            raise ValueError(f"holds {len(arrays)} of {len(meta['arrays'])} arrays")
-        return Checkpoint(int(meta["step"]), arrays, meta)
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zlib.error) as error:
-        raise InputError(f"{path}: no readable checkpoint: {error}") from error
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-        raise InputError(f"{path}: damaged checkpoint: {error}") from error
+        meta = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{where}: {_META}: {str(error)[:80]}; {_REMEDY}") from error
+    wanted = {
+        "format": lambda value: value == _FORMAT,
+        "step": lambda value: type(value) is int and value >= 0,
+        "capacity": lambda value: type(value) is int and value in _lengths(arrays),
+        "arrays": lambda value: value == sorted(arrays),
+    }
+    meta = meta if isinstance(meta, dict) else {}
+    for key, good in wanted.items():
+        if not good(meta.get(key)):
+            found = repr(meta.get(key, "missing"))[:80]
+            told = f"; {_FORMAT} is wanted" if key == "format" else ""
+            raise InputError(f"{where}: {_META}: {key} {found}{told}; {_REMEDY}")
+    return Checkpoint(meta["step"], arrays, meta)
+
+
+def _lengths(arrays: dict[str, np.ndarray]) -> set[int]:
+    return {len(array) for array in arrays.values() if array.ndim}
+
+
+def _entries(path: Path) -> Iterator[tuple[str, bytes]]:
+    """Names and bytes in an archive, whose checksums fit; none is unpacked."""
+    with opened(path, "a checkpoint") as file:
+        try:
+            archive = zipfile.ZipFile(file)
+            entries = archive.infolist()
+        except _ZIP_ERRORS as error:
+            raise _damaged(path, error) from error
+        size = path.stat().st_size
+        declared = sum(entry.file_size for entry in entries)
+        faults = {
+            "compressed": any(entry.compress_type for entry in entries),
+            "more than it can hold": declared > size,
+            "of one name": len({entry.filename for entry in entries}) < len(entries),
+        }
+        fault = next((fault for fault, found in faults.items() if found), None)
+        if fault is not None:
+            raise InputError(
+                f"{path}: no readable checkpoint: {len(entries)} arrays, {fault}, in "
+                f"{declared} bytes ({size} are there); {_REMEDY}"
+            )
+        for entry in entries:
+            try:
+                data = archive.read(entry)
+            except _ZIP_ERRORS as error:
+                where = f"{entry.filename[:80]} (byte {entry.header_offset})"
+                raise _damaged(path, error, where) from error
+            yield entry.filename, data
+
+
+def _damaged(path: Path, error: Exception, where: str = "") -> InputError:
+    told = f"{where}: {error}" if where else f"{error}"
+    return InputError(f"{path}: damaged checkpoint: {told}; {_REMEDY}")
 
 
 def restore(checkpoint: Checkpoint, template: TrainState) -> TrainState:

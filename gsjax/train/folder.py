@@ -21,14 +21,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax import images
 from gsjax.errors import InputError
+from gsjax.files import read_json, write_file
 from gsjax.gaussians import Gaussians
 from gsjax.io import load, save
 from gsjax.scene.dataset import load_dataset
 from gsjax.scene.splits import split_views
 from gsjax.scene.types import Scene
-from gsjax.train.config import TrainConfig, from_json, to_json
+from gsjax.train.config import TrainConfig, check_kinds, from_json, to_json
 from gsjax.train.refined import with_cameras
 
 _FORMAT = 1
@@ -136,23 +136,27 @@ def load_settings(folder: Path) -> RunSettings:
     Raises:
       InputError: if the folder holds none, or they are damaged.
     """
-    path = run_files(folder).config
+    path, wanted = run_files(folder).config, "what `gsjax train -o` made"
+    if not path.exists():
+        raise InputError(
+            f"{folder}: no run is here ({path.name} is missing); pass {wanted}"
+        )
+    data = read_json(path, wanted)
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
         if data["format"] != _FORMAT:
-            raise ValueError(f"format {data['format']}; {_FORMAT} is wanted")
+            raise ValueError(f"format {data['format']!r}; {_FORMAT} is wanted")
         rest = {k: v for k, v in data.items() if k not in ("format", "train")}
+        check_kinds(RunSettings, rest)
         rest["dataset"] = Path(rest["dataset"])
         rest["test_images"] = tuple(rest["test_images"])
         config = from_json(json.dumps(data["train"]))
         return RunSettings(config=config, **rest)
-    except OSError as error:
+    except KeyError as error:
         raise InputError(
-            f"{folder}: no run is here ({path.name}: {error.strerror or error}); pass "
-            "the folder that `gsjax train -o` made"
+            f"{path}: damaged: {error} is missing; pass {wanted}"
         ) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: damaged: {error}") from error
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{path}: damaged: {error}; pass {wanted}") from error
 
 
 def save_settings(folder: Path, settings: RunSettings) -> None:
@@ -165,7 +169,7 @@ def save_settings(folder: Path, settings: RunSettings) -> None:
     data["dataset"] = str(settings.dataset.resolve())
     train = json.loads(to_json(settings.config))
     text = json.dumps({"format": _FORMAT, **data, "train": train}, indent=2)
-    images.write_file(run_files(folder).config, f"{text}\n".encode())
+    write_file(run_files(folder).config, f"{text}\n".encode())
 
 
 def save_scene(

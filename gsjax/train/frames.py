@@ -103,9 +103,15 @@ def _shrunk(photo: Photo, divisor: int) -> Photo:
     valid = photo.valid
     if valid is not None:
         valid = area(valid.astype(np.uint8) * 255) == 255
-    alpha = None if photo.alpha is None else area(photo.alpha)
     scale = np.diag([size[0] / width, size[1] / height, 1.0])
-    return Photo(area(photo.pixels), alpha, valid, scale @ photo.K)
+    if photo.alpha is None:
+        return Photo(area(photo.pixels), None, valid, scale @ photo.K)
+    # Colours count as much as they are seen: what is transparent has none.
+    weight = photo.alpha.astype(np.float32)[..., None]
+    alpha = area(weight)
+    colors = area(photo.pixels * weight) / np.where(alpha > 0, alpha, 1)[..., None]
+    pixels = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
+    return Photo(pixels, np.rint(alpha).astype(np.uint8), valid, scale @ photo.K)
 
 
 def draw(frames: Frames, key: Array, step: Array, batch: int) -> Batch:

@@ -9,6 +9,7 @@ import numpy as np
 from gsjax import images
 from gsjax.errors import InputError
 from gsjax.evaluation import Summary, ViewResult, evaluate, summarise
+from gsjax.files import make_folder, write_file
 from gsjax.gaussians import Gaussians
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
@@ -83,12 +84,12 @@ def write_evaluation(
     Raises:
       InputError: if something cannot be written.
     """
-    images.make_folder(files.renders)
+    make_folder(files.renders)
     begun, results = time.perf_counter(), []
     for result in results_of(gaussians, scene, photos, config):
         path = files.renders / f"{Path(result.name).with_suffix('')}.png"
-        images.make_folder(path.parent)
-        images.write_file(path, images.encode_png(images.to_8_bit(result.render)))
+        make_folder(path.parent)
+        write_file(path, images.encode_png(images.to_8_bit(result.render)))
         results.append(result)
     summary = summarise(results)
     told = {
@@ -99,7 +100,7 @@ def write_evaluation(
         "gaussians": int(np.sum(gaussians.active)),
         "each": [_told(result) for result in results],
     }
-    images.write_file(files.eval, (json.dumps(told, indent=2) + "\n").encode())
+    write_file(files.eval, (json.dumps(told, indent=2) + "\n").encode())
     _write_preview(files, results)
     return summary
 
@@ -137,4 +138,4 @@ def _write_preview(files: RunFiles, results: list[ViewResult]) -> None:
         SheetRow(results[i].name, results[i].truth, results[i].render, results[i].depth)
         for i in few
     ]
-    images.write_file(files.preview, images.encode_png(comparison(rows)))
+    write_file(files.preview, images.encode_png(comparison(rows)))

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from gsjax.curves import Series, curves_png
-from gsjax.images import write_file
+from gsjax.files import read_bytes, write_file
 
-_NEEDED = {"step", "seconds", "psnr", "gaussians"}
+_NEEDED = ("step", "seconds", "gaussians")
 
 
 def finite_or_none(value: float) -> float | None:
@@ -29,16 +29,20 @@ def record_line(record: dict[str, Any]) -> str:
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
     """Lines of a `metrics.jsonl` or `held_out.jsonl`, but for those that were cut short
-    by a kill; none if it is not there."""
+    by a kill; none if it is not there.
+
+    Raises:
+      InputError: if it cannot be read.
+    """
     if not path.exists():
         return []
     lines = []
-    for line in path.read_text(encoding="utf-8").splitlines():
+    for line in read_bytes(path, "a metrics.jsonl").splitlines():
         try:
             record = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue
-        if isinstance(record, dict) and record.keys() >= _NEEDED:
+        if isinstance(record, dict) and all(map(_is_number, _needed(record))):
             lines.append(record)
     return lines
 
@@ -52,6 +56,16 @@ def keep_steps(path: Path, steps: int) -> None:
     if path.exists():
         kept = [record_line(r) for r in read_metrics(path) if r["step"] <= steps]
         write_file(path, "".join(kept).encode())
+
+
+def _needed(record: dict[str, Any]) -> list[Any]:
+    """Values that a line has; the PSNR is null where it is not finite."""
+    psnr = record.get("psnr", "missing")
+    return [record.get(key) for key in _NEEDED] + [0 if psnr is None else psnr]
+
+
+def _is_number(value) -> bool:
+    return type(value) in (int, float) and abs(value) < 1e300
 
 
 def write_curves(

@@ -12,11 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax import images
 from gsjax.cameras import make_camera
 from gsjax.errors import InputError
+from gsjax.files import read_json, write_file
+from gsjax.scene.colmap_model import MAX_COORDINATE
 from gsjax.scene.types import Photo, Scene, View
 from gsjax.train.tuning import Tuning, tuned_camera
+
+_RIGID_TOLERANCE = 1e-3
 
 
 def refined_scene(
@@ -81,7 +84,7 @@ def save_cameras(path: Path, scene: Scene) -> None:
         }
         for view in scene.views
     ]
-    images.write_file(path, (json.dumps({"views": views}, indent=1) + "\n").encode())
+    write_file(path, (json.dumps({"views": views}, indent=1) + "\n").encode())
 
 
 def with_cameras(scene: Scene, path: Path) -> Scene:
@@ -90,8 +93,8 @@ def with_cameras(scene: Scene, path: Path) -> Scene:
     Raises:
       InputError: if the file is damaged, or a view is not in it.
     """
+    data = read_json(path, "the cameras.json of a run")
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
         found = {view["name"]: view for view in data["views"]}
         views = []
         for view in scene.views:
@@ -99,16 +102,27 @@ def with_cameras(scene: Scene, path: Path) -> Scene:
                 np.asarray(found[view.name][name], np.float64).reshape(size, size)
                 for name, size in (("viewmat", 4), ("K", 3))
             )
-            if not (np.isfinite(viewmat).all() and np.isfinite(K).all()):
-                raise ValueError(f"{view.name}: not finite")
+            if not (_is_rigid(viewmat) and np.isfinite(K).all()):
+                raise ValueError(f"{view.name}: no rigid pose, or not finite")
             viewmat = _moved(viewmat, scene.origin)
             views.append(replace(view, viewmat=viewmat, K=K))
         return replace(scene, views=tuple(views))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(
             f"{path}: damaged, or of another dataset: {error!r}; remove it to use the "
             "cameras of the dataset"
         ) from error
+
+
+def _is_rigid(viewmat: np.ndarray) -> bool:
+    rotation = viewmat[:3, :3]
+    good = (np.abs(viewmat) < MAX_COORDINATE).all()
+    return bool(
+        good
+        and np.abs(rotation @ rotation.T - np.eye(3)).max() < _RIGID_TOLERANCE
+        and np.linalg.det(rotation) > 0
+        and (viewmat[3] == (0, 0, 0, 1)).all()
+    )
 
 
 def _moved(viewmat: np.ndarray, by: np.ndarray) -> np.ndarray:

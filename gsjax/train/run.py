@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsjax import images
 from gsjax.console import decibels, note, stopping_on_ctrl_c
 from gsjax.errors import InputError
 from gsjax.evaluation import Summary, summarise
+from gsjax.files import make_folder
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.checkpoint import load_latest, restore, save_checkpoint
@@ -140,7 +140,7 @@ def start_run(
     data = load_data(settings)
     for path in ours:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
-    images.make_folder(folder)
+    make_folder(folder)
     save_settings(folder, settings)
     return _train(_Sitting(settings.config, data, files, _Start()))
 

@@ -1,0 +1,151 @@
+"""Files, read or refused by name, and written complete or not at all."""
+
+import json
+import os
+import secrets
+import stat
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from gsjax.errors import InputError
+
+
+@contextmanager
+def reading(path: Path, wanted: str = "a file") -> Iterator[None]:
+    """Within, what keeps ``path`` from being read is told with its name.
+
+    Args:
+      path: checked to be a regular file first: a pipe or device may never end.
+      wanted: what to pass instead, for the message.
+
+    Raises:
+      InputError: if it is missing, no regular file, may not be read, or is larger
+        than the memory.
+    """
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise InputError(
+                f"{path}: not a regular file and cannot be read; pass {wanted}"
+            )
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read: {error.strerror or error}; check the path and "
+            "its permissions"
+        ) from error
+    except MemoryError as error:
+        raise InputError(
+            f"{path}: cannot be read: larger than the memory; is it {wanted}?"
+        ) from error
+
+
+@contextmanager
+def opened(path: Path, wanted: str = "a file") -> Iterator[BinaryIO]:
+    """A file open to read bytes from; raises as `reading`."""
+    with reading(path, wanted), path.open("rb") as file:
+        yield file
+
+
+def read_bytes(path: Path, wanted: str = "a file") -> bytes:
+    """All of a file; raises as `reading`."""
+    with reading(path, wanted):
+        return path.read_bytes()
+
+
+def read_json(path: Path, wanted: str = "a JSON file") -> dict[str, Any]:
+    """The object that a JSON file holds.
+
+    Raises:
+      InputError: as `reading`, and if it is no JSON, or no object.
+    """
+    raw = read_bytes(path, wanted)
+    try:
+        data = json.loads(raw)
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"{path}: not JSON: {str(error)[:120]}; pass {wanted}"
+        ) from error
+    if not isinstance(data, dict):
+        raise InputError(
+            f"{path}: the top is {repr(data)[:80]}, an object is wanted; pass {wanted}"
+        )
+    return data
+
+
+@contextmanager
+def writing(path: Path, what: str = "written") -> Iterator[None]:
+    """Within, what keeps ``path`` from being written is told with its name.
+
+    Raises:
+      InputError: on any error of the system.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be {what}: {error.strerror or error}; check permissions "
+            "and space"
+        ) from error
+
+
+@contextmanager
+def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
+    """A file to write to that becomes ``path``, in place of what is there, at the end.
+
+    It stands beside ``path`` until then, and is gone if anything fails.
+
+    Args:
+      path: of the file.
+      durable: wait until it is on the disk before it gets its name, so that a power
+        cut leaves the one file or the other.
+
+    Raises:
+      InputError: as `writing`.
+    """
+    temporary = path.parent / f".gsjax-{secrets.token_hex(6)}.tmp"
+    try:
+        with writing(path):
+            with temporary.open("xb") as file:
+                yield file
+                if durable:
+                    file.flush()
+                    os.fsync(file.fileno())
+            os.replace(temporary, path)
+    finally:
+        with suppress(OSError):  # it is told already
+            temporary.unlink()
+
+
+def write_file(path: Path, data: bytes, *, durable: bool = False) -> None:
+    """Write all of a file; as `replacing`."""
+    with replacing(path, durable=durable) as file:
+        file.write(data)
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder and those above it.
+
+    Raises:
+      InputError: if that cannot be.
+    """
+    with writing(path, "made a folder"):
+        path.mkdir(parents=True, exist_ok=True)
+
+
+def refuse_existing(paths: Iterable[Path], overwrite: bool) -> None:
+    """Check names before the work that would fill them.
+
+    Raises:
+      InputError: if one exists and ``overwrite`` is not set, or is a folder.
+    """
+    found = [path for path in paths if path.exists()]
+    folders = [path for path in found if path.is_dir()]
+    if folders:
+        raise InputError(f"{folders[0]}: is a folder; a file is to be written there")
+    if found and not overwrite:
+        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+        raise InputError(
+            f"{found[0]}{more}: exists; pass --overwrite, or another folder with -o"
+        )
