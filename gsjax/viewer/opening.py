@@ -13,7 +13,13 @@ from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene, View
 from gsjax.subjects import is_run, open_subject
 from gsjax.train.config import TrainConfig
-from gsjax.train.run import background_of, load_data, load_settings
+from gsjax.train.folder import (
+    background_of,
+    load_data,
+    load_settings,
+    refined_data,
+    run_files,
+)
 from gsjax.viewer.exact import ExactRenderer
 from gsjax.viewer.session import Exhibit
 from gsjax.viewer.stage import (
@@ -61,7 +67,7 @@ def open_exhibit(
         run = describe_run(path)
         status = f"step {run['steps_done']:,} of {run['steps']:,}"
         try:
-            scene = load_data(settings).scene
+            scene = refined_data(load_data(settings), run_files(path)).scene
         except InputError as error:
             note(f"warning: without cameras: {one_line(error)}")
     subject = open_subject(path, scene=scene, preset=preset)

@@ -15,6 +15,7 @@ from gsjax.viewer.stage import (
     paint_background,
     set_eye,
     size_of_frusta,
+    stop_server,
 )
 
 _CAPTION = """<div style="position:fixed;left:12px;bottom:10px;z-index:9;color:#ddd;
@@ -63,7 +64,7 @@ def write_page(exhibit: Exhibit, path: Path, *, title: str) -> Page:
             add_cameras(server.scene, exhibit.frusta, size)
         text = server.scene.as_html(dark_mode=True)
     finally:
-        server.stop()
+        stop_server(server)
     caption = (
         f"{html.escape(title)} · {drawn:,} of {found:,} Gaussians, each of one colour "
         "from all sides (SH degree 0), drawn by viser; gsjax"

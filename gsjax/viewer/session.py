@@ -78,6 +78,7 @@ class Session:
         self.splats: Any = None
         self.shown = np.zeros(0, bool)
         self.scene_shown: Gaussians | None = None
+        self.closed = False
         self.covered = False  # by an exact picture, over the view
         self.cameras: list[Any] = []
         self.result: Any = None
@@ -104,7 +105,7 @@ class Session:
             hint="by the longest axis: of all Gaussians, the smallest so many percent",
         )  # fmt: skip
         for slider in (self.opacity, self.scale):
-            slider.on_update(lambda _: self.refresh())
+            slider.on_update(lambda _: self._cut())
         with gui.add_folder("Exact picture"):
             self.kind = gui.add_dropdown("Shows", KINDS)
             self.height = gui.add_dropdown("Height, px", _HEIGHTS, initial_value="540")
@@ -118,21 +119,21 @@ class Session:
             self.pictures.visible = False
         self.button.on_click(lambda _: self.render())
         for choice in (self.kind, self.height, self.place):
-            choice.on_update(lambda _: self.result_shown and self.render())
-        self.follow.on_update(lambda _: self.follow.value and self.render())
+            choice.on_update(lambda _: self._again())
+        self.follow.on_update(lambda _: self._again())
         self.album = gui.add_folder("Cameras")
         self.go_to: Any = None
 
-    @property
-    def result_shown(self) -> bool:
-        """Whether an exact picture is to be seen."""
-        return self.covered or self.pictures.visible
+    def _again(self) -> None:
+        """Render anew if an exact picture is to be seen."""
+        if self.covered or self.pictures.visible or self.follow.value:
+            self.render()
 
     def show_cameras(self) -> None:
         """Draw the exhibit's cameras, in place of those that were."""
         frusta, eye = self.exhibit.frusta, self.exhibit.eye
         self.album.visible = bool(frusta)
-        if not frusta:
+        if not frusta or self.closed:
             return
         size = size_of_frusta(frusta, eye.distance)
         self.cameras = add_cameras(self.client.scene, frusta, size)
@@ -173,7 +174,13 @@ class Session:
 
     # --- the splats ---
 
+    def _cut(self) -> None:
+        self.refresh()
+        self._again()
+
     def _draw(self) -> None:
+        if self.closed:
+            return
         exhibit, gaussians = self.exhibit, self.exhibit.gaussians
         longest = longest_axes(gaussians)[np.asarray(gaussians.active)]
         longest = longest[np.isfinite(longest)]
@@ -198,7 +205,7 @@ class Session:
         if exhibit.status:
             lines.append(exhibit.status)
         self.counts.content = "<br/>".join(lines)
-        if self.covered or self.follow.value:
+        if self.follow.value:
             self.render()
 
     # --- exact pictures ---
@@ -206,7 +213,7 @@ class Session:
     def _render(self) -> None:
         """The picture for where the camera is now; what goes wrong is told there."""
         gaussians = self.scene_shown
-        if gaussians is None:
+        if gaussians is None or self.closed:
             return
         self.told.content = "rendering; the first of a size compiles for some seconds"
         camera, height = self.client.camera, int(self.height.value)
@@ -220,6 +227,8 @@ class Session:
         except GsjaxError as error:
             self.told.content = f"not rendered: {one_line(error)}"
             note(f"warning: {one_line(error)}")
+            return
+        if self.closed:
             return
         pixels, what = picture(view, self.kind.value)
         seconds = time.perf_counter() - begun
@@ -268,7 +277,7 @@ class Session:
             self.rest.start()
 
     def close(self) -> None:
-        """Nothing more is rendered."""
+        """Nothing more is drawn."""
+        self.closed = True
         if self.rest is not None:
             self.rest.cancel()
-        self.scene_shown = None

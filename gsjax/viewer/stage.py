@@ -4,8 +4,7 @@ Cameras have OpenCV axes, in gsjax as in viser; fields of view are vertical, rad
 """
 
 import contextlib
-import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -98,15 +97,15 @@ def open_server(host: str, port: int) -> Any:
     """
     viser = require_viser()
     try:
-        # Its banner is neither result nor progress; the caller says the address.
-        with contextlib.redirect_stdout(sys.stderr), _without_banner():
+        with quiet():
             return viser.ViserServer(host=host, port=port, label="gsjax", verbose=False)
     except (OSError, OverflowError) as error:
         raise InputError(f"{host}:{port}: cannot be listened on: {error}") from error
 
 
 @contextlib.contextmanager
-def _without_banner():
+def quiet() -> Iterator[None]:
+    """Within, viser says nothing: neither results nor progress come from it."""
     import rich
 
     console = rich.get_console()
@@ -115,6 +114,12 @@ def _without_banner():
         yield
     finally:
         console.quiet = before
+
+
+def stop_server(server: Any) -> None:
+    """Stop it, silent."""
+    with quiet():
+        server.stop()
 
 
 def frusta_of(views: Sequence[View], photos: Sequence[Photo] = ()) -> list[Frustum]:
@@ -225,11 +230,11 @@ def add_cameras(scene: Any, frusta: Sequence[Frustum], size: float) -> list[Any]
 def size_of_frusta(frusta: Sequence[Frustum], distance: float) -> float:
     """World units: to be seen from ``distance``, and not to hide one another."""
     if len(frusta) < 2:
-        return 0.06 * distance
+        return 0.03 * distance
     centres = np.stack([-f.viewmat[:3, :3].T @ f.viewmat[:3, 3] for f in frusta])
     gaps = np.linalg.norm(centres[:, None] - centres, axis=-1)
     nearest = np.where(gaps > 0, gaps, np.inf).min(axis=1)
-    return float(np.clip(0.4 * np.median(nearest), 0.02 * distance, 0.06 * distance))
+    return float(np.clip(0.4 * np.median(nearest), 0.01 * distance, 0.03 * distance))
 
 
 def wxyz_of(rotation: np.ndarray) -> np.ndarray:

@@ -8,7 +8,13 @@ from typing import Any
 from gsjax.console import note, one_line
 from gsjax.gaussians import Gaussians
 from gsjax.viewer.session import Exhibit, Session
-from gsjax.viewer.stage import Frustum, open_server, paint_background, set_eye
+from gsjax.viewer.stage import (
+    Frustum,
+    open_server,
+    paint_background,
+    set_eye,
+    stop_server,
+)
 
 
 class Window:
@@ -60,7 +66,7 @@ class Window:
         for session in list(self.sessions.values()):
             session.close()
         self._worker.shutdown(wait=True, cancel_futures=True)
-        self.server.stop()
+        stop_server(self.server)
 
     def _each(self, act: Callable[[Session], None]) -> None:
         def work():
