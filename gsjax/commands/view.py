@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.commands.common import Command, UsageError, use_all_cores
+from gsjax.commands.common import Command, UsageError, start_jax
 from gsjax.console import note, say
 
 _LARGE_PAGE = 32 * 2**20
@@ -55,7 +55,7 @@ class ViewCommand(Command):
             if self.html.suffix.lower() not in (".html", ".htm"):
                 raise UsageError(f"--html {self.html}: a name in .html is wanted")
             images.refuse_existing([self.html], self.overwrite)
-        use_all_cores()
+        start_jax()
         from gsjax.viewer.opening import open_exhibit
 
         shown = open_exhibit(

@@ -108,7 +108,7 @@ def pack(gaussians: Gaussians, shown: np.ndarray) -> Splats:
     return Splats(
         centers=(np.asarray(params.means)[shown] / scale).astype(np.float32),
         covariances=axes @ axes.swapaxes(1, 2),
-        rgbs=np.clip(dc_to_rgb(np.asarray(params.sh)[shown, 0]), 0, 1),
+        rgbs=np.clip(np.asarray(dc_to_rgb(params.sh[:, 0]))[shown], 0, 1),
         opacities=opacities[shown, None].astype(np.float32),
         scale=scale,
     )
