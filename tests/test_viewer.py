@@ -19,6 +19,7 @@ from conftest import LIGHT, frustum_points, gaussians_at
 import gsjax
 from gsjax import cli
 from gsjax.rotations import covariance, quaternion_to_matrix
+from gsjax.scene.types import Photo
 from gsjax.train.config import TrainConfig
 from gsjax.train.fit import Progress, initial_state
 from gsjax.train.step import Metrics
@@ -350,7 +351,9 @@ def test_a_training_is_shown_by_copies_of_its_own():
 
     config = TrainConfig(steps=9, sh_degree=0, raster=training.RASTER)
     start, viewer = training.scene(), LiveViewer(port=8290)
-    hook = viewer.begin(start, training.photos(), config)
+    blank = np.zeros((training.HEIGHT, training.WIDTH, 3), np.uint8)
+    photos = [Photo(blank, None, None, view.K) for view in start.views]
+    hook = viewer.begin(start, photos, config)
 
     def after(step):
         """The hook, and then what the next step does to the state it was given."""

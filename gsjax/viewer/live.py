@@ -76,6 +76,7 @@ class LiveViewer:
         try:
             while window.watched:
                 window.left.wait(1.0)
+                window.left.clear()
         except KeyboardInterrupt:
             pass
 

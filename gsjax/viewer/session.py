@@ -13,7 +13,7 @@ import numpy as np
 
 from gsjax.console import note, one_line
 from gsjax.errors import GsjaxError
-from gsjax.gaussians import Gaussians, num_active, select
+from gsjax.gaussians import Gaussians, select
 from gsjax.viewer.exact import KINDS, ExactRenderer, camera_of, picture
 from gsjax.viewer.splats import Cut, longest_axes, most_important, pack, within
 from gsjax.viewer.stage import (
@@ -199,7 +199,8 @@ class Session:
         elif self.splats is not None:
             self.splats.remove()
             self.splats = None
-        lines = [f"**{shown.sum():,}** of {int(num_active(gaussians)):,} Gaussians"]
+        found = np.count_nonzero(np.asarray(gaussians.active))
+        lines = [f"**{shown.sum():,}** of {found:,} Gaussians"]
         if limit < float("inf"):
             lines.append(f"scales up to {limit:.3g}")
         if exhibit.status:

@@ -4,7 +4,8 @@ Axis legend: N slots, M Gaussians that are shown.
 
 viser holds a covariance in half precision and a colour in 8 bits, the same from all
 sides: that of the spherical harmonics' degree 0. It draws nothing below an opacity of
-`LEAST_OPACITY`.
+`LEAST_OPACITY`. All of this is NumPy: nothing is compiled for a new M, and nothing
+waits for what a device is busy with.
 """
 
 from typing import NamedTuple
@@ -69,10 +70,13 @@ def longest_axes(gaussians: Gaussians) -> np.ndarray:
 def within(gaussians: Gaussians, cut: Cut) -> np.ndarray:
     """[N] bool: active, finite, and within the cut."""
     params = gaussians.params
-    finite = [
-        np.isfinite(np.asarray(leaf)).reshape(gaussians.capacity, -1).all(axis=1)
-        for leaf in (params.means, params.quats, params.log_scales, params.sh[:, 0])
+    leaves = [
+        params.means,
+        params.quats,
+        params.log_scales,
+        np.asarray(params.sh)[:, 0],
     ]
+    finite = [np.isfinite(np.asarray(leaf)).all(axis=1) for leaf in leaves]
     shown = np.logical_and.reduce([np.asarray(gaussians.active), *finite])
     shown &= opacities_of(gaussians) >= cut.min_opacity  # False for NaN
     return shown & (longest_axes(gaussians) <= cut.max_scale)
@@ -108,7 +112,7 @@ def pack(gaussians: Gaussians, shown: np.ndarray) -> Splats:
     return Splats(
         centers=(np.asarray(params.means)[shown] / scale).astype(np.float32),
         covariances=axes @ axes.swapaxes(1, 2),
-        rgbs=np.clip(np.asarray(dc_to_rgb(params.sh[:, 0]))[shown], 0, 1),
+        rgbs=np.clip(dc_to_rgb(np.asarray(params.sh)[shown, 0]), 0, 1),  # pyright: ignore
         opacities=opacities[shown, None].astype(np.float32),
         scale=scale,
     )
@@ -129,7 +133,7 @@ def _unit(longest: np.ndarray) -> float:
 
 
 def _rotations(quats: np.ndarray) -> np.ndarray:
-    """[M, 3, 3] float32; by NumPy, which compiles nothing for each new M."""
+    """[M, 3, 3] float32."""
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     unit = np.where(norms > 0, quats, (1.0, 0, 0, 0)) / np.where(norms > 0, norms, 1)
     rows = rotation_rows(*unit.T)  # pyright: ignore

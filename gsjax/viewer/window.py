@@ -80,6 +80,9 @@ class Window:
 
     def _joined(self, client: Any) -> None:
         self.sessions[client.client_id] = Session(client, self.exhibit)
+        # Gone meanwhile: viser calls from several threads.
+        if client.client_id not in self.server.get_clients():
+            self._parted(client)
 
     def _parted(self, client: Any) -> None:
         session = self.sessions.pop(client.client_id, None)
