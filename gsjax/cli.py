@@ -27,6 +27,7 @@ from gsjax.commands.info import InfoCommand
 from gsjax.commands.render import RenderCommand
 from gsjax.commands.sfm import SfmCommand
 from gsjax.commands.train import TrainCommand
+from gsjax.commands.view import ViewCommand
 from gsjax.console import one_line, warnings_as_lines
 from gsjax.errors import GsjaxError, InputError
 
@@ -36,6 +37,7 @@ _COMMANDS = (
     | Annotated[TrainCommand, subcommand("train")]
     | Annotated[EvalCommand, subcommand("eval")]
     | Annotated[RenderCommand, subcommand("render")]
+    | Annotated[ViewCommand, subcommand("view")]
     | Annotated[ExportCommand, subcommand("export")]
     | Annotated[InfoCommand, subcommand("info")]
     | Annotated[DoctorCommand, subcommand("doctor")]

@@ -1,6 +1,6 @@
 """Curves of a training as a picture: a plain line plot, drawn by OpenCV."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,43 +55,73 @@ def curves(
     Raises:
       InputError: if ``x`` and ``y`` differ in length, or the size is too small.
     """
-    cv2 = images.opencv()
-    width, height = size
-    if width < 200 or height < 120:
-        raise InputError(f"size {size}: a plot has at least 200 × 120 px")
     lines = [_points(line) for line in series]
     finite = np.concatenate(
         [np.zeros((0, 2)), *(p[np.isfinite(p).all(axis=1)] for p in lines)]
     )
-    least, most = np.transpose([_range(finite[:, 0], 0.0), _range(finite[:, 1], 0.06)])
+    ranges = _range(finite[:, 0], 0.0), _range(finite[:, 1], 0.06)
+    plot, place = axes(*ranges, title=title, x_label=x_label, size=size)
+    for index, points in enumerate(lines):
+        gaps = np.flatnonzero(~np.isfinite(points).all(axis=1))
+        for piece in np.split(points, gaps):
+            draw_line(plot, place(piece[np.isfinite(piece).all(axis=1)]), index)
+    legend(plot, [line.label for line in series])
+    return plot
+
+
+def axes(
+    x: tuple[float, float],
+    y: tuple[float, float],
+    *,
+    title: str = "",
+    x_label: str = "",
+    size: tuple[int, int] = (720, 420),
+    x_text: Callable[[float], str] | None = None,
+) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """An empty plot [H, W, 3] uint8, and what takes points [·, 2] to its px.
+
+    Args:
+      x, y: the ranges, from less to more.
+      title, x_label, size: as `curves`.
+      x_text: of a tick of x; the number itself by default.
+
+    Raises:
+      InputError: if the size is too small.
+    """
+    cv2 = images.opencv()
+    width, height = size
+    if width < 200 or height < 120:
+        raise InputError(f"size {size}: a plot has at least 200 × 120 px")
+    least, most = np.transpose([x, y])
     low, high = np.asarray([(_LEFT, height - _BOTTOM), (width - _RIGHT, _TOP)])
 
     def place(points) -> np.ndarray:
         return low + (points - least) / (most - least) * (high - low)
 
     plot = np.full((height, width, 3), _PAPER, np.uint8)
-    for tick in _ticks(least[1], most[1], (height - _TOP - _BOTTOM) // 45):
-        y, text = round(place((0, tick))[1]), _number(tick)
-        cv2.line(plot, (_LEFT, y), (width - _RIGHT, y), _GRID, 1)
-        put_text(plot, text, (_LEFT - 8 - text_width(text), y + 4), _INK)
-    for tick in _ticks(least[0], most[0], (width - _LEFT - _RIGHT) // 90):
-        x, text = round(place((tick, 0))[0]), _number(tick)
-        cv2.line(plot, (x, _TOP), (x, low[1]), _GRID, 1)
-        put_text(plot, text, (x - text_width(text) // 2, low[1] + 16), _INK)
+    for tick in _ticks(*y, (height - _TOP - _BOTTOM) // 45):
+        v, text = round(place((x[0], tick))[1]), short_number(tick)
+        cv2.line(plot, (_LEFT, v), (width - _RIGHT, v), _GRID, 1)
+        put_text(plot, text, (_LEFT - 8 - text_width(text), v + 4), _INK)
+    for tick in _ticks(*x, (width - _LEFT - _RIGHT) // 90):
+        u, text = round(place((tick, y[0]))[0]), (x_text or short_number)(tick)
+        cv2.line(plot, (u, _TOP), (u, low[1]), _GRID, 1)
+        put_text(plot, text, (u - text_width(text) // 2, low[1] + 16), _INK)
     frame = np.asarray([(_LEFT, _TOP), low, (width - _RIGHT, low[1])], np.int32)
     cv2.polylines(plot, [frame], False, _INK, 1)
-    for index, points in enumerate(lines):
-        gaps = np.flatnonzero(~np.isfinite(points).all(axis=1))
-        for piece in np.split(points, gaps):
-            at = place(piece[np.isfinite(piece).all(axis=1)]) * 2**_FINE
-            if len(at):
-                at, color = np.rint(at).astype(np.int32), _COLORS[index % len(_COLORS)]
-                cv2.polylines(plot, [at], False, color, 2, cv2.LINE_AA, _FINE)
     put_text(plot, title, (_LEFT, 21), _INK, 0.5)
     middle = (_LEFT + width - _RIGHT - text_width(x_label)) // 2
     put_text(plot, x_label, (middle, height - 8), _INK)
-    _legend(plot, [line.label for line in series])
-    return plot
+    return plot, place
+
+
+def draw_line(plot: np.ndarray, points: np.ndarray, index: int) -> None:
+    """A line through points [·, 2] in px, in the colour of the ``index``-th."""
+    cv2 = images.opencv()
+    if len(points):
+        at = np.rint(points * 2**_FINE).astype(np.int32)
+        color = _COLORS[index % len(_COLORS)]
+        cv2.polylines(plot, [at], False, color, 2, cv2.LINE_AA, _FINE)
 
 
 def _points(line: Series) -> np.ndarray:
@@ -122,7 +152,7 @@ def _ticks(low: float, high: float, most: int) -> np.ndarray:
     return step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
 
 
-def _number(value: float) -> str:
+def short_number(value: float) -> str:
     """Short: 1500 is 1.5k; the rounding of the ticks is not shown."""
     for size, letter in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
@@ -130,7 +160,7 @@ def _number(value: float) -> str:
     return f"{value + 0.0:.4g}" if abs(value) > 1e-12 else "0"
 
 
-def _legend(plot: np.ndarray, labels: list[str]) -> None:
+def legend(plot: np.ndarray, labels: list[str]) -> None:
     """Names in the colours of their lines, at the right above the frame."""
     cv2 = images.opencv()
     right = plot.shape[1] - _RIGHT

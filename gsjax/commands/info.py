@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from gsjax.commands.common import Command, start_jax
+from gsjax.commands.common import Command, UsageError, start_jax
 from gsjax.console import say
 
 
@@ -19,13 +19,24 @@ class InfoCommand(Command):
     """The Gaussians: a .ply file, or the folder of a run."""
     json: bool = False
     """Print JSON."""
+    plot: Annotated[Path | None, arg(metavar="OUT.png")] = None
+    """Also draw histograms of opacity, scale and anisotropy."""
+    overwrite: bool = False
+    """Replace a plot that exists."""
 
     def run(self) -> int:
+        from gsjax import images
+
+        if self.plot is not None:
+            if self.plot.suffix.lower() != ".png":
+                raise UsageError(f"--plot {self.plot}: a name in .png is wanted")
+            images.refuse_existing([self.plot], self.overwrite)
         start_jax()
+        from gsjax.histograms import histograms_png
         from gsjax.info import describe, info_text
         from gsjax.io import load
         from gsjax.runinfo import describe_run, run_text
-        from gsjax.subjects import is_run
+        from gsjax.subjects import is_run, splat_file
         from gsjax.train.folder import run_files
 
         told: dict[str, Any] = {"path": str(self.scene)}
@@ -34,10 +45,18 @@ class InfoCommand(Command):
             told["run"] = describe_run(self.scene)
             texts.append(run_text(str(self.scene), told["run"]))
             splat = run_files(self.scene).splat
+        if self.plot is not None:
+            splat = splat_file(self.scene)  # which says what is missing
         if splat.exists() or "run" not in told:
-            facts = describe(load(splat))
+            gaussians = load(splat)
+            facts = describe(gaussians)
             facts["file_bytes"] = splat.stat().st_size
             told |= facts
             texts.append(info_text(str(splat), facts))
+            if self.plot is not None:
+                images.make_folder(self.plot.parent)
+                histograms_png(self.plot, gaussians, title=splat.name)
+                told["plot"] = str(self.plot)
+                texts.append(str(self.plot))
         say(json.dumps(told, indent=2) if self.json else "\n".join(texts))
         return 0

@@ -60,6 +60,10 @@ class TrainCommand(Command):
     """Steps between checkpoints; 0 only at the end."""
     eval_every: int | None = None
     """Steps between measurements on the held-out views; 0 only at the end."""
+    viewer: bool = False
+    """Show the scene in the browser as it grows; needs the extra gsjax[viewer]."""
+    viewer_port: int = 8080
+    """Where; the next free port if it is taken."""
     resume: bool = False
     """Go on where the run in RUN stopped, with the settings that it has."""
     overwrite: bool = False
@@ -68,7 +72,23 @@ class TrainCommand(Command):
     def run(self) -> int:
         if self.resume and self.overwrite:
             raise UsageError("--resume and --overwrite exclude each other")
+        if not 1 <= self.viewer_port < 2**16:
+            raise UsageError(f"--viewer-port {self.viewer_port}: from 1 to 65535")
         start_jax()
+        if not self.viewer:
+            return self._train(None)
+        from gsjax.viewer.live import LiveViewer
+
+        viewer = LiveViewer(port=self.viewer_port)
+        try:
+            code = self._train(viewer.begin)
+            if code == 0:
+                viewer.stay()
+            return code
+        finally:
+            viewer.close()
+
+    def _train(self, watch) -> int:
         from gsjax.train.folder import load_settings, run_files
         from gsjax.train.run import resume_run, start_run
 
@@ -79,9 +99,11 @@ class TrainCommand(Command):
                     f"{self.out} was trained on {settings.dataset}; --resume goes on "
                     "with that"
                 )
-            result = resume_run(self.out)
+            result = resume_run(self.out, watch=watch)
         else:
-            result = start_run(self._settings(), self.out, overwrite=self.overwrite)
+            result = start_run(
+                self._settings(), self.out, overwrite=self.overwrite, watch=watch
+            )
         if not result.finished:
             note(f"stopped after step {result.step}; go on with --resume")
             return 130

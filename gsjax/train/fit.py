@@ -70,6 +70,8 @@ class Hooks:
       measure: every ``config.every_eval`` steps: state and record; the time that it
         takes does not count.
       stop: asked after each step; True ends the run there.
+      state: after each step, with the state, whose memory the next step takes over:
+        copy what is to last.
     """
 
     step: Callable[[Progress], None] = lambda _: None
@@ -77,6 +79,7 @@ class Hooks:
     checkpoint: Callable[[TrainState, int, Progress], None] = lambda *_: None
     measure: Callable[[TrainState, Progress], None] = lambda *_: None
     stop: Callable[[], bool] = lambda: False
+    state: Callable[[TrainState, Progress], None] = lambda *_: None
 
 
 @dataclass
@@ -219,6 +222,7 @@ class _Run:
                     "photograph or a pose that is off"
                 )
             hooks.step(progress)
+            hooks.state(state, progress)
             state = self.with_room(state, metrics)
             # The last is saved by the caller, with what belongs to the end.
             every = config.every_checkpoint

@@ -1,7 +1,7 @@
 """A training run from a dataset to its folder: started, gone on with, saved."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -120,10 +120,26 @@ class _Sitting:
             log.write(record_line(record))
 
 
+# Given what a training begins with, what is to be done after each step.
+Watch = Callable[
+    [Scene, list[Photo], TrainConfig], Callable[[TrainState, Progress], None]
+]
+
+
 def start_run(
-    settings: RunSettings, folder: Path, *, overwrite: bool = False
+    settings: RunSettings,
+    folder: Path,
+    *,
+    overwrite: bool = False,
+    watch: Watch | None = None,
 ) -> RunResult:
     """Train, save and evaluate.
+
+    Args:
+      settings: of the run.
+      folder: where it is kept; created if missing.
+      overwrite: whether a run in it may be replaced.
+      watch: gives `Hooks.state`.
 
     Raises:
       InputError: if the folder holds a run and ``overwrite`` is not set, or what is
@@ -142,11 +158,11 @@ def start_run(
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     make_folder(folder)
     save_settings(folder, settings)
-    return _train(_Sitting(settings.config, data, files, _Start()))
+    return _train(_Sitting(settings.config, data, files, _Start()), watch)
 
 
-def resume_run(folder: Path) -> RunResult:
-    """Go on where a run stopped, bit for bit as if it had not.
+def resume_run(folder: Path, *, watch: Watch | None = None) -> RunResult:
+    """Go on where a run stopped, bit for bit as if it had not; see `start_run`.
 
     Raises:
       InputError: if there is no run, or its files are damaged.
@@ -156,7 +172,7 @@ def resume_run(folder: Path) -> RunResult:
     if any(files.checkpoints.glob("*.npz")):
         start = _last_checkpoint(files, settings.config, subset(data.scene, data.train))
         note(f"going on from step {start.step}")
-    return _train(_Sitting(settings.config, data, files, start))
+    return _train(_Sitting(settings.config, data, files, start), watch)
 
 
 def _last_checkpoint(files: RunFiles, config: TrainConfig, scene: Scene) -> _Start:
@@ -171,7 +187,7 @@ def _last_checkpoint(files: RunFiles, config: TrainConfig, scene: Scene) -> _Sta
     )
 
 
-def _train(sitting: _Sitting) -> RunResult:
+def _train(sitting: _Sitting, watch: Watch | None) -> RunResult:
     config, data, files = sitting.config, sitting.data, sitting.files
     start, scene = sitting.start, sitting.scene
     note(
@@ -182,6 +198,8 @@ def _train(sitting: _Sitting) -> RunResult:
     for path in (files.metrics, files.held_out):
         keep_steps(path, start.step)
     with _hooks(sitting) as hooks:
+        if watch is not None:
+            hooks.state = watch(scene, photos, config)
         result = fit(
             scene,
             photos,

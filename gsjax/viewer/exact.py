@@ -1,0 +1,79 @@
+"""Our own renderer's picture for the camera of a browser."""
+
+import threading
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax import images
+from gsjax.cameras import Camera, make_camera
+from gsjax.gaussians import Gaussians, capacity_bucket
+from gsjax.raster.render import render_exact
+from gsjax.raster.types import RasterConfig, Render
+from gsjax.rotations import rotation_rows
+from gsjax.sheets import depth_colors
+
+KINDS = ("rgb", "depth", "alpha")
+_PAIRS, _MARGIN = 2**20, 1.5  # room at first, and for the views to come
+
+
+def camera_of(wxyz, position, fov: float, width: int, height: int) -> Camera:
+    """The pinhole camera of a browser.
+
+    Args:
+      wxyz: [4] rotation camera → world, OpenCV axes.
+      position: [3] in the world.
+      fov: vertical field of view, radians.
+      width, height: px of the picture that is wanted.
+    """
+    unit = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)
+    world_from_camera = np.array(rotation_rows(*unit))
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = world_from_camera.T
+    viewmat[:3, 3] = -world_from_camera.T @ np.asarray(position, np.float64)
+    focal = 0.5 * height / np.tan(fov / 2)
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return make_camera(viewmat=viewmat, K=K, width=width, height=height)
+
+
+class ExactRenderer:
+    """Renders one picture at a time, and remembers what capacity that took.
+
+    Rgb, depth and alpha are one program: one compilation for each size.
+    """
+
+    def __init__(self, config: RasterConfig, background: Sequence[float]):
+        # One rung, and no capacity measured first: compiled three times as fast.
+        self.config = config.replace(
+            outputs=("rgb", "alpha", "depth"), rungs=1, pair_capacity=_PAIRS
+        )
+        self.background = tuple(background)
+        self._lock = threading.Lock()
+
+    def __call__(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """The images, on the host.
+
+        Raises:
+          CapacityError: if the view wants more memory than can be addressed.
+        """
+        behind = jnp.asarray(self.background, jnp.result_type(float))
+        with self._lock:
+            view = render_exact(gaussians, camera, self.config, behind)
+            wanted = int(view.demand.capacity)
+            if wanted > (self.config.pair_capacity or 0):
+                roomy = min(capacity_bucket(int(_MARGIN * wanted)), 2**30 - 1)
+                self.config = self.config.replace(pair_capacity=roomy)
+            return jax.device_get(view)
+
+
+def picture(view: Render, kind: str) -> tuple[np.ndarray, str]:
+    """([H, W, 3] uint8, what it shows) of a kind of `KINDS`."""
+    if kind == "depth":
+        pixels, near, far = depth_colors(np.asarray(view.depth))
+        return pixels, f"depth {near:.3g} (red) to {far:.3g} (blue)"
+    if kind == "alpha":
+        alpha = images.to_8_bit(np.asarray(view.alpha))
+        return np.repeat(alpha[..., None], 3, axis=2), "alpha"
+    return images.to_8_bit(np.asarray(view.rgb)), "rgb"

@@ -1,0 +1,77 @@
+"""A scene as one page, that opens offline."""
+
+import html
+from pathlib import Path
+from typing import NamedTuple
+
+from gsjax import images
+from gsjax.errors import InputError
+from gsjax.gaussians import num_active
+from gsjax.viewer.session import Exhibit
+from gsjax.viewer.splats import Cut, most_important, pack, within
+from gsjax.viewer.stage import (
+    add_cameras,
+    open_server,
+    paint_background,
+    set_eye,
+    size_of_frusta,
+    stop_server,
+)
+
+_CAPTION = """<div style="position:fixed;left:12px;bottom:10px;z-index:9;color:#ddd;
+font:13px sans-serif;text-shadow:0 0 3px #000;pointer-events:none">{}</div>"""
+
+
+class Page(NamedTuple):
+    """What was written: Gaussians drawn, of how many, and bytes."""
+
+    drawn: int
+    found: int
+    size: int
+
+
+def write_page(exhibit: Exhibit, path: Path, *, title: str) -> Page:
+    """Write what `Exhibit` says, with its cameras, into one HTML file.
+
+    Args:
+      exhibit: the scene; cut and thinned out as it says.
+      path: of the file, replaced if it exists; its folder is created if missing.
+      title: of the page.
+
+    Raises:
+      MissingExtraError: without viser.
+      InputError: if nothing would be left of the scene, or the file cannot be written.
+    """
+    gaussians = exhibit.gaussians
+    shown = within(gaussians, Cut(exhibit.min_opacity))
+    if exhibit.max_gaussians is not None:
+        shown = most_important(gaussians, shown, exhibit.max_gaussians)
+    splats = pack(gaussians, shown)
+    drawn, found = len(splats.centers), int(num_active(gaussians))
+    if found and not drawn:
+        raise InputError(
+            f"{path}: none of {found:,} Gaussians is opaque enough to be drawn; lower "
+            "--min-opacity"
+        )
+    server = open_server("127.0.0.1", 0)
+    try:
+        set_eye(server, exhibit.eye)
+        paint_background(server.scene, exhibit.renderer.background)
+        if drawn:
+            server.scene.add_gaussian_splats("/splats", **splats._asdict())
+        if exhibit.frusta:
+            size = size_of_frusta(exhibit.frusta, exhibit.eye.distance)
+            add_cameras(server.scene, exhibit.frusta, size)
+        text = server.scene.as_html(dark_mode=True)
+    finally:
+        stop_server(server)
+    caption = (
+        f"{html.escape(title)} · {drawn:,} of {found:,} Gaussians, each of one colour "
+        "from all sides (SH degree 0), drawn by viser; gsjax"
+    )
+    head, tail = text.rsplit("</body>", 1)
+    head = head.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>")
+    data = f"{head}{_CAPTION.format(caption)}</body>{tail}".encode()
+    images.make_folder(path.parent)
+    images.write_file(path, data)
+    return Page(drawn, found, len(data))

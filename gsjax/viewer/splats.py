@@ -1,0 +1,140 @@
+"""Gaussians as the browser draws them: what is left of them, and in which numbers.
+
+Axis legend: N slots, M Gaussians that are shown.
+
+viser holds a covariance in half precision and a colour in 8 bits, the same from all
+sides: that of the spherical harmonics' degree 0. It draws nothing below an opacity of
+`LEAST_OPACITY`. All of this is NumPy: nothing is compiled for a new M, and nothing
+waits for what a device is busy with.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from gsjax.gaussians import Gaussians
+from gsjax.rotations import rotation_rows
+from gsjax.sh import dc_to_rgb
+
+LEAST_OPACITY = 0.01
+# Half precision has 11 bits from 6e-5 to 65504: of scales, from 0.008 to 255.
+_LARGEST, _TYPICAL = 250.0, 0.1
+
+
+class Cut(NamedTuple):
+    """Which Gaussians are shown: both ends included.
+
+    Attributes:
+      min_opacity: in [0, 1).
+      max_scale: of the longest axis, world units.
+    """
+
+    min_opacity: float = 0.0
+    max_scale: float = float("inf")
+
+
+class Splats(NamedTuple):
+    """What `viser.SceneApi.add_gaussian_splats` takes.
+
+    Lengths are in units of ``scale``, so that covariances fit half precision.
+
+    Attributes:
+      centers: [M, 3] float32.
+      covariances: [M, 3, 3] float32.
+      rgbs: [M, 3] float32 in [0, 1].
+      opacities: [M, 1] float32.
+      scale: world units.
+    """
+
+    centers: np.ndarray
+    covariances: np.ndarray
+    rgbs: np.ndarray
+    opacities: np.ndarray
+    scale: float
+
+
+def opacities_of(gaussians: Gaussians) -> np.ndarray:
+    """[N] float64."""
+    logits = np.asarray(gaussians.params.logit_opacities, np.float64)
+    with np.errstate(over="ignore"):
+        return 1 / (1 + np.exp(-logits))
+
+
+def longest_axes(gaussians: Gaussians) -> np.ndarray:
+    """[N] float64, the largest of the three scales, in world units."""
+    logs = np.asarray(gaussians.params.log_scales, np.float64)
+    with np.errstate(over="ignore"):
+        return np.exp(logs.max(axis=1))
+
+
+def within(gaussians: Gaussians, cut: Cut) -> np.ndarray:
+    """[N] bool: active, finite, and within the cut."""
+    params = gaussians.params
+    leaves = [
+        params.means,
+        params.quats,
+        params.log_scales,
+        np.asarray(params.sh)[:, 0],
+    ]
+    finite = [np.isfinite(np.asarray(leaf)).all(axis=1) for leaf in leaves]
+    shown = np.logical_and.reduce([np.asarray(gaussians.active), *finite])
+    shown &= opacities_of(gaussians) >= cut.min_opacity  # False for NaN
+    return shown & (longest_axes(gaussians) <= cut.max_scale)
+
+
+def most_important(gaussians: Gaussians, shown: np.ndarray, count: int) -> np.ndarray:
+    """[N] bool: of those ``shown`` the ``count`` that matter most.
+
+    That is opacity times the area of the two longest axes: what a Gaussian covers
+    from its best side. A heuristic: it knows no cameras, and not what is hidden.
+    """
+    if shown.sum() <= count:
+        return shown
+    logs = np.asarray(gaussians.params.log_scales, np.float64)
+    area = logs.sum(axis=1) - logs.min(axis=1)
+    with np.errstate(divide="ignore"):
+        weight = np.where(shown, np.log(opacities_of(gaussians)) + area, -np.inf)
+    kept = np.zeros_like(shown)
+    kept[np.argsort(-weight, kind="stable")[:count]] = True
+    return kept
+
+
+def pack(gaussians: Gaussians, shown: np.ndarray) -> Splats:
+    """Those that ``shown`` [N] marks, without those that the browser never draws."""
+    opacities = opacities_of(gaussians)
+    shown = shown & (opacities >= LEAST_OPACITY)
+    params = gaussians.params
+    logs = np.asarray(params.log_scales, np.float64)[shown]
+    scale = _unit(logs.max(axis=1))
+    half = np.minimum(np.exp(logs - np.log(scale)), _LARGEST).astype(np.float32)
+    rotations = _rotations(np.asarray(params.quats, np.float64)[shown])
+    axes = rotations * half[:, None, :]
+    return Splats(
+        centers=(np.asarray(params.means)[shown] / scale).astype(np.float32),
+        covariances=axes @ axes.swapaxes(1, 2),
+        rgbs=np.clip(dc_to_rgb(np.asarray(params.sh)[shown, 0]), 0, 1),  # pyright: ignore
+        opacities=opacities[shown, None].astype(np.float32),
+        scale=scale,
+    )
+
+
+def _unit(longest: np.ndarray) -> float:
+    """World units in which half precision holds these log scales [M].
+
+    The largest fits, unless those in the middle would get too small by that; then the
+    largest are cut.
+    """
+    if not len(longest):
+        return 1.0
+    log_unit = min(
+        longest.max() - np.log(_LARGEST), np.median(longest) - np.log(_TYPICAL)
+    )
+    return float(np.exp(np.clip(log_unit, -60, 60)))
+
+
+def _rotations(quats: np.ndarray) -> np.ndarray:
+    """[M, 3, 3] float32."""
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    unit = np.where(norms > 0, quats, (1.0, 0, 0, 0)) / np.where(norms > 0, norms, 1)
+    rows = rotation_rows(*unit.T)  # pyright: ignore
+    return np.moveaxis(np.asarray(rows, np.float32), -1, 0)

@@ -1,0 +1,393 @@
+"""The viewer: the browser's numbers, our picture for its camera, pages, live runs."""
+
+import base64
+import re
+import shutil
+import struct
+import subprocess
+import sys
+import threading
+import time
+
+import cv2
+import jax
+import numpy as np
+import pytest
+import training
+from conftest import LIGHT, frustum_points, gaussians_at
+
+import gsjax
+from gsjax import cli
+from gsjax.rotations import covariance, quaternion_to_matrix
+from gsjax.scene.types import Photo
+from gsjax.train.config import TrainConfig
+from gsjax.train.fit import Progress, initial_state
+from gsjax.train.step import Metrics
+from gsjax.viewer.exact import ExactRenderer, camera_of, picture
+from gsjax.viewer.splats import (
+    LEAST_OPACITY,
+    Cut,
+    longest_axes,
+    most_important,
+    opacities_of,
+    pack,
+    within,
+)
+from gsjax.viewer.stage import UPS, eye_of_cameras, eye_of_gaussians, frusta_of
+
+COUNT = 64
+
+
+def scene(spread=1.0, degree=1):
+    """Gaussians of all sizes and opacities, orange, as large as ``spread``."""
+    rng = np.random.default_rng(0)
+    points = spread * frustum_points(rng, COUNT)
+    scales = spread * np.exp(rng.normal(-2.0, 0.7, (COUNT, 3)))
+    found = gaussians_at(points, scales, rng.uniform(0.02, 0.99, COUNT), degree=degree,
+                         viewmat=np.eye(4))  # fmt: skip
+    sh = np.zeros_like(found.params.sh)
+    sh[:, 0] = (np.array([0.9, 0.5, 0.1]) - 0.5) / 0.28209479177387814
+    return found.replace(params=found.params.replace(sh=jax.numpy.asarray(sh)))
+
+
+# --- numbers ---
+
+
+@pytest.mark.parametrize("spread", [1e-4, 1.0, 1e5])
+def test_half_precision_holds_a_scene_of_any_size(spread):
+    gaussians = scene(spread)
+    splats = pack(gaussians, within(gaussians, Cut()))
+    scales = np.exp(gaussians.params.log_scales)
+    wanted = np.asarray(covariance(gaussians.params.quats, scales))
+    stored = splats.covariances.astype(np.float16).astype(float) * splats.scale**2
+    largest = np.abs(wanted).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(stored / largest, wanted / largest, atol=1e-3)
+    means = np.asarray(gaussians.params.means)
+    np.testing.assert_allclose(splats.centers * splats.scale, means, rtol=1e-5)
+    np.testing.assert_allclose(splats.rgbs, [[0.9, 0.5, 0.1]] * COUNT, atol=1e-6)
+    np.testing.assert_allclose(
+        splats.opacities[:, 0], opacities_of(gaussians), rtol=1e-6
+    )
+
+
+def test_giants_are_cut_and_do_not_starve_the_others():
+    gaussians = scene()
+    logs = gaussians.params.log_scales.at[0].set(np.log(1e9))
+    giant = gaussians.replace(params=gaussians.params.replace(log_scales=logs))
+    splats = pack(giant, within(giant, Cut()))
+    stored = splats.covariances.astype(np.float16)
+    assert np.isfinite(stored).all()
+    assert (np.trace(stored[1:], axis1=1, axis2=2) > 0).all()
+
+
+def test_what_is_not_there_is_not_shown():
+    gaussians = scene()
+    params, active = gaussians.params, np.ones(COUNT, bool)
+    active[0] = False
+    params = params.replace(
+        means=params.means.at[1, 2].set(np.nan),
+        log_scales=params.log_scales.at[2].set(np.inf),
+        logit_opacities=params.logit_opacities.at[3].set(np.nan).at[4].set(-9.0),
+        quats=params.quats.at[5].set(0.0),
+    )
+    broken = gaussians.replace(params=params, active=jax.numpy.asarray(active))
+    shown = within(broken, Cut())
+    assert list(np.flatnonzero(~shown)) == [0, 1, 2, 3]
+    splats = pack(broken, shown)
+    assert len(splats.centers) == COUNT - 5  # nor what is never drawn
+    assert all(np.isfinite(each).all() for each in splats)
+    assert splats.opacities.min() >= LEAST_OPACITY
+
+
+def test_cuts_and_thinning_keep_what_they_say():
+    gaussians = scene()
+    opacities, longest = opacities_of(gaussians), longest_axes(gaussians)
+    half = float(np.median(longest))
+    shown = within(gaussians, Cut(0.4, half))
+    np.testing.assert_array_equal(shown, (opacities >= 0.4) & (longest <= half))
+    kept = most_important(gaussians, shown, 5)
+    assert kept.sum() == 5
+    assert not (kept & ~shown).any()
+    np.testing.assert_array_equal(most_important(gaussians, shown, COUNT), shown)
+    # Of equal shapes the most opaque, of equal opacities the largest.
+    logs = np.linspace(-5, 0, COUNT)
+    flat = gaussians_at(frustum_points(np.random.default_rng(0), COUNT),
+                        np.exp(logs)[:, None], 0.5)  # fmt: skip
+    kept = most_important(flat, np.ones(COUNT, bool), 9)
+    np.testing.assert_array_equal(np.flatnonzero(kept), np.arange(COUNT - 9, COUNT))
+
+
+def test_the_camera_of_a_browser():
+    wxyz, position = np.array([0.9, -0.2, 0.3, 0.1]), np.array([1.0, 2, 3])
+    camera = camera_of(wxyz, position, 0.8, 40, 30)
+    rotation = np.asarray(quaternion_to_matrix(wxyz))
+    np.testing.assert_allclose(camera.viewmat[:3, :3], rotation.T, atol=1e-12)
+    edge = position + rotation @ (0, -np.tan(0.4), 1)  # the middle of the upper edge
+    local = camera.viewmat[:3, :3] @ edge + camera.viewmat[:3, 3]
+    pixel = camera.K @ local
+    np.testing.assert_allclose(pixel[:2] / pixel[2], (20, 0), atol=1e-9)
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_where_one_looks_from(up):
+    eye = eye_of_gaussians(scene(), UPS[up])
+    means = np.asarray(scene().params.means)
+    np.testing.assert_allclose(eye.target, np.median(means, axis=0), atol=1.0)
+    assert (eye.position - eye.target) @ UPS[up] > 0
+    frusta = frusta_of(training.scene().views)
+    eye = eye_of_cameras(frusta)
+    view = gsjax.look_at(eye.position, eye.target, eye.up)
+    points = training.scene().points @ view[:3, :3].T + view[:3, 3]
+    assert (points[:, 2] > 0).all()
+    assert (np.abs(points[:, :2] / points[:, 2:]) < 1).all()
+
+
+@pytest.mark.long
+def test_exact_pictures_are_the_renderers():
+    gaussians, background = scene(), (0.1, 0.2, 0.3)
+    config = gsjax.RasterConfig(**LIGHT)
+    renderer = ExactRenderer(config, background)
+    camera = camera_of((1, 0, 0, 0), (0, 0, 0), 0.7, 32, 24)
+    view = renderer(gaussians, camera)
+    wanted = gsjax.reference_render(gaussians, camera, config, np.array(background))
+    np.testing.assert_allclose(view.rgb, wanted["rgb"], atol=1e-6)
+    for kind, image in (("rgb", wanted["rgb"]), ("alpha", wanted["alpha"][..., None])):
+        pixels, what = picture(view, kind)
+        assert what == kind
+        np.testing.assert_allclose(pixels / 255, image * np.ones(3), atol=0.51 / 255)
+    pixels, what = picture(view, "depth")
+    assert pixels.shape == (24, 32, 3)
+    assert re.match(r"depth \d.* \(red\) to \d.* \(blue\)", what)
+
+
+# --- the command ---
+
+
+@pytest.fixture
+def ply(tmp_path):
+    path = tmp_path / "a.ply"
+    gsjax.save(path, scene())
+    return path
+
+
+def test_without_viser_the_line_that_installs_it(ply, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    for args in (["view", str(ply)], ["train", "x", "-o", str(tmp_path), "--viewer"]):
+        assert cli.main(args) == 6
+        said = capsys.readouterr()
+        assert said.out == ""
+        assert "pip install 'gsjax[viewer]'" in said.err
+
+
+@pytest.mark.parametrize(
+    "args", [["--min-opacity", "1"], ["--max-gaussians", "0"], ["--port", "0"],
+             ["--up", "z"]],
+)  # fmt: skip
+def test_usage(ply, args, capsys):
+    assert cli.main(["view", str(ply), *args]) == 2
+    assert args[0] in capsys.readouterr().err
+
+
+def splats_of(text: str) -> np.ndarray:
+    """Packed splats [M, 8] of a page: the largest of its buffers, and the only one."""
+    import msgspec
+    import zstandard
+
+    data = base64.b64decode(re.search(r'EMBED_DATA__="([^"]*)"', text)[1])
+    inner = zstandard.ZstdDecompressor().decompressobj().decompress(data[8:])
+    length = 8 + struct.unpack("<Q", inner[:8])[0]
+    told = msgspec.msgpack.decode(inner[8:length])
+    kinds = [message["type"] for _, message in told["messages"]]
+    assert kinds.count("GaussianSplatsMessage") == 1
+    assert "BackgroundImageMessage" in kinds
+    (size,) = told["binaryBufferLengths"]
+    return np.frombuffer(inner[len(inner) - size :], np.uint32).reshape(-1, 8)
+
+
+def test_a_page_holds_the_scene_and_needs_nothing_else(ply, tmp_path, capsys):
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    out = tmp_path / "new" / "a.html"
+    assert cli.main(["view", str(ply), "--html", str(out)]) == 0
+    size = out.stat().st_size / 2**20
+    assert capsys.readouterr().out == f"{out}  {COUNT} Gaussians, {size:.2f} MiB\n"
+    text = out.read_text()
+    links = set(re.findall(r"(?:src|href)=.?https?://[^\"' ]+", text))
+    assert not links
+    assert "SH degree 0" in text
+    packed = splats_of(text)
+    rgb = packed[:, 7:].copy().view(np.uint8)[:, :3] / 255
+    np.testing.assert_allclose(rgb, [[0.9, 0.5, 0.1]] * COUNT, atol=1 / 255)
+    assert cli.main(["view", str(ply), "--html", str(out)]) == 3
+    assert "exists" in capsys.readouterr().err
+    args = ["--overwrite", "--max-gaussians", "20", "--min-opacity", "0.5"]
+    assert cli.main(["view", str(ply), "--html", str(out), *args]) == 0
+    assert f"20 of {COUNT} Gaussians" in capsys.readouterr().out
+    args = ["--overwrite", "--min-opacity", "0.999"]
+    assert cli.main(["view", str(ply), "--html", str(out), *args]) == 3
+    assert "lower --min-opacity" in capsys.readouterr().err
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_a_browser_shows_the_colours_of_the_scene(ply, tmp_path, capsys):
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    out, shot = tmp_path / "a.html", tmp_path / "a.png"
+    assert cli.main(["view", str(ply), "--html", str(out)]) == 0
+    capsys.readouterr()
+    subprocess.run(
+        [CHROMIUM, "--headless", "--no-sandbox", "--use-angle=swiftshader",
+         "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
+         f"--user-data-dir={tmp_path}/profile", "--window-size=500,400",
+         "--virtual-time-budget=20000", f"--screenshot={shot}", out.as_uri()],
+        capture_output=True, timeout=120, check=True,
+    )  # fmt: skip
+    pixels = cv2.imread(str(shot))[..., ::-1].astype(float)
+    red, green, blue = np.moveaxis(pixels, -1, 0)
+    orange = (red > 60) & (red > 1.5 * green) & (green > 1.5 * blue)
+    assert orange.mean() > 0.02
+
+
+# --- live ---
+
+
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0),
+    "position": (0.0, 0.0, 0.0), "fov": 0.7, "image_height": 24,
+    "image_width": 32, "near": 0.01, "far": 100.0, "look_at": (0.0, 0.0, 1.0),
+    "up_direction": (0.0, -1.0, 0.0),
+}  # fmt: skip
+
+
+class Browser:
+    """Connects as a browser does, says where its camera is, and draws nothing."""
+
+    def __init__(self, url: str):
+        import msgspec
+        import viser
+        from websockets.sync.client import connect
+
+        self.socket = connect(
+            url.replace("http", "ws"),
+            subprotocols=[f"viser-v{viser.__version__}"],
+            max_size=None,
+        )
+        self.socket.send(msgspec.msgpack.encode(CAMERA))
+        self.reader = threading.Thread(target=lambda: list(self.socket), daemon=True)
+        self.reader.start()
+
+    def close(self) -> None:
+        self.socket.close()
+        self.reader.join(10)
+
+
+def wait_for(condition, seconds=30.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def window():
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    from gsjax.viewer.opening import _exhibit
+    from gsjax.viewer.window import Window
+
+    def render(gaussians, camera):
+        calls.append((gaussians, camera))
+        shape = (camera.height, camera.width)
+        image = np.full((*shape, 3), 0.5)
+        return gsjax.Render(**dict.fromkeys(gsjax.Render._fields))._replace(rgb=image)
+
+    calls = []
+    renderer = ExactRenderer(gsjax.RasterConfig(), (0, 0, 0))
+    exhibit = _exhibit(scene(), renderer, frusta_of(training.scene().views), None)
+    made = Window(exhibit, port=8190)
+    render.background = (0, 0, 0)
+    exhibit.renderer = render
+    made.calls = calls
+    yield made
+    made.close()
+
+
+def test_a_session_cuts_renders_and_moves(window):
+    browser = Browser(window.url)
+    wait_for(lambda: window.sessions and next(iter(window.sessions.values())).splats)
+    session = next(iter(window.sessions.values()))
+    assert session.splats.buffer.shape == (COUNT, 8)
+    assert f"**{COUNT}** of {COUNT} Gaussians" in session.counts.content
+    assert len(session.cameras) == 1 + training.VIEWS
+    session.opacity.value = 0.5
+    kept = int((opacities_of(scene()) >= 0.5).sum())
+    wait_for(lambda: session.splats.buffer.shape == (kept, 8))
+    assert not window.calls  # nothing was asked for
+    session.height.value = "270"
+    session.render()
+    gaussians, camera = window.calls[-1]
+    assert (camera.height, camera.width) == (270, 360)
+    assert int(gaussians.active.sum()) == kept
+    assert session.covered
+    assert not session.splats.visible
+    session.place.value = "in the panel"
+    wait_for(lambda: session.pictures.visible)
+    assert session.splats.visible
+    assert not session.covered
+    window.show(scene(2.0), "step 7 of 9")
+    wait_for(lambda: "step 7 of 9" in session.counts.content)
+    session._go(window.exhibit.frusta[2])
+    np.testing.assert_allclose(
+        session.client.camera.position, training.scene().views[2].centre, atol=1e-6
+    )
+    browser.close()
+    wait_for(lambda: not window.watched)
+
+
+def test_a_training_is_shown_by_copies_of_its_own():
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    from gsjax.viewer.live import LiveViewer
+
+    config = TrainConfig(steps=9, sh_degree=0, raster=training.RASTER)
+    start, viewer = training.scene(), LiveViewer(port=8290)
+    blank = np.zeros((training.HEIGHT, training.WIDTH, 3), np.uint8)
+    photos = [Photo(blank, None, None, view.K) for view in start.views]
+    hook = viewer.begin(start, photos, config)
+
+    def after(step):
+        """The hook, and then what the next step does to the state it was given."""
+        state = initial_state(start, config)
+        means = state.gaussians.params.means + step
+        params = state.gaussians.params.replace(means=means)
+        gaussians = state.gaussians.replace(params=params)
+        kept = np.array(means)
+        metrics = Metrics(*[0] * len(Metrics._fields))._replace(step=step)
+        hook(state.replace(gaussians=gaussians), Progress(metrics, 0, 0, 0, 1, 64))
+        np.testing.assert_array_equal(means, kept)
+        jax.tree.map(lambda a: a.delete(), gaussians)
+        return kept
+
+    def shown():
+        return np.asarray(viewer.window.exhibit.gaussians.params.means)
+
+    first = after(1)
+    after(2)  # nobody looks, and it is too early: no copy
+    np.testing.assert_array_equal(shown(), first)
+    browser = Browser(viewer.window.url)
+    wait_for(lambda: viewer.window.watched)
+    viewer.due = time.monotonic() + 60
+    after(3)  # too early still
+    np.testing.assert_array_equal(shown(), first)
+    viewer.due = 0.0
+    fourth = after(4)
+    np.testing.assert_array_equal(shown(), fourth)
+    session = next(iter(viewer.window.sessions.values()))
+    wait_for(lambda: "step 4 of 9" in session.counts.content)
+    assert viewer.due > time.monotonic()
+    last = after(9)  # the last is always shown
+    np.testing.assert_array_equal(shown(), last)
+    wait_for(lambda: "step 9 of 9" in session.counts.content)
+    browser.close()
+    viewer.stay()  # nobody looks any more
+    viewer.close()
