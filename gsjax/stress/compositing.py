@@ -16,6 +16,7 @@ from gsjax.stress.scenes import (
     SLOTS,
     WIDE,
     camera_of,
+    double,
     fields_at,
     frustum,
     in_float64,
@@ -61,7 +62,7 @@ def opaque(full: bool) -> Measured:
         for count in (1, 2):
             alpha.flat[rng.choice(alpha.size, count, replace=False)] = 1
             found = np.asarray(_slopes_of_transmittance(alpha, weigh)).ravel()
-            wanted = _slopes_of_products(np.float64(alpha).ravel(), weigh.ravel())
+            wanted = _slopes_of_products(double(alpha).ravel(), weigh.ravel())
             worst = max(worst, float(np.max(np.abs(found - wanted))) / usually)
             alpha[alpha == 1] = 0.002
     return Measured(worst, f"of {np.prod(shape)}")

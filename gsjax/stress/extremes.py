@@ -16,12 +16,14 @@ from gsjax.stress.scenes import (
     SLOTS,
     camera_of,
     changed,
+    double,
     fields_at,
     frustum,
     host_fields,
     not_finite,
     pose,
     scene_of,
+    single,
     unequal,
     usual,
     usual_gradients,
@@ -41,15 +43,17 @@ def quaternions(full: bool) -> Measured:
     del full
     drawn = np.random.default_rng(0).normal(size=(SLOTS, 4))
     size = np.resize([1e-30, 1e-23, 1e-10, 1, 1e10, 1e20, 1e30], SLOTS)[:, None]
-    quats = np.float32(drawn * size)
-    unit = np.float64(quats) / np.abs(np.float64(quats)).max(1, keepdims=True)
+    quats = single(drawn * size)
+    unit = double(quats) / np.abs(double(quats)).max(1, keepdims=True)
     w, *v = (unit / np.linalg.norm(unit, axis=1, keepdims=True)).T
     v = np.stack(v, 1)
     cross = np.stack([np.cross(np.eye(3)[i], v) for i in range(3)], 1)
     wanted = np.eye(3) * (w * w - (v * v).sum(1))[:, None, None]
     wanted = wanted + 2 * v[:, :, None] * v[:, None, :] + 2 * w[:, None, None] * cross
-    error = np.max(np.abs(np.asarray(quaternion_to_matrix(quats)) - wanted))
-    bad = np.float32([0, 0, 1e-45, np.nan, np.inf])
+    error = np.max(
+        np.abs(np.asarray(quaternion_to_matrix(jnp.asarray(quats))) - wanted)
+    )
+    bad = single([0, 0, 1e-45, np.nan, np.inf])
     fields = host_fields(usual())
     fields["quats"][:5] = bad[:, None]
     out, slopes = usual_gradients(changed(usual(), **fields))
@@ -153,7 +157,9 @@ def _rows_of_wild(gaussians: Gaussians, camera, value):
         row_spans(moved, 0 * order, grid, jnp.int32(0)).rows
         for moved in (out._replace(u=sign), out._replace(v=sign))
     ]
-    return jnp.sum(jnp.stack(rows)), jnp.sum(row_spans(out, 0 * order, grid, 0).rows)
+    return jnp.sum(jnp.stack(rows)), jnp.sum(
+        row_spans(out, 0 * order, grid, jnp.int32(0)).rows
+    )
 
 
 def wild_coordinates(full: bool) -> Measured:
@@ -193,7 +199,7 @@ def at_the_camera(full: bool) -> Measured:
     """Numbers not finite where the direction of the harmonics is undefined."""
     del full
     fields = host_fields(usual())
-    viewmat = np.float64(pose())
+    viewmat = double(pose())
     fields["means"][:4] = -viewmat[:3, :3].T @ viewmat[:3, 3]
     fields["log_scales"][:4] = 2
     # With a near plane of 0 under jit, what stands at the centre could be drawn.
@@ -221,10 +227,10 @@ def empty(full: bool) -> Measured:
 def probabilities(full: bool) -> Measured:
     """Largest error of sigmoid(logit(p)), p = 0 and 1 included."""
     del full
-    p = np.float32([0, 1e-45, 1e-30, 2**-24, 1e-6, 0.01, 0.5, 0.99, 1 - 2**-24, 1])
+    p = single([0, 1e-45, 1e-30, 2**-24, 1e-6, 0.01, 0.5, 0.99, 1 - 2**-24, 1])
     p = np.concatenate([p, np.linspace(0, 1, 10_001, dtype=np.float32)])
     back = np.asarray(jax.nn.sigmoid(logit(jnp.asarray(p))))
-    return Measured(float(np.max(np.abs(back - np.float64(p)))), f"{len(p)} values")
+    return Measured(float(np.max(np.abs(back - double(p)))), f"{len(p)} values")
 
 
 CASES = (

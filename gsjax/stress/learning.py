@@ -20,6 +20,7 @@ from gsjax.stress.scenes import (
     changed,
     not_finite,
     oracle,
+    single,
     unequal,
     usual,
     usual_gradients,
@@ -34,7 +35,7 @@ def similarity(full: bool) -> Measured:
     for height, width in shapes:
         drawn = np.random.default_rng(0).uniform(size=(height, width, 3))
         flat = [np.full((height, width, 3), v) for v in (0, 1e-3, 0.1, 0.5, 0.999, 1)]
-        for image in np.float32([*flat, drawn, 1 - 1e-3 * drawn]):
+        for image in single([*flat, drawn, 1 - 1e-3 * drawn]):
             count += 1
             worst = max(worst, abs(1 - float(score(image, image))))
     return Measured(worst, f"{count} pictures")

@@ -18,6 +18,7 @@ from gsjax.stress.scenes import (
     SLOTS,
     camera_of,
     changed,
+    double,
     each_alpha,
     each_alpha_oracle,
     fields_at,
@@ -28,6 +29,7 @@ from gsjax.stress.scenes import (
     on_host,
     oracle,
     scene_of,
+    single,
     usual_gradients,
     weights,
 )
@@ -174,8 +176,8 @@ def extreme_but_valid(seed: int = 0) -> Gaussians:
 
     def on_pixel(where):
         """Means moved onto the nearest pixel centre of `level_camera`."""
-        mean = np.float64(fields["means"][where])
-        K = np.float64(level_camera().K)
+        mean = double(fields["means"][where])
+        K = double(level_camera().K)
         size = SIZE - 1
         for axis in (0, 1):
             uv = K[axis, axis] * mean[:, axis] / mean[:, 2] + K[axis, 2]
@@ -228,7 +230,7 @@ def wrongly_culled(full: bool) -> Measured:
 def beside_bad(full: bool) -> Measured:
     """Valid splats that vanish beside bad ones, and bad ones that do not vanish."""
     wrong, seen, bad = 0, 0, np.arange(SLOTS) % 5 == 0
-    values = np.resize(np.float32([np.nan, np.inf, -np.inf]), SLOTS)
+    values = np.resize(single([np.nan, np.inf, -np.inf]), SLOTS)
     for seed in range(16 if full else 2):
         scene, camera = extreme_but_valid(seed), level_camera()
         visible = each_alpha_oracle(clipped(scene), camera).max((1, 2)) >= VISIBLE

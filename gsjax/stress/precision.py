@@ -21,12 +21,14 @@ from gsjax.stress.scenes import (
     SLOTS,
     WIDE,
     camera_of,
+    double,
     fields_at,
     frustum,
     in_float64,
     oracle,
     pose,
     scene_of,
+    single,
     usual_gradients,
     weights,
 )
@@ -131,7 +133,7 @@ def far_world(offset: float):
         for before, after in zip(scene.views, near.views):
             rotation = before.viewmat[:3, :3]
             x, y, z = rotation @ (points - before.centre).T
-            K = np.float64(np.float32(before.K))
+            K = double(single(before.K))
             wanted = np.stack([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]], 1)
             for name, seen, view in (
                 ("rebased", near, after),

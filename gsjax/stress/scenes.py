@@ -28,7 +28,7 @@ COMPAT = RasterConfig(rungs=1, devices=1, pair_capacity=WIDE * 16)
 SMOOTH = COMPAT.replace(
     alpha_cut=1e-6, alpha_cap=1 - 1e-6, stop=0.0, outputs=("alpha",)
 )
-BACKGROUND = np.float32([0.2, 0.5, 0.9])
+BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
 # A pixel this near a threshold, relatively, may rightly differ by a whole Gaussian.
 BAND = 1e-3
 FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
@@ -40,6 +40,16 @@ class Gradients(NamedTuple):
     params: GaussianParams
     camera: Camera
     background: Array
+
+
+def single(values) -> np.ndarray:
+    """An array of float32."""
+    return np.asarray(values, np.float32)
+
+
+def double(values) -> np.ndarray:
+    """An array of float64."""
+    return np.asarray(values, np.float64)
 
 
 def in_float64(tree):
@@ -69,7 +79,7 @@ def camera_of(viewmat=None, focal=FOCAL, centre=(16.6, 15.1), **kwargs) -> Camer
     K = np.array([[focal, 0, centre[0]], [0, 1.07 * focal, centre[1]], [0, 0, 1]])
     viewmat = pose() if viewmat is None else viewmat
     size = {"width": SIZE, "height": SIZE}
-    return make_camera(viewmat=viewmat, K=np.float32(K), **{**size, **kwargs})
+    return make_camera(viewmat=viewmat, K=single(K), **{**size, **kwargs})
 
 
 def fields_at(points, scales, opacities, viewmat=None, seed: int = 0) -> dict:
@@ -164,7 +174,7 @@ def usual_gradients(
     camera = camera_of() if camera is None else camera
     weigh = weights() if weigh is None else weigh
     # Always of one type: another would be compiled again.
-    given = np.float32(background), np.float32(weigh)
+    given = single(background), single(weigh)
     return on_host(gradients(gaussians, camera, *given))
 
 
