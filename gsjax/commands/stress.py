@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsjax.commands.common import Command
+from gsjax.commands.common import Command, start_jax
 from gsjax.console import note, say
 
 
@@ -25,6 +25,7 @@ class StressCommand(Command):
     """Replace a --json file that exists."""
 
     def run(self) -> int:
+        start_jax()
         from gsjax.errors import InputError
         from gsjax.stress import run as stress
 
