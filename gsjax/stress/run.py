@@ -136,6 +136,9 @@ def markdown(told: dict[str, Any]) -> str:
         lines.append(
             f"| {row.name} | {row.claim} | {measured}{mark} | {bound} | {ratio} |"
         )
+    for row in rows:
+        if not row.good:
+            lines += ["", f"{row.name}: {row.error or row.note}."]
     where = told["machine"]
     good = sum(row.good for row in rows)
     lines += [

@@ -75,15 +75,17 @@ def run_case(case: Case, full: bool) -> Result:
         error += f" ({where.name})"
         measured = Measured(float("nan"))
     value = float(measured.value)
+    good = value <= case.bound
+    notes = [measured.note, "" if good else case.known]
     return Result(
         name=case.name,
         claim=case.claim,
         measured=value,
         bound=case.bound,
         unit=case.unit,
-        good=value <= case.bound,
+        good=good,
         seconds=time.perf_counter() - start,
-        note=measured.note or case.known,
+        note="; ".join(note for note in notes if note),
         error=error,
         more=measured.more,
     )
