@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import platform
 from collections.abc import Iterator
 from datetime import date
@@ -10,7 +11,6 @@ from typing import Any
 
 import jax
 
-from gsjax import doctor
 from gsjax.errors import InputError
 from gsjax.stress import (
     accuracy,
@@ -110,10 +110,9 @@ def machine() -> dict[str, str]:
     devices = jax.local_devices()
     return {
         "date": date.today().isoformat(),
-        "gsjax": doctor.version("gsjax"),
         "jax": jax.__version__,
         "python": platform.python_version(),
-        "cpu": _cpu(),
+        "cpu": f"{_cpu()}, {os.cpu_count()} cores",
         "device": f"{devices[0].platform} ({devices[0].device_kind})",
     }
 
