@@ -71,8 +71,8 @@ def run_case(case: Case, full: bool) -> Result:
         measured = case.measure(full)
     except Exception as caught:
         where = traceback.extract_tb(caught.__traceback__)[-1]
-        error = f"{type(caught).__name__}: {str(caught).strip().splitlines()[:1]}"
-        error += f" ({where.name})"
+        told = " ".join(str(caught).split())[:200]
+        error = f"{type(caught).__name__}: {told} ({where.name})"
         measured = Measured(float("nan"))
     value = float(measured.value)
     good = value <= case.bound
