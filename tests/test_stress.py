@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from gsjax import cli
 from gsjax.stress import poison, precision, run
 from gsjax.stress.scenes import changed, host_fields, usual
-from gsjax.stress.types import Case, Measured
+from gsjax.stress.types import Case, Measured, worse
 
 ROOT = Path(__file__).parents[1]
 SHORT = run.chosen(False)
@@ -99,6 +99,12 @@ FAKE = {
     "known": Case("f/known", "share", 1.0, found(3), known="why"),
     "full": Case("g/full", "share", 1.0, found(1.5), full_only=True),
 }
+
+
+def test_a_nan_is_the_worst():
+    assert np.isnan(worse(0.0, np.nan))
+    assert np.isnan(worse(np.nan, 1.0))
+    assert worse(1.0, 2.0) == worse(2.0, 1.0) == 2
 
 
 def stress(monkeypatch, names: str, *args: str) -> int:

@@ -26,7 +26,7 @@ from gsjax.stress.scenes import (
     usual,
     usual_gradients,
 )
-from gsjax.stress.types import Case, Measured
+from gsjax.stress.types import Case, Measured, worse
 
 _TILES = (SIZE // COMPAT.tile_size) ** 2
 _render = jax.jit(render, static_argnames="config")
@@ -63,7 +63,7 @@ def opaque(full: bool) -> Measured:
             alpha.flat[rng.choice(alpha.size, count, replace=False)] = 1
             found = np.asarray(_slopes_of_transmittance(alpha, weigh)).ravel()
             wanted = _slopes_of_products(double(alpha).ravel(), weigh.ravel())
-            worst = max(worst, float(np.max(np.abs(found - wanted))) / usually)
+            worst = worse(worst, float(np.max(np.abs(found - wanted))) / usually)
             alpha[alpha == 1] = 0.002
     return Measured(worst, f"of {np.prod(shape)}")
 
@@ -83,7 +83,7 @@ def _slopes_of_products(alpha: np.ndarray, weigh: np.ndarray) -> np.ndarray:
 def cap_tie(full: bool) -> Measured:
     """Slope of α by the opacity where α is the cap exactly: that of the cap, 0."""
     del full
-    pixel = jnp.asarray([[0.5, 0.5, 1.0]])
+    pixel = jnp.asarray([[0.5], [0.5], [1.0]])  # x, y and 1
 
     def alpha(opacity):
         names = ("inv_sx", "inv_sy", "slope", "x", "y")
@@ -179,7 +179,7 @@ def sizes(full: bool) -> Measured:
             wanted = on_host(jax.jit(slow)(*given))
         error = np.abs(found - wanted["alpha"])
         clear = (wanted["margin"] > BAND) & (wanted["alpha"] > 0)
-        worst = max(
+        worst = worse(
             worst, float(error[clear].max(initial=0)) if clear.any() else np.nan
         )
     return Measured(worst, ", ".join(f"{w} × {h}" for w, h in _SIZES))

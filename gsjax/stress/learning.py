@@ -25,7 +25,7 @@ from gsjax.stress.scenes import (
     usual,
     usual_gradients,
 )
-from gsjax.stress.types import Case, Measured
+from gsjax.stress.types import Case, Measured, worse
 
 
 def similarity(full: bool) -> Measured:
@@ -37,7 +37,7 @@ def similarity(full: bool) -> Measured:
         flat = [np.full((height, width, 3), v) for v in (0, 1e-3, 0.1, 0.5, 0.999, 1)]
         for image in single([*flat, drawn, 1 - 1e-3 * drawn]):
             count += 1
-            worst = max(worst, abs(1 - float(score(image, image))))
+            worst = worse(worst, abs(1 - float(score(image, image))))
     return Measured(worst, f"{count} pictures")
 
 

@@ -33,7 +33,7 @@ from gsjax.stress.scenes import (
     usual_gradients,
     weights,
 )
-from gsjax.stress.types import Case, Measured
+from gsjax.stress.types import Case, Measured, worse
 
 LENGTHS = (10, 100, 1_000, 10_000)
 # Of the catalogue: a splat whose α would be below this everywhere may be left out.
@@ -79,7 +79,7 @@ def alpha_error(length: float, far: float = 1_000):
             scene, camera = needles(length, seed, far), level_camera()
             found = np.asarray(each_alpha(scene, camera)[0], np.float64)
             wanted = each_alpha_oracle(scene, camera)
-            worst = max(worst, float(np.max(np.abs(found - wanted))))
+            worst = worse(worst, float(np.max(np.abs(found - wanted))))
             seen += int(np.sum(wanted.max((1, 2)) > VISIBLE))
         return Measured(worst if seen else np.nan, f"{seen} needles in view")
 
@@ -138,7 +138,7 @@ def antialias_ratio(full: bool) -> Measured:
         found = np.asarray(projected(needles(1_000, seed), level_camera())[1])
         ratio = projected_oracle(needles(1_000, seed), level_camera())[3]
         wanted = np.sqrt(np.maximum(ratio, 0.005**2))
-        worst = max(worst, float(np.max(np.abs(found / wanted - 1))))
+        worst = worse(worst, float(np.max(np.abs(found / wanted - 1))))
     return Measured(worst, f"{SLOTS * (8 if full else 1)} needles")
 
 
@@ -153,7 +153,7 @@ def projection_error(full: bool) -> Measured:
         camera = camera_of(viewmat, focal=float(rng.uniform(20, 60)))
         found = np.asarray(projected(scene, camera)[0], np.float64)
         wanted = projected_oracle(scene, camera)[0]
-        worst = max(worst, float(np.max(np.abs(found - wanted))))
+        worst = worse(worst, float(np.max(np.abs(found - wanted))))
     return Measured(worst, f"{SLOTS * (64 if full else 8)} Gaussians")
 
 

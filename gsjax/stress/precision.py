@@ -32,7 +32,7 @@ from gsjax.stress.scenes import (
     usual_gradients,
     weights,
 )
-from gsjax.stress.types import Case, Measured
+from gsjax.stress.types import Case, Measured, worse
 
 SHORT, FULL = 50, 1000
 DIRECTIONS = 32
@@ -74,7 +74,7 @@ def scene_errors(seed: int) -> tuple[float, float, float]:
     for field in FIELDS:
         a, b = getattr(found.params, field), getattr(wanted.params, field)
         norm = np.linalg.norm(b)
-        worst = max(worst, float(np.linalg.norm(a - b) / norm) if norm > 0 else 0.0)
+        worst = worse(worst, float(np.linalg.norm(a - b) / norm) if norm > 0 else 0.0)
     return float(image), worst, float(clear.mean())
 
 
@@ -140,7 +140,7 @@ def far_world(offset: float):
                 ("plain", scene, before),
             ):
                 error = float(np.max(np.abs(shown(seen, view) - wanted)))
-                errors[name] = max(errors[name], error)
+                errors[name] = worse(errors[name], error)
         return Measured(errors["rebased"], f"{errors['plain']:.2g} px without rebasing")
 
     return measure
@@ -197,7 +197,7 @@ def off_axis(full: bool) -> Measured:
             slopes, differences = _slopes_and_differences(*given, directions)
             errors = np.abs(np.asarray(slopes) - np.asarray(differences))
             size = np.sqrt(np.mean(np.square(np.asarray(differences))))
-        worst = max(worst, float(errors.max() / size))
+        worst = worse(worst, float(errors.max() / size))
     return Measured(worst, f"{DIRECTIONS} directions")
 
 

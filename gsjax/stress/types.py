@@ -64,6 +64,11 @@ class Result(NamedTuple):
     more: dict[str, Any] | None
 
 
+def worse(a: float, b: float) -> float:
+    """The larger of two errors; a NaN is the worst of all, which `max` may forget."""
+    return b if b > a or b != b else a
+
+
 def run_case(case: Case, full: bool) -> Result:
     """Measure; an exception is a case outside its bound, not the end of the others."""
     start, error = time.perf_counter(), ""
