@@ -26,6 +26,7 @@ from gsjax.commands.export import ExportCommand
 from gsjax.commands.info import InfoCommand
 from gsjax.commands.render import RenderCommand
 from gsjax.commands.sfm import SfmCommand
+from gsjax.commands.stress import StressCommand
 from gsjax.commands.train import TrainCommand
 from gsjax.commands.view import ViewCommand
 from gsjax.console import one_line, warnings_as_lines
@@ -41,6 +42,7 @@ _COMMANDS = (
     | Annotated[ExportCommand, subcommand("export")]
     | Annotated[InfoCommand, subcommand("info")]
     | Annotated[DoctorCommand, subcommand("doctor")]
+    | Annotated[StressCommand, subcommand("stress")]
 )
 
 

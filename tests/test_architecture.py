@@ -79,10 +79,11 @@ def test_no_circles():
 
 def test_the_rasteriser_has_one_door():
     doors = {"gsjax.raster." + name for name in ("render", "types", "reference")}
+    inside = ("gsjax.raster", "gsjax.stress")  # the latter examines every stage
     outside = {
         b
         for a, b in imports()
-        if b.startswith("gsjax.raster.") and not a.startswith("gsjax.raster")
+        if b.startswith("gsjax.raster.") and not a.startswith(inside)
     }
     assert outside
     assert outside <= doors

@@ -21,6 +21,11 @@ from gsjax.raster.ladder import on_ladder
 from gsjax.raster.sorting import argsort_float
 from gsjax.raster.types import Array, Projected, RasterConfig
 
+# What keeps squares of squares within float32, far beyond what any image shows.
+_LONGEST = 1e9  # px, σ along an axis: a longer one is drawn as long as this
+_COLOR_LIMIT = 1e32  # a coefficient or feature from there on counts as infinite
+_LENS_RANGE = (1e-15, 1e15)  # px, focal lengths; the principal point lies within
+
 
 def transform_point(viewmat: Array, point):
     """Camera coordinates of world ``point``, as components; viewmat is [4, 4]."""
@@ -43,6 +48,15 @@ def ewa_jacobian(camera: Camera, point):
         for j in range(3)
     ]
     return tuple(zip(*columns))
+
+
+def usable(camera: Camera) -> Array:
+    """Whether a camera can draw at all; under jit a bad one cannot be refused."""
+    low, high = _LENS_RANGE
+    focal = jnp.abs(jnp.stack([camera.K[0, 0], camera.K[1, 1]]))
+    centre = jnp.abs(jnp.stack([camera.K[0, 2], camera.K[1, 2]]))
+    good = jnp.all(jnp.isfinite(camera.viewmat[:3]))
+    return good & jnp.all((focal > low) & (focal < high) & (centre < high))
 
 
 def in_depth_range(camera: Camera, z: Array) -> Array:
@@ -68,6 +82,7 @@ def depth_order(
     logits = params.logit_opacities
     x, y, z = transform_point(camera.viewmat, means)
     live = gaussians.active & in_depth_range(camera, z) & jnp.isfinite(logits)
+    live &= usable(camera)
     for value in (*means, *log_scales):
         live &= jnp.isfinite(value)
     point = (jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1))
@@ -79,10 +94,12 @@ def depth_order(
         (u, v), ewa_jacobian(camera, point), (camera.width, camera.height)
     ):
         gain = sum(j * j for j in row)
-        extent = jnp.sqrt(reach * (largest * largest * gain + config.dilation))
+        square = largest * largest * gain
+        extent = jnp.sqrt(reach * (square + config.dilation))
         extent = extent * 1.001 + 0.01  # room for rounding
-        # Phrased so that an overflow to inf keeps the Gaussian for `project`.
-        live &= ~(centre + extent < 0.5) & ~(centre - extent > size - 0.5)
+        # Phrased so that neither an overflow nor a NaN gets through.
+        live &= (square < jnp.inf) & (jnp.abs(centre) < jnp.inf)
+        live &= (centre + extent >= 0.5) & (centre - extent <= size - 0.5)
     live &= reach > 0
     return _compact_and_sort(live, z, config)
 
@@ -199,7 +216,7 @@ def _project_components(
     """
     live = lax.iota(jnp.int32, rows.logit_opacities.shape[0]) < count
     for value in rows.colors:
-        live &= jnp.isfinite(value)
+        live &= jnp.abs(value) < _COLOR_LIMIT
     unit, good = safe_normalize(
         tuple(jnp.where(live, q, 1) for q in rows.quats), (1.0, 0.0, 0.0, 0.0)
     )
@@ -212,6 +229,7 @@ def _project_components(
     u, v = camera.model.project_point(camera.K, (x, y, z))
     if rows.shift is not None:
         u, v = u + rows.shift[0], v + rows.shift[1]
+    live &= (jnp.abs(u) < jnp.inf) & (jnp.abs(v) < jnp.inf)
 
     m1, m2 = _half_covariance(camera, (x, y, z), unit, scales)
     a, b, c, det, det_sharp = _dilate(m1, m2, config.dilation)
@@ -249,7 +267,11 @@ def _project_components(
 
 
 def _half_covariance(camera: Camera, point, unit, scales):
-    """Rows m1, m2 of J W R S, as components: the 2D covariance is M Mᵀ."""
+    """Rows m1, m2 of J W R S, as components: the 2D covariance is M Mᵀ.
+
+    Columns longer than `_LONGEST` are cut to it: their products would overflow, and
+    the Gaussian vanish, though all that can be seen of it is that it is flat.
+    """
     rotation = rotations.rotation_rows(*unit)
     halves = []
     for jacobian_row in ewa_jacobian(camera, point):
@@ -263,7 +285,12 @@ def _half_covariance(camera: Camera, point, unit, scales):
                 for j in range(3)
             )
         )
-    return halves
+    shrinks = []
+    for p, q in zip(*halves):
+        length = lax.stop_gradient(jnp.maximum(jnp.abs(p), jnp.abs(q)))
+        long = length > _LONGEST
+        shrinks.append(jnp.where(long, _LONGEST / jnp.where(long, length, 1), 1))
+    return [tuple(m * k for m, k in zip(half, shrinks)) for half in halves]
 
 
 def _dilate(m1, m2, dilation: float):

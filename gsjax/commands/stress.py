@@ -1,0 +1,50 @@
+"""`gsjax stress`: is what is computed here numerically sound?"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsjax.commands.common import Command, start_jax
+from gsjax.console import note, say
+
+
+@dataclass(kw_only=True)
+class StressCommand(Command):
+    """Measure numerical stability: one line a case, exit code 1 if one is outside its
+    bound."""
+
+    full: bool = False
+    """Over more scenes and values, and all cases: minutes in place of one."""
+    only: str = ""
+    """Only the cases whose name has this in it."""
+    json: Path | None = None
+    """Write the results to this file."""
+    markdown: Path | None = None
+    """Put the table into this file, between <!-- gsjax stress --> and
+    <!-- /gsjax stress -->."""
+    overwrite: bool = False
+    """Replace a --json file that exists."""
+
+    def run(self) -> int:
+        start_jax()
+        from gsjax.errors import InputError
+        from gsjax.stress import run as stress
+
+        if self.json is not None:
+            stress.check_free(self.json, self.overwrite)
+        cases = [c for c in stress.chosen(self.full) if self.only in c.name]
+        if not cases:
+            names = ", ".join(c.name for c in stress.chosen(self.full))
+            raise InputError(f"--only {self.only!r}: no case; there are {names}")
+        results = []
+        for result in stress.run_cases(tuple(cases), self.full):
+            results.append(result)
+            say(stress.line(result))
+        say(stress.summary(results))
+        told = stress.as_json(results, self.full)
+        if self.json is not None:
+            stress.write_json(self.json, told, self.overwrite)
+            note(f"{self.json} written")
+        if self.markdown is not None:
+            stress.put_between_marks(self.markdown, stress.markdown(told))
+            note(f"{self.markdown} written")
+        return 0 if all(result.good for result in results) else 1

@@ -1,0 +1,1 @@
+"""Numerical stability as a scoreboard: cases with bounds, measured on this machine."""

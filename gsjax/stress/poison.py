@@ -1,0 +1,183 @@
+"""Poison in every number of the parameters, the camera and the background.
+
+The law: images and gradients stay finite; what is not a number vanishes; and what is
+not seen leaves no trace, so that images and the gradients by each Gaussian are those,
+bit for bit, of the scene in which it does not exist.
+"""
+
+from collections.abc import Iterator
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.cameras import Camera
+from gsjax.gaussians import Gaussians
+from gsjax.stress.scenes import (
+    BACKGROUND,
+    FIELDS,
+    SLOTS,
+    camera_of,
+    changed,
+    host_fields,
+    not_finite,
+    unequal,
+    usual,
+    usual_gradients,
+)
+from gsjax.stress.types import Case, Measured
+
+_F32 = np.finfo(np.float32)
+VALUES = (
+    *(np.nan, -np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0, -1.0),
+    *(1e-45, -1e-45, 1e-40, float(_F32.tiny), 1e-30, -1e-30, 1e-23, 1e-10),
+    *(17.0, 88.8, -88.8, 2.0**24, 2.0**31, -(2.0**31), 1e10, -1e10),
+    *(1e19, 1e20, -1e20, 1e30, -1e30, float(_F32.max), -float(_F32.max)),
+)
+
+
+@cache
+def entries() -> tuple[tuple[str, tuple[int, ...]], ...]:
+    """Every single number of a Gaussian: (field, index)."""
+    fields = host_fields(usual())
+    return tuple((f, i) for f in FIELDS for i in np.ndindex(fields[f].shape[1:]))
+
+
+def poisoned(value: float, shift: int) -> tuple[Gaussians, dict[int, str]]:
+    """The usual scene, one slot spoilt in each number: which slot in which.
+
+    Over all `SLOTS` shifts every number of every slot has its turn.
+    """
+    fields, slots = host_fields(usual()), {}
+    for place, (field, index) in enumerate(entries()):
+        slot = (2 * place + shift) % SLOTS
+        fields[field][slot, *index] = value
+        slots[slot] = f"{field}{list(index)}"
+    return changed(usual(), **fields), slots
+
+
+def traces(scene: Gaussians, spoilt: list[int], value: float) -> dict[str, list[int]]:
+    """What is wrong with a scene of which ``spoilt`` slots hold ``value``.
+
+    Returns:
+      "not finite": how many numbers; "seen": spoilt slots that show although their
+      value is no finite number; "traces": how many numbers differ from those of the
+      scene without what is not seen.
+    """
+    out, slopes = usual_gradients(scene)
+    images = (out.rgb, out.alpha, out.depth, out.radii)
+    unseen = out.radii == 0
+    clean = jax.tree.map(
+        lambda bad, good: jnp.where(
+            unseen.reshape(-1, *(1,) * (bad.ndim - 1)), good, bad
+        ),
+        scene.params,
+        usual().params,
+    )
+    without = scene.replace(params=clean, active=scene.active & ~unseen)  # pyright: ignore
+    wanted, wanted_slopes = usual_gradients(without)
+    difference = unequal(images[:3], (wanted.rgb, wanted.alpha, wanted.depth))
+    difference += unequal(slopes.params, wanted_slopes.params)
+    return {
+        "not finite": [not_finite(images), not_finite(slopes)],
+        "seen": [s for s in spoilt if not np.isfinite(value) and not unseen[s]],
+        "traces": [difference, int((~unseen).sum())],
+    }
+
+
+def _sweep(full: bool) -> Iterator[tuple[float, int, dict, dict]]:
+    for value in VALUES:
+        for shift in range(SLOTS) if full else (0,):
+            scene, slots = poisoned(value, shift)
+            yield value, shift, slots, traces(scene, list(slots), value)
+
+
+@cache
+def _found(full: bool) -> tuple[dict[str, int], list[str]]:
+    """Counts over the sweep, and some words on what was wrong."""
+    totals, words = {"not finite": 0, "seen": 0, "traces": 0}, []
+    for value, shift, slots, wrong in _sweep(full):
+        totals["not finite"] += sum(wrong["not finite"])
+        totals["seen"] += len(wrong["seen"])
+        totals["traces"] += wrong["traces"][0]
+        if wrong["traces"][1] < SLOTS // 4:
+            words.append(f"{value:g} at {shift}: hardly anything was in view")
+            totals["traces"] += 1
+        if sum(wrong["not finite"]):
+            words.append(f"{value:g} at shift {shift}: not finite")
+        words += [f"{value:g} in {slots[s]} seen" for s in wrong["seen"]]
+    return totals, words
+
+
+def of_parameters(kind: str):
+    """Measures one of the counts of `traces` over all values, numbers and slots."""
+
+    def measure(full: bool) -> Measured:
+        totals, words = _found(full)
+        where = f"{len(VALUES)} values × {len(entries())} numbers"
+        where += f" × {SLOTS} slots" if full else ""
+        return Measured(totals[kind], "; ".join([where, *words[:2]]), {"wrong": words})
+
+    return measure
+
+
+def spoilt_cameras() -> Iterator[tuple[str, float, Camera]]:
+    """Cameras as they can arise under jit, where nothing can be refused."""
+    camera = camera_of()
+    for name in ("viewmat", "K", "near", "far"):
+        array = np.asarray(getattr(camera, name))
+        for index in np.ndindex(array.shape):
+            for value in VALUES:
+                bad = array.copy()
+                bad[index] = value
+                fields = {**vars(camera), name: jnp.asarray(bad)}
+                yield f"{name}{list(index)}", value, Camera(**fields)
+
+
+def of_cameras(full: bool) -> Measured:
+    """Numbers that are not finite, in images and gradients, over spoilt cameras."""
+    del full
+    count, words, renders = 0, [], 0
+    for name, value, camera in spoilt_cameras():
+        renders += 1
+        out, slopes = usual_gradients(usual(), camera)
+        wrong = not_finite((out.rgb, out.alpha, out.depth, out.radii, slopes))
+        count += wrong
+        if wrong:
+            words.append(f"{value:g} in {name}")
+    return Measured(
+        count, "; ".join([f"{renders} cameras", *words[:2]]), {"wrong": words}
+    )
+
+
+def of_backgrounds(full: bool) -> Measured:
+    """Numbers that are not finite, in images and gradients, over backgrounds."""
+    del full
+    count, words = 0, []
+    for index in range(3):
+        for value in VALUES:
+            background = BACKGROUND.copy()
+            background[index] = value
+            out, slopes = usual_gradients(usual(), background=background)
+            wrong = not_finite((out.rgb, out.alpha, out.depth, slopes))
+            count += wrong
+            if wrong:
+                words.append(f"{value:g} in background[{index}]")
+    what = f"{len(VALUES)} values × 3"
+    return Measured(count, "; ".join([what, *words[:2]]), {"wrong": words})
+
+
+CASES = (
+    Case("poison/not finite", "images and gradients", 0, of_parameters("not finite")),
+    Case("poison/seen", "Gaussians of NaN or inf seen", 0, of_parameters("seen")),
+    Case("poison/traces", "live numbers changed", 0, of_parameters("traces")),
+    Case("poison/camera", "images and gradients not finite", 0, of_cameras),
+    Case(
+        "poison/background",
+        "images and gradients not finite",
+        0,
+        of_backgrounds,
+        known="a background of NaN shows wherever the scene is not opaque",
+    ),
+)

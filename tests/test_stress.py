@@ -1,0 +1,179 @@
+"""The short form of `gsjax stress`, a test a case, and fuzzing on top of it."""
+
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from conftest import on_cpu
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsjax import cli
+from gsjax.stress import poison, precision, run
+from gsjax.stress.scenes import changed, host_fields, usual
+from gsjax.stress.types import Case, Measured, worse
+
+ROOT = Path(__file__).parents[1]
+SHORT = run.chosen(False)
+# Of the thousand scenes of the full form, those of the largest errors of image and
+# gradient: benchmarks/results/stress.json.
+WORST = (94, 976)
+
+
+@pytest.fixture(scope="module")
+def results():
+    return {result.name: result for result in run.run_cases(SHORT, False)}
+
+
+@on_cpu
+@pytest.mark.long
+@pytest.mark.parametrize("name", [case.name for case in SHORT])
+def test_within_its_bound(results, name, report):
+    result = results[name]
+    report(name, result.measured, result.bound or 1)
+    assert result.good, run.line(result)
+
+
+def test_what_is_left_out_has_a_reason():
+    names = [case.name for case in run.CASES]
+    assert len(set(names)) == len(names) > 40
+    left_out = set(run.chosen(True)) - set(SHORT)
+    assert left_out
+    assert all(case.known or case.full_only for case in left_out)
+    assert len(poison.VALUES) >= 22
+    assert len(poison.entries()) == 59
+
+
+@on_cpu
+@settings(max_examples=40, deadline=None, derandomize=True, database=None)
+@given(
+    value=st.floats(width=32),
+    entry=st.integers(0, 58),
+    slots=st.sets(st.integers(0, 127), min_size=1, max_size=40),
+)
+def test_any_value_anywhere(value, entry, slots):
+    """Nothing that is not finite, and no trace of what is not seen."""
+    field, index = poison.entries()[entry]
+    spoilt = sorted(slots)
+    with jax.enable_x64(False):
+        fields = host_fields(usual())
+        fields[field][spoilt, *index] = value
+        wrong = poison.traces(changed(usual(), **fields), spoilt, value)
+    assert wrong["not finite"] == [0, 0]
+    assert wrong["seen"] == []
+    changes, seen = wrong["traces"]
+    assert changes == 0
+    assert seen > 80
+
+
+@on_cpu
+@pytest.mark.parametrize("seed", WORST)
+def test_the_worst_of_a_thousand_scenes(seed, report):
+    with jax.enable_x64(False):
+        image, gradient, clear = precision.scene_errors(seed)
+    assert clear > 0.5
+    for what, error, bar in (("image", image, 1e-4), ("gradient", gradient, 1e-3)):
+        report(f"scene {seed}, {what}", error, bar)
+        assert 0 < error <= bar
+
+
+# --- the command ---
+
+
+def found(value: float, note: str = ""):
+    return lambda full: Measured(value / (1 + full), note)
+
+
+def raising(full: bool) -> Measured:
+    raise ValueError(f"nothing to measure\nin full: {full}")
+
+
+FAKE = {
+    "well": Case("a/well", "share", 1.0, found(0.25, "of 4")),
+    "none": Case("b/none", "count", 0, found(0), "px"),
+    "over": Case("c/over", "share", 1.0, found(1.5)),
+    "nan": Case("d/nan", "share", 1.0, found(np.nan)),
+    "raises": Case("e/raises", "share", 1.0, raising),
+    "known": Case("f/known", "share", 1.0, found(3), known="why"),
+    "full": Case("g/full", "share", 1.0, found(1.5), full_only=True),
+}
+
+
+def test_a_nan_is_the_worst():
+    assert np.isnan(worse(0.0, np.nan))
+    assert np.isnan(worse(np.nan, 1.0))
+    assert worse(1.0, 2.0) == worse(2.0, 1.0) == 2
+
+
+def stress(monkeypatch, names: str, *args: str) -> int:
+    cases = tuple(FAKE[name] for name in names.split())
+    monkeypatch.setattr(run, "CASES", cases)
+    return cli.main(["stress", *args])
+
+
+def test_exit_codes(monkeypatch, capsys):
+    assert stress(monkeypatch, "well none known full") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in lines[:2]] == [
+        ["ok", "a/well"],
+        ["ok", "b/none"],
+    ]
+    assert "4 ×" in lines[0]
+    assert "exact" in lines[1]
+    assert lines[2].startswith("2 of 2 cases within their bounds")
+    for name in ("over", "nan", "raises"):
+        assert stress(monkeypatch, f"well {name}") == 1
+        line = capsys.readouterr().out.splitlines()[1]
+        assert line.startswith(f"RED {FAKE[name].name}")
+    assert "ValueError: nothing to measure" in line
+    assert stress(monkeypatch, "well full known", "--full") == 1
+    assert len(capsys.readouterr().out.splitlines()) == 4
+    assert stress(monkeypatch, "well over", "--only", "a/") == 0
+    assert stress(monkeypatch, "well over", "--only", "z") == 3
+    assert "there are a/well, c/over" in capsys.readouterr().err
+
+
+def test_json_and_markdown(monkeypatch, tmp_path, capsys):
+    path, page = tmp_path / "new" / "found.json", tmp_path / "page.md"
+    page.write_text(
+        "# before\n<!-- gsjax stress -->\nold\n<!-- /gsjax stress -->\nafter\n"
+    )
+    args = ("--json", str(path), "--markdown", str(page))
+    assert stress(monkeypatch, "well none nan raises", *args) == 1
+    told = json.loads(path.read_text())
+    assert told["form"] == "short"
+    assert told["machine"]["jax"] == jax.__version__
+    rows = {row["name"]: row for row in told["rows"]}
+    assert rows["a/well"]["margin"] == 4
+    assert rows["a/well"]["good"] is True
+    assert rows["d/nan"]["measured"] is None
+    assert rows["e/raises"]["error"].startswith("ValueError")
+    text = page.read_text()
+    assert text.startswith("# before\n<!-- gsjax stress -->\n| case |")
+    assert text.endswith("\n<!-- /gsjax stress -->\nafter\n")
+    assert "old" not in text
+    assert "| a/well | share | 0.25 | 1 | 4 × |" in text
+    assert "| b/none | count | 0 px | 0 px | exact |" in text
+    assert "nan **(outside)**" in text
+    capsys.readouterr()
+    assert stress(monkeypatch, "well", *args) == 3
+    assert "exists; --overwrite replaces it" in capsys.readouterr().err
+    page.write_text("no marks")
+    assert stress(monkeypatch, "well", "--markdown", str(page)) == 3
+    assert "no place for the table" in capsys.readouterr().err
+
+
+def test_the_table_of_the_readme_is_that_of_the_results():
+    told = json.loads((ROOT / "benchmarks/results/stress.json").read_text())
+    assert told["form"] == "full"
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    table = readme.split("<!-- gsjax stress -->\n")[1]
+    assert table.split("\n<!-- /gsjax stress -->")[0] == run.markdown(told)
+    rows = {row["name"]: row for row in told["rows"]}
+    assert set(rows) == {case.name for case in run.CASES}
+    worst = [rows[f"scenes/{n}"]["more"]["worst seed"] for n in ("image", "gradient")]
+    assert tuple(worst) == WORST
+    for case in run.CASES:
+        assert rows[case.name]["good"] or case.known, case.name
