@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsjax import images
+from gsjax import files, images
 from gsjax.curves import axes, draw_line, legend, short_number
 from gsjax.gaussians import Gaussians
 
@@ -27,7 +27,7 @@ def histograms_png(path: Path, gaussians: Gaussians, *, title: str = "") -> None
       InputError: if the file cannot be written.
       MissingExtraError: if OpenCV is absent.
     """
-    images.write_file(path, images.encode_png(histograms(gaussians, title=title)))
+    files.write_file(path, images.encode_png(histograms(gaussians, title=title)))
 
 
 def histograms(gaussians: Gaussians, *, title: str = "") -> np.ndarray:

@@ -4,6 +4,7 @@ In float32, as users have it. Runs share their programs through JAX's cache on d
 for each call of `fit` compiles its own.
 """
 
+import time
 from dataclasses import replace
 
 import jax
@@ -43,12 +44,14 @@ from gsjax.train.fit import (
 from gsjax.train.step import init_state
 
 STEPS, FINER = 60, 30
+_PAUSE = 2.0  # s
 CONFIG = TrainConfig(
     steps=STEPS,
     levels=(Level(0.0, 2), Level(0.5, 1)),
     sh_degree=1,
     sh_every=10,
     every_checkpoint=7,
+    every_eval=25,
     adaptive=AdaptiveSettings(
         start=0,
         stop=50,
@@ -92,11 +95,17 @@ class Log:
     """What a run told, and what it was asked to do."""
 
     def __init__(self, stop_at=None, folder=None):
-        self.records, self.phases, self.saved = [], [], []
+        self.records, self.phases, self.saved, self.measured = [], [], [], []
         self.stop_at, self.folder = stop_at, folder
 
     def hooks(self):
-        return Hooks(self.step, self.phases.append, self.checkpoint, self.stop)
+        return Hooks(
+            step=self.step,
+            phase=self.phases.append,
+            checkpoint=self.checkpoint,
+            measure=self.measure,
+            stop=self.stop,
+        )
 
     def step(self, progress):
         self.records.append(progress.record())
@@ -109,6 +118,11 @@ class Log:
         self.saved.append(int(state.step))
         if self.folder:
             save_checkpoint(self.folder, state, {"pair_capacity": pair_capacity})
+
+    def measure(self, state, progress):
+        assert progress.metrics.step == state.step
+        self.measured.append(int(state.step))
+        time.sleep(_PAUSE)
 
     def told(self, *names):
         return [tuple(record[name] for name in names) for record in self.records]
@@ -138,6 +152,10 @@ def test_it_learns(whole, strategy):
     assert POINTS < counts[-1] <= 200
     assert all(r["finite"] and not r["overflowed"] for r in log.records)
     assert log.saved == list(range(7, STEPS, 7))
+    # Measuring is no training: at its steps, and its time does not count.
+    assert log.measured == [25, 50]
+    gone = np.diff(np.asarray(log.told("seconds"))[:, 0])
+    assert gone[[24, 49]].max() < _PAUSE
     divisors = np.asarray(log.told("divisor"))[:, 0]
     finer = len(CONFIGS[strategy].levels) > 1
     wanted = np.where(finer & (np.arange(STEPS) >= FINER), 1, 2)

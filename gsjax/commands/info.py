@@ -25,12 +25,12 @@ class InfoCommand(Command):
     """Replace a plot that exists."""
 
     def run(self) -> int:
-        from gsjax import images
+        from gsjax import files
 
         if self.plot is not None:
             if self.plot.suffix.lower() != ".png":
                 raise UsageError(f"--plot {self.plot}: a name in .png is wanted")
-            images.refuse_existing([self.plot], self.overwrite)
+            files.refuse_existing([self.plot], self.overwrite)
         start_jax()
         from gsjax.histograms import histograms_png
         from gsjax.info import describe, info_text
@@ -54,7 +54,7 @@ class InfoCommand(Command):
             told |= facts
             texts.append(info_text(str(splat), facts))
             if self.plot is not None:
-                images.make_folder(self.plot.parent)
+                files.make_folder(self.plot.parent)
                 histograms_png(self.plot, gaussians, title=splat.name)
                 told["plot"] = str(self.plot)
                 texts.append(str(self.plot))

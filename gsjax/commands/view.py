@@ -47,14 +47,14 @@ class ViewCommand(Command):
             raise UsageError("--max-gaussians from 1")
         if not 1 <= self.port < 2**16:
             raise UsageError(f"--port {self.port}: from 1 to 65535 is wanted")
-        from gsjax import images
+        from gsjax import files
         from gsjax.viewer.stage import require_viser
 
         require_viser()
         if self.html is not None:
             if self.html.suffix.lower() not in (".html", ".htm"):
                 raise UsageError(f"--html {self.html}: a name in .html is wanted")
-            images.refuse_existing([self.html], self.overwrite)
+            files.refuse_existing([self.html], self.overwrite)
         start_jax()
         from gsjax.viewer.opening import open_exhibit
 

@@ -48,7 +48,7 @@ def _parts(values: Array) -> list[Array]:
     """[G, 1, P] for each k. By `lax.split`, whose transpose is one concatenation; that
     of K slices would be a sum of K padded arrays.
     """
-    return lax.split(values, [1] * values.shape[1], axis=1)
+    return list(lax.split(values, [1] * values.shape[1], axis=1))
 
 
 @jax.custom_jvp
@@ -234,8 +234,8 @@ def composite(
     if "median_depth" in config.outputs:
         fresh["median"] = jnp.zeros((group, count), dtype)
 
-    # In the branch as well: what the backward pass recomputes there is compiled together
-    # with what uses it, and nothing but the inputs crosses the `cond`.
+    # In the branch as well: what the backward pass recomputes there is compiled
+    # together with what uses it, and nothing but the inputs crosses the `cond`.
     blend = jax.checkpoint(partial(_composite_chunk, pixels=pixels, config=config))
 
     def skip(carried, _):

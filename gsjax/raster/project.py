@@ -23,7 +23,7 @@ from gsjax.raster.types import Array, Projected, RasterConfig
 
 # What keeps squares of squares within float32, far beyond what any image shows.
 _LONGEST = 1e9  # px, σ along an axis: a longer one is drawn as long as this
-_COLOR_LIMIT = 1e32  # a coefficient or feature from there on counts as infinite
+COLOR_LIMIT = 1e32  # a coefficient or feature from there on counts as infinite
 _LENS_RANGE = (1e-15, 1e15)  # px, focal lengths; the principal point lies within
 
 
@@ -216,7 +216,7 @@ def _project_components(
     """
     live = lax.iota(jnp.int32, rows.logit_opacities.shape[0]) < count
     for value in rows.colors:
-        live &= jnp.abs(value) < _COLOR_LIMIT
+        live &= jnp.abs(value) < COLOR_LIMIT
     unit, good = safe_normalize(
         tuple(jnp.where(live, q, 1) for q in rows.quats), (1.0, 0.0, 0.0, 0.0)
     )

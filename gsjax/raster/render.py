@@ -14,7 +14,7 @@ from gsjax.cameras import Camera
 from gsjax.errors import CapacityError, InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.numerics import safe_divide
-from gsjax.raster.project import depth_order, project, radii_of
+from gsjax.raster.project import COLOR_LIMIT, depth_order, project, radii_of
 from gsjax.raster.rasterise import rasterise
 from gsjax.raster.types import Array, Demand, Projected, RasterConfig, Render
 
@@ -41,7 +41,7 @@ def render(
       gaussians: N slots.
       camera: one camera, or a batch B (one call, one image each).
       config: static settings.
-      background: [C] or [B, C]; default black.
+      background: [C] or [B, C]; default black, as is a component that is not finite.
       features: [N, C] composited in place of the SH colour.
       probe: [N, 2], or [B, N, 2] for a batch, zeros: added to the projected means
         (px); its gradient is the screen-space statistic of densification.
@@ -156,6 +156,8 @@ def _finish(
                     f"background has shape {background.shape}; ({colors},) or "
                     f"({cameras}, {colors}) is wanted"
                 )
+            # What is not finite would show through wherever the scene is not opaque.
+            background = jnp.where(jnp.abs(background) < COLOR_LIMIT, background, 0)
             background = jnp.broadcast_to(background, (cameras, colors))
             rgb = rgb + (1 - alpha)[..., None] * background[:, None, None]
         out["rgb"] = rgb

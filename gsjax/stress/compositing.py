@@ -83,7 +83,7 @@ def _slopes_of_products(alpha: np.ndarray, weigh: np.ndarray) -> np.ndarray:
 def cap_tie(full: bool) -> Measured:
     """Slope of α by the opacity where α is the cap exactly: that of the cap, 0."""
     del full
-    pixel = jnp.asarray([[0.5], [0.5], [1.0]])  # x, y and 1
+    pixel = np.asarray([[0.5], [0.5], [1.0]], np.float32)  # x, y and 1
 
     def alpha(opacity):
         names = ("inv_sx", "inv_sy", "slope", "x", "y")

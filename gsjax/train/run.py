@@ -257,7 +257,13 @@ def _hooks(sitting: _Sitting) -> Iterator[Hooks]:
 
     try:
         with stopping_on_ctrl_c() as stopped:
-            yield Hooks(step, reporter.phase, checkpoint, measure, stopped)
+            yield Hooks(
+                step=step,
+                phase=reporter.phase,
+                checkpoint=checkpoint,
+                measure=measure,
+                stop=stopped,
+            )
     finally:
         reporter.close()
         log.close()

@@ -4,7 +4,7 @@ import html
 from pathlib import Path
 from typing import NamedTuple
 
-from gsjax import images
+from gsjax import files
 from gsjax.errors import InputError
 from gsjax.gaussians import num_active
 from gsjax.viewer.session import Exhibit
@@ -72,6 +72,6 @@ def write_page(exhibit: Exhibit, path: Path, *, title: str) -> Page:
     head, tail = text.rsplit("</body>", 1)
     head = head.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>")
     data = f"{head}{_CAPTION.format(caption)}</body>{tail}".encode()
-    images.make_folder(path.parent)
-    images.write_file(path, data)
+    files.make_folder(path.parent)
+    files.write_file(path, data)
     return Page(drawn, found, len(data))
