@@ -17,6 +17,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
+from gsjax.commands.bench import BenchCommand
 from gsjax.commands.common import UsageError
 from gsjax.commands.demo import DemoCommand
 from gsjax.commands.doctor import DoctorCommand
@@ -37,6 +38,7 @@ _COMMANDS = (
     | Annotated[RenderCommand, subcommand("render")]
     | Annotated[ExportCommand, subcommand("export")]
     | Annotated[InfoCommand, subcommand("info")]
+    | Annotated[BenchCommand, subcommand("bench")]
     | Annotated[DoctorCommand, subcommand("doctor")]
 )
 

@@ -7,6 +7,7 @@ happen to lie over one another, and a bound on that is of use in small scenes on
 """
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -17,13 +18,13 @@ from gsjax import bounds
 from gsjax.cameras import Camera
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, capacity_bucket, compact, select, with_sh_degree
-from gsjax.raster.render import DEFAULT_CONFIG, exact_config, render_exact
-from gsjax.raster.types import RasterConfig
+from gsjax.raster.render import DEFAULT_CONFIG, exact_config, render, render_exact
+from gsjax.raster.types import Demand, RasterConfig
 from gsjax.timing import time_ms
 
 _CAMERAS = 12  # to measure on, at most
 _ROUNDS = 5
-_ROOM = 1.25  # of capacities, for views that show more than those measured
+_ROOM = 1.125  # of capacities, for views that show more than those measured
 _SH_SHARE, _STOP_SHARE = 0.25, 1 / 16
 _CAP = 1 - 1e-6
 _REFERENCE_CUT, _REFERENCE_STOP = 1e-5, 1e-6
@@ -318,7 +319,7 @@ def _measured_cut(
     )
     # Finer than all trials: what it has room for is room enough for them.
     fitted = exact_config(gaussians, views[0], exact).pair_capacity or 1
-    room = capacity_bucket(int(_ROOM * fitted))
+    room = capacity_bucket(fitted)
     wanted = list(_pictures(gaussians, views, exact, background, room))
     best, error = least, 0.0
     # Coarser has failed, or would be coarser than is sensible.
@@ -380,17 +381,37 @@ def _shown(
 def _with_capacities(
     gaussians: Gaussians, views: list[Camera], config: RasterConfig
 ) -> tuple[RasterConfig, list[Reason]]:
-    """``config`` with room for the cameras and a quarter more, in whole buckets."""
-    fits = [exact_config(gaussians, view, config) for view in views]
-    pairs = max(fit.pair_capacity or 1 for fit in fits)
-    seen = max(fit.visible_capacity or 1 for fit in fits)
-    visible = min(capacity_bucket(int(_ROOM * seen)), gaussians.capacity)
-    room = capacity_bucket(int(_ROOM * pairs))
+    """``config`` with room for what the cameras ask for and an eighth more."""
+    fitted = exact_config(gaussians, views[0], config)
+    room = fitted.pair_capacity or 1
+    light = config.replace(outputs=("alpha",), rungs=1, visible_capacity=None)
+    pairs = seen = 1
+    for view in views:
+        while True:
+            demand = _demand(gaussians, view, light.replace(pair_capacity=room))
+            wanted = int(demand.capacity)
+            if wanted <= room:
+                break
+            room = capacity_bucket(wanted)
+        pairs, seen = max(pairs, wanted), max(seen, int(demand.visible))
+    visible = min(_roomy(seen), gaussians.capacity)
     reasons = [
         Reason("visible_capacity", f"{visible:,}: at most {seen:,} are in a view"),
-        Reason("pair_capacity", f"{room:,}: views ask for {pairs:,} at most"),
+        Reason("pair_capacity", f"{_roomy(pairs):,}: views ask for {pairs:,} at most"),
     ]
-    return config.replace(pair_capacity=room, visible_capacity=visible), reasons
+    config = config.replace(pair_capacity=_roomy(pairs), visible_capacity=visible)
+    return config, reasons
+
+
+@partial(jax.jit, static_argnames="config")
+def _demand(gaussians: Gaussians, camera: Camera, config: RasterConfig) -> Demand:
+    return render(gaussians, camera, config).demand
+
+
+def _roomy(count: int) -> int:
+    """An eighth more, in whole steps of about that size or less."""
+    step = max(256, 2 ** (max(count, 1).bit_length() - 4))
+    return -(-int(_ROOM * count) // step) * step
 
 
 def _tuned(

@@ -64,9 +64,9 @@ def as_fitting(monkeypatch):
     """No programs are compiled to ask for capacities."""
 
     def fit(gaussians, _, config):
-        return config.replace(visible_capacity=gaussians.capacity)
+        return config.replace(visible_capacity=gaussians.capacity), []
 
-    monkeypatch.setattr(planning, "exact_config", fit)
+    monkeypatch.setattr(planning, "_with_capacities", fit)
 
 
 @pytest.fixture(scope="module")
