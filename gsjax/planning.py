@@ -263,7 +263,9 @@ def _within(
         why = f"{cut:g}: even all the splats over one another hide no more"
         told.append(Reason("alpha_cut", why, error, "bound"))
         return config.replace(alpha_cut=cut), told, None
-    margin = 1 + 2 / np.sqrt(len(views))
+    # A heuristic: of 20 random cameras of a trained scene the worst was 1.7 times as
+    # far off as the worst of 12 others.
+    margin = 1.5 + 2 / np.sqrt(len(views))
     least = _reference_cut(gaussians, spread, budget)
     cut, measured = _measured_cut(
         gaussians, views, config, background, (budget / margin, least)
@@ -321,19 +323,24 @@ def _measured_cut(
     fitted = exact_config(gaussians, views[0], exact).pair_capacity or 1
     room = capacity_bucket(fitted)
     wanted = list(_pictures(gaussians, views, exact, background, room))
-    best, error = least, 0.0
+    best = least
+    error = float("inf")
     # Coarser has failed, or would be coarser than is sensible.
-    failed, cut = _LARGEST_CUT * 1.01, _rounded(max(allowed / 4, 2 * least))
+    failed, cut = _LARGEST_CUT * 1.01, _rounded(max(allowed / 12, 2 * least))
     for _ in range(_ROUNDS):
         trial = config.replace(alpha_cut=cut, outputs=("rgb",))
         found = _pictures(gaussians, views, trial, background, room)
         largest = max(float(np.abs(a - b).max()) for a, b in zip(found, wanted))
+        # The error is about in proportion to the cut, and so is the reference's own.
+        largest *= cut / (cut - least)
         if largest <= allowed:
             best, error = cut, largest
             if largest > 0.7 * allowed:
                 break
         else:
             failed = cut
+            if best == least:
+                error = largest * least / cut
         step = 0.9 * allowed / max(largest, allowed / 20)
         aim = min(cut * step, np.sqrt(best * failed) if failed < cut * step else 1)
         cut = _rounded(float(np.clip(aim, best, _LARGEST_CUT)))
