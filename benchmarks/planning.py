@@ -128,9 +128,10 @@ def main() -> None:
         row(case.name, case.gaussians, around(case, SEEN, rng),
             around(case, UNSEEN, rng))
     ]  # fmt: skip
+    measure.save("planning", rows, claim=__doc__)
     for folder in sys.argv[1:]:
         rows.append(row(Path(folder).name, *of_run(Path(folder), rng)))
-    measure.save("planning", rows, claim=__doc__)
+        measure.save("planning", rows, claim=__doc__)
 
 
 if __name__ == "__main__":

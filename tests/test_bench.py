@@ -166,7 +166,7 @@ def test_points_are_measured(view):
     """One compiled pair beside the exact one: times, errors, bounds, the gradient."""
     scene, camera, _ = view
     trial = Trial("small", scene, camera, tuple(BEHIND))
-    light = {"rungs": 1, "devices": 1, "outputs": ("rgb",)}
+    light = {"rungs": 1, "devices": 1, "outputs": ("rgb",), "pair_capacity": 2048}
     config = RasterConfig.compat(**light)
     (found,) = pareto(trial, [Point("compat", "", config, double=True)], repeats=1)
     assert found["inside"]

@@ -148,6 +148,8 @@ def _run(
         degree = scene.sh_degree if point.degree is None else point.degree
         config, sizes = point.config, point.config
         sizes = (sizes.alpha_cut, sizes.tile_size, sizes.chunk_size)
+        if config.pair_capacity is not None:
+            fits[sizes] = config
         if sizes not in fits:
             fits[sizes] = exact_config(scene, camera, config)
         config = config.replace(
