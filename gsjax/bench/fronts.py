@@ -107,7 +107,7 @@ def _draw_marks(plot: np.ndarray, places: np.ndarray, marks: Sequence[Mark]) -> 
         wide = text_width(mark.label, _SMALL)
         line = y + 4
         for shift in (0, 11, -11, 22, -22, 33, -33, 44, -44, 55, -55):
-            line = y + 4 + shift
+            line = y - 5 + shift
             clear = all(
                 abs(line - other) > 10 or x + 7 > right or x + 7 + wide < left
                 for left, right, other in taken
