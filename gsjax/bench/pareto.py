@@ -158,25 +158,25 @@ def _run(
         )
         dtype = scene.params.means.dtype
         behind = jnp.asarray(trial.background, dtype)
-        weights = jnp.asarray(weights, dtype)
+        weigh = jnp.asarray(weights, dtype)
 
         def picture(params):
             seen = with_sh_degree(scene.replace(params=params), degree)  # pyright: ignore
             return render(seen, camera, config, behind).rgb
 
-        def loss(params, weights):
+        def loss(params, weigh):
             rgb = picture(params)
-            return jnp.sum(rgb * weights), rgb
+            return jnp.sum(rgb * weigh), rgb
 
         # What is not called is not compiled: of the exact picture, the first.
         forward = jax.jit(picture)
         gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))
-        (_, seen), grads = gradient(scene.params, weights)
+        (_, seen), grads = gradient(scene.params, weigh)
         rgb = np.asarray(seen, np.float64)
         leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(grads)]
         params = scene.params
         return _Runs(
-            lambda: forward(params), lambda: gradient(params, weights), rgb, leaves
+            lambda: forward(params), lambda: gradient(params, weigh), rgb, leaves
         )
 
 
@@ -243,7 +243,7 @@ def stages(trial: Trial, repeats: int = 5) -> dict[str, float]:
         "lists": jax.jit(lambda params: picture(params).demand),
         "forward": jax.jit(lambda params: picture(params)[:3]),
         "gradient": jax.jit(
-            jax.value_and_grad(lambda params: jnp.sum(picture(params).rgb))
+            jax.value_and_grad(lambda params: jnp.sum(jnp.asarray(picture(params).rgb)))
         ),
     }
     params = trial.gaussians.params

@@ -49,7 +49,8 @@ def open_trial(
     gaussians = subject.load()
     if camera is None:
         camera = facing(gaussians, *(size or _SIZE))
-    return Trial(path.stem, gaussians, camera, subject.background)
+    red, green, blue = subject.background
+    return Trial(path.stem, gaussians, camera, (red, green, blue))
 
 
 def facing(gaussians: Gaussians, width: int, height: int) -> Camera:
