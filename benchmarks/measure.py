@@ -1,62 +1,15 @@
-"""Timing, machine description, and where results go."""
+"""Where results go; timing is `gsjax.timing`."""
 
 from __future__ import annotations
 
 import json
-import os
-import platform
-import time
-from datetime import date
 from pathlib import Path
 
-import jax
-import numpy as np
+from gsjax.timing import interleaved as interleaved
+from gsjax.timing import machine as machine
+from gsjax.timing import time_ms as time_ms
 
 RESULTS = Path(__file__).with_name("results")
-
-
-def time_ms(function, repeats: int = 9) -> list[float]:
-    """Milliseconds of each of ``repeats`` calls, after one that is not counted."""
-    jax.block_until_ready(function())
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(function())
-        times.append(1e3 * (time.perf_counter() - start))
-    return times
-
-
-def interleaved(functions: dict, repeats: int = 9) -> dict[str, float]:
-    """Median ms of each function, all taken in turn: A B C A B C …
-
-    So that a drift of a shared machine falls on all of them and ratios hold.
-    """
-    for function in functions.values():
-        jax.block_until_ready(function())
-    times: dict[str, list[float]] = {name: [] for name in functions}
-    for _ in range(repeats):
-        for name, function in functions.items():
-            start = time.perf_counter()
-            jax.block_until_ready(function())
-            times[name].append(1e3 * (time.perf_counter() - start))
-    return {name: float(np.median(t)) for name, t in times.items()}
-
-
-def machine() -> dict[str, str]:
-    """What the numbers were measured on."""
-    cpu = platform.processor()
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        cpu = next(x.split(":")[1].strip() for x in lines if "model name" in x)
-    except (OSError, StopIteration):
-        pass
-    return {
-        "date": date.today().isoformat(),
-        "cpu": f"{cpu}, {os.cpu_count()} cores",
-        "devices": f"{jax.local_device_count()} × {jax.devices()[0].device_kind}",
-        "jax": jax.__version__,
-        "python": platform.python_version(),
-    }
 
 
 def save(name: str, rows: list[dict], **more) -> None:

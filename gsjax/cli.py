@@ -18,6 +18,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import FlagCreatePairsOff, subcommand
 
+from gsjax.commands.bench import BenchCommand
 from gsjax.commands.common import UsageError
 from gsjax.commands.demo import DemoCommand
 from gsjax.commands.doctor import DoctorCommand
@@ -41,6 +42,7 @@ _COMMANDS = (
     | Annotated[ViewCommand, subcommand("view")]
     | Annotated[ExportCommand, subcommand("export")]
     | Annotated[InfoCommand, subcommand("info")]
+    | Annotated[BenchCommand, subcommand("bench")]
     | Annotated[DoctorCommand, subcommand("doctor")]
     | Annotated[StressCommand, subcommand("stress")]
 )

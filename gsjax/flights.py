@@ -22,7 +22,7 @@ from gsjax.scene.types import Scene, View
 from gsjax.sheets import depth_colors
 from gsjax.subjects import Subject
 from gsjax.train.folder import Data
-from gsjax.views import rendered
+from gsjax.views import prepared, rendered
 
 PATHS = ("test", "train", "orbit", "spiral", "interpolate")
 MOVIE_SUFFIXES = (".gif", ".webp", ".webm")
@@ -96,10 +96,9 @@ def write_flight(
 def _pictures(
     subject: Subject, entries: Sequence[CameraEntry], kind: str
 ) -> Iterator[np.ndarray]:
-    gaussians = subject.load()
     cameras = [entry.camera for entry in entries]
+    gaussians, config = prepared(subject, cameras, (kind,))
     limits = _depth_limits(gaussians, entries) if kind == "depth" else None
-    config = subject.config.replace(outputs=(kind,))
     views = rendered(gaussians, cameras, config, subject.background)
     for _, view in zip(progress(entries, "frames"), views):
         image = np.asarray(getattr(view, kind), np.float32)

@@ -31,11 +31,13 @@ class Subject(NamedTuple):
       load: reads the Gaussians; called when all else is found to be well.
       config: how to render.
       background: RGB behind the scene.
+      budget: largest error of rgb for which to choose the settings anew, or None.
     """
 
     load: Callable[[], Gaussians]
     config: RasterConfig
     background: tuple[float, ...]
+    budget: float | None = None
 
 
 def is_run(path: Path) -> bool:

@@ -9,10 +9,11 @@ import numpy as np
 
 from gsjax import images
 from gsjax.cameras import Camera
-from gsjax.console import progress, say
+from gsjax.console import note, progress, say
 from gsjax.errors import InputError
 from gsjax.files import make_folder, refuse_existing, write_file
 from gsjax.gaussians import Gaussians, capacity_bucket
+from gsjax.planning import plan
 from gsjax.raster.render import exact_config, render_exact
 from gsjax.raster.types import RasterConfig, Render
 from gsjax.scene.transforms import CameraEntry
@@ -57,14 +58,37 @@ def write_views(
     images.opencv()
     targets = [_targets(folder, entry.name, kinds, npy) for entry in entries]
     _refuse_conflicts(targets, overwrite)
-    gaussians = subject.load()
-    make_folder(folder)
-    config = subject.config.replace(outputs=tuple(kinds))
     cameras = [entry.camera for entry in entries]
+    gaussians, config = prepared(subject, cameras, kinds)
+    make_folder(folder)
     views = rendered(gaussians, cameras, config, subject.background)
     for of_view, view in zip(progress(targets, "views"), views):
         for target in of_view:
             _write(target, np.asarray(getattr(view, target.kind), np.float32))
+
+
+def prepared(
+    subject: Subject, cameras: Sequence[Camera], kinds: Sequence[str]
+) -> tuple[Gaussians, RasterConfig]:
+    """The scene and how to render it; with a budget, as `plan` says, and why.
+
+    Raises:
+      InputError: if the scene cannot be read, or as `plan`.
+    """
+    gaussians, config = subject.load(), subject.config.replace(outputs=tuple(kinds))
+    if subject.budget is None:
+        return gaussians, config
+    made = plan(
+        gaussians,
+        cameras,
+        budget=subject.budget,
+        config=config,
+        background=subject.background,
+        outputs=kinds,
+    )
+    for line in made.lines():
+        note(line)
+    return made.gaussians, made.config
 
 
 def rendered(

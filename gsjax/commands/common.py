@@ -63,6 +63,20 @@ def parse_background(text: str) -> tuple[float, ...]:
     return tuple(float(value) for value in text.split(","))
 
 
+def parse_budget(text: str) -> float:
+    """The error ``1/255`` or ``0.004``.
+
+    Raises:
+      UsageError: if it is neither, or not above 0.
+    """
+    number = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,2})?"
+    match = re.fullmatch(rf"({number})(?:/({number}))?", text)
+    parts = [float(part or 1) for part in match.groups()] if match else [0.0]
+    if min(parts) <= 0:
+        raise UsageError(f"--budget {text!r}: an error above 0, e.g. 1/255 or 0.004")
+    return parts[0] / parts[1]
+
+
 def start_jax() -> None:
     """Give JAX a device for each core, and a place for what it compiles."""
     from gsjax import devices

@@ -10,6 +10,7 @@ from gsjax.commands.common import (
     Command,
     UsageError,
     parse_background,
+    parse_budget,
     parse_kinds,
     parse_size,
     start_jax,
@@ -41,6 +42,9 @@ class RenderCommand(Command):
     preset: Literal["compat", "accurate", "fast"] | None = None
     """Which constants to render with, see RasterConfig; default: those of the run, of
     a .ply compat."""
+    budget: Annotated[str | None, arg(metavar="ERROR")] = None
+    """Largest error of a colour, e.g. 1/255: the settings are chosen for it, measured
+    on some of the cameras, and said why. Pays for many frames; not with --preset."""
     size: Annotated[str | None, arg(metavar="WxH")] = None
     """Size of the images, e.g. 800x600; default: as in the file, or as in training."""
     what: Annotated[str, arg(metavar="KINDS")] = "rgb"
@@ -58,6 +62,7 @@ class RenderCommand(Command):
         background = None
         if self.background is not None:
             background = parse_background(self.background)
+        budget = self._budget()
         movie = self._is_movie(kinds)
         path = self._path()
         start_jax()
@@ -88,6 +93,7 @@ class RenderCommand(Command):
         subject = open_subject(
             self.scene, scene=scene, preset=self.preset, background=background
         )
+        subject = subject._replace(budget=budget)
         if movie:
             rate = 24.0 if self.fps is None else self.fps
             count = write_flight(
@@ -102,6 +108,13 @@ class RenderCommand(Command):
                 overwrite=self.overwrite,
             )  # fmt: skip
         return 0
+
+    def _budget(self) -> float | None:
+        if self.budget is None:
+            return None
+        if self.preset is not None:
+            raise UsageError("--budget and --preset exclude each other")
+        return parse_budget(self.budget)
 
     def _path(self) -> str:
         """The path to fly, if it is one.

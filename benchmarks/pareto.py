@@ -1,0 +1,51 @@
+"""Claim: every setting errs by no more than theory allows, and what each costs.
+
+``python benchmarks/pareto.py [NAME|RUN|PLY …]`` turns one knob at a time (α cut, stop
+and its rule, SH degree, tile, chunk, dtype), with a plan for 1/255 beside them, on the
+scenes that are built in, or those named: milliseconds forward, and of value and
+gradient, against the errors of the picture and of the gradient. It exits with 1 if an
+error is beyond its bound at any pixel looked at. ``gsjax bench`` does one scene.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import gsjax
+
+gsjax.use_all_cores()
+
+import measure  # noqa: E402
+
+from gsjax import files, images  # noqa: E402
+from gsjax.bench.pareto import front, pareto, points, stages  # noqa: E402
+from gsjax.bench.scenes import open_trial  # noqa: E402
+from gsjax.bench.sheet import front_picture, table  # noqa: E402
+from gsjax.scene.trials import TRIALS  # noqa: E402
+
+
+def main() -> int:
+    """Measure, save and draw; a scene that is measured again replaces its rows."""
+    names = sys.argv[1:] or list(TRIALS)
+    inside = True
+    for name in names:
+        trial = open_trial(name)
+        made = gsjax.plan(
+            trial.gaussians, trial.camera, budget=1 / 255, background=trial.background
+        )
+        rows = pareto(trial, points(trial.gaussians, made))
+        print(f"{trial.name}, {trial.camera.width} × {trial.camera.height}")
+        print(table(rows, front(rows)))
+        measure.save(
+            f"pareto_{trial.name}", rows, claim=__doc__, stages=stages(trial),
+            size=[trial.camera.width, trial.camera.height], reasons=made.lines(),
+        )  # fmt: skip
+        picture = front_picture(rows, trial.name)
+        path = measure.RESULTS / f"pareto_{trial.name}.png"
+        files.write_file(path, images.encode_png(picture))
+        inside &= all(row["inside"] for row in rows)
+    return 0 if inside else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

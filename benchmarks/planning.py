@@ -1,0 +1,138 @@
+"""Claim: a plan for 1/255 is within it on cameras it has not seen, and is faster.
+
+``python benchmarks/planning.py [RUN]`` plans guitar.ply at 800 × 600 (where the data
+are absent, a synthetic shell) and the scene of a run's folder, on 12 cameras each;
+renders 20 random others with the plan and by `RasterConfig.accurate` made finer still;
+and times three of them, plan, `accurate` and `compat` in turn.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import gsjax
+
+gsjax.use_all_cores()
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import measure  # noqa: E402
+import numpy as np  # noqa: E402
+import scenes  # noqa: E402
+
+SEEN, UNSEEN, TIMED = 12, 20, 3
+BUDGET = 1 / 255
+
+
+def around(case: scenes.Case, count: int, rng) -> list[gsjax.Camera]:
+    """Random cameras on all sides of a scene that look at its middle."""
+    means = np.asarray(case.gaussians.params.means)
+    centre = np.median(means, axis=0)
+    radius = np.percentile(np.linalg.norm(means - centre, axis=1), 95)
+    cameras = []
+    for _ in range(count):
+        direction = rng.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        eye = centre + direction * radius * rng.uniform(1.6, 2.4)
+        cameras.append(
+            gsjax.make_camera(
+                viewmat=gsjax.look_at(eye, centre, (0, 1, 0)), K=case.camera.K,
+                width=case.camera.width, height=case.camera.height,
+            )
+        )  # fmt: skip
+    return cameras
+
+
+def of_run(folder: Path, rng):
+    """(Gaussians, cameras that took its photographs, random ones between them)."""
+    from gsjax.flights import path_entries
+    from gsjax.train.folder import load_data, load_scene, load_settings, run_files
+
+    settings = load_settings(folder)
+    data = load_data(settings)
+    gaussians = load_scene(run_files(folder).splat, data.scene)
+    size = settings.config.max_size
+    seen = [e.camera for e in path_entries(data, "train", max_size=size)]
+    between = path_entries(data, "interpolate", frames=400, max_size=size)
+    unseen = []
+    for index in rng.choice(400, UNSEEN, replace=False):
+        camera = between[index].camera
+        shift = np.eye(4)
+        shift[:3, 3] = 0.05 * rng.normal(size=3)
+        unseen.append(
+            gsjax.make_camera(
+                viewmat=shift @ np.asarray(camera.viewmat, np.float64), K=camera.K,
+                width=camera.width, height=camera.height,
+            )
+        )  # fmt: skip
+    return gaussians, seen[: 2 * SEEN], unseen
+
+
+def row(name: str, gaussians, seen, unseen) -> dict:
+    """Plan, check and time one scene."""
+    start = time.perf_counter()
+    made = gsjax.plan(gaussians, seen, budget=BUDGET)
+    seconds = time.perf_counter() - start
+    print(f"{name}: planned in {seconds:.0f} s")
+    for line in made.lines():
+        print(f"  {line}")
+    finer = gsjax.RasterConfig.accurate(alpha_cut=1e-6, stop=1e-7, outputs=("rgb",))
+    finer = gsjax.exact_config(gaussians, unseen[0], finer)
+    errors = []
+    for camera in unseen:
+        wanted = gsjax.render_exact(gaussians, camera, finer).rgb
+        found = gsjax.render_exact(made.gaussians, camera, made.config).rgb
+        errors.append(255 * float(jnp.abs(found - wanted).max()))
+    render = jax.jit(gsjax.render, static_argnames="config")
+    times: dict[str, list[float]] = {}
+    for camera in unseen[:TIMED]:
+        presets = {
+            name: gsjax.exact_config(gaussians, unseen[0], config)
+            for name, config in {
+                "accurate": gsjax.RasterConfig.accurate(),
+                "compat": gsjax.RasterConfig(),
+            }.items()
+        }
+        functions = {
+            key: lambda c=config, v=camera: render(gaussians, v, config=c)
+            for key, config in presets.items()
+        }
+        functions["plan"] = lambda v=camera: render(
+            made.gaussians, v, config=made.config
+        )
+        for key, ms in measure.interleaved(functions, 7).items():
+            times.setdefault(key, []).append(ms)
+    ms = {key: float(np.median(values)) for key, values in times.items()}
+    return {
+        "scene": name,
+        "Gaussians": int(gsjax.num_active(gaussians)),
+        "alpha cut": made.config.alpha_cut,
+        "stop": made.config.stop,
+        "promised /255": 255 * made.error,
+        "worst of unseen /255": max(errors),
+        "median of unseen /255": float(np.median(errors)),
+        "within": max(errors) <= 1,
+        **{f"{key} ms": value for key, value in ms.items()},
+        "accurate / plan": ms["accurate"] / ms["plan"],
+        "planning s": seconds,
+    }
+
+
+def main() -> None:
+    """Measure and save."""
+    rng = np.random.default_rng(0)
+    case = scenes.real_cases()[0]
+    rows = [
+        row(case.name, case.gaussians, around(case, SEEN, rng),
+            around(case, UNSEEN, rng))
+    ]  # fmt: skip
+    measure.save("planning", rows, claim=__doc__)
+    for folder in sys.argv[1:]:
+        rows.append(row(Path(folder).name, *of_run(Path(folder), rng)))
+        measure.save("planning", rows, claim=__doc__)
+
+
+if __name__ == "__main__":
+    main()

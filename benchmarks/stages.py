@@ -1,0 +1,55 @@
+"""Claim: most of a view's time goes into compositing, and little into finding what.
+
+``python benchmarks/stages.py`` times the stages of one view with the default settings,
+in turn, on the real scenes: projecting, binning with its sort, that sort alone (as many
+keys, two integers packed into one), compositing, its backward pass; and what a whole
+render and its gradient take.
+"""
+
+from __future__ import annotations
+
+import gsjax
+
+gsjax.use_all_cores()
+
+import compositor  # noqa: E402
+import jax  # noqa: E402
+import measure  # noqa: E402
+import numpy as np  # noqa: E402
+import scenes  # noqa: E402
+
+
+def main() -> None:
+    """Measure and save."""
+    rows = []
+    for case in scenes.real_cases():
+        config = gsjax.exact_config(case.gaussians, case.camera)
+        functions, _, _ = compositor.stages(case, config)
+        # Each device sorts its share at the same time.
+        share = -(-config.pair_capacity // jax.local_device_count())
+        keys = np.random.default_rng(0).integers(0, 2**32, share, np.uint32)
+        keys, sort = jax.device_put(keys), jax.jit(jax.numpy.sort)
+        functions["sort"] = lambda sort=sort, keys=keys: sort(keys)
+        ms = measure.interleaved(functions)
+        backward = ms["composite v+g"] - ms["composite"]
+        parts = {
+            "project": ms["project"],
+            "bin and sort": ms["bin"],
+            "sort of its keys alone": ms["sort"],
+            "composite": ms["composite"],
+            "composite backward": backward,
+            "render": ms["render"],
+            "render v+g": ms["render v+g"],
+        }
+        rows.append(
+            {
+                "scene": case.name,
+                **{f"{name} ms": value for name, value in parts.items()},
+                "bin and sort / composite": ms["bin"] / ms["composite"],
+            }
+        )
+    measure.save("stages", rows, claim=__doc__)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,268 @@
+"""Time against error: one scene, one view, one knob of accuracy or size at a time.
+
+The exact picture, and its gradient, are those of the renderer in float64 with cut and
+stop at 1e-9. At some pixels, the worst of every point among them, errors are held
+against what theory allows (`gsjax.bench.pixelwise`), and the exact picture against a
+dense one. Capacities are fitted to the view; programs are compiled at one size.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.bench import pixelwise
+from gsjax.console import progress
+from gsjax.gaussians import Gaussians, with_sh_degree
+from gsjax.planning import Plan
+from gsjax.raster.render import exact_config, render
+from gsjax.raster.types import RasterConfig
+from gsjax.scene.trials import Trial
+from gsjax.timing import interleaved
+
+_EXACT = RasterConfig.accurate(
+    alpha_cut=1e-9,
+    alpha_cap=1 - 1e-12,
+    stop=1e-9,
+    outputs=("rgb",),
+    rungs=1,
+    devices=1,
+)
+_PIXELS = 48
+
+
+class Point(NamedTuple):
+    """One setting.
+
+    Attributes:
+      knob: what is turned.
+      value: to what.
+      config: all settings.
+      degree: of the spherical harmonics; None as the scene has.
+      double: whether in float64.
+    """
+
+    knob: str
+    value: str
+    config: RasterConfig
+    degree: int | None = None
+    double: bool = False
+
+    @property
+    def label(self) -> str:
+        return f"{self.knob} {self.value}".strip()
+
+
+class _Runs(NamedTuple):
+    """Of one point: what to call, what came of it."""
+
+    forward: Any
+    gradient: Any
+    rgb: np.ndarray
+    grads: list[np.ndarray]
+
+
+def points(gaussians: Gaussians, made: Plan | None = None) -> list[Point]:
+    """Knobs turned one at a time from `RasterConfig.accurate`, the presets, a plan."""
+    base = RasterConfig.accurate(outputs=("rgb",), rungs=1)
+    found = [
+        Point("compat", "", RasterConfig.compat(outputs=("rgb",), rungs=1)),
+        Point("accurate", "", base),
+        Point("fast", "", RasterConfig.fast(outputs=("rgb",), rungs=1)),
+    ]
+    for cut, text in ((1 / 255, "1/255"), (1 / 1024, "1/1024"), (1e-4, "1e-4")):
+        found.append(Point("cut", text, base.replace(alpha_cut=cut)))
+    for stop in ("1e-2", "1e-3"):
+        found.append(Point("stop after", stop, base.replace(stop=float(stop))))
+    # The rule's bound is ε / (1 − cap): it wants the field's cap.
+    before = base.replace(stop=1e-4, stop_rule="before", alpha_cap=0.99)
+    found.append(Point("stop before", "1e-4", before))
+    for degree in range(gaussians.sh_degree):
+        found.append(Point("SH degree", str(degree), base, degree))
+    for tile in (4, 16):
+        found.append(Point("tile", str(tile), base.replace(tile_size=tile)))
+    found.append(Point("chunk", "64", base.replace(chunk_size=64)))
+    found.append(Point("dtype", "float64", base, double=True))
+    if made is not None:
+        config = made.config.replace(
+            rungs=1, outputs=("rgb",), pair_capacity=None, visible_capacity=None
+        )
+        found.append(Point("plan", "", config, made.gaussians.sh_degree))
+    return found
+
+
+def pareto(trial: Trial, settings: Sequence[Point], repeats: int = 5) -> list[dict]:
+    """A row for each point: milliseconds, errors, and what theory allows.
+
+    Its keys: knob, value; "forward ms", "gradient ms" (value and gradient); "max",
+    "psnr" and "gradient" (relative L2) against the exact picture; "at worst" and
+    "bound", error and bound where they are nearest to each other; "inside": whether
+    every pixel looked at is within its bound.
+    """
+    rng = np.random.default_rng(0)
+    shape = (trial.camera.height, trial.camera.width, 3)
+    weights = rng.normal(size=shape)
+    with jax.enable_x64(True):
+        exact = _run(trial, Point("exact", "", _EXACT, double=True), weights, {})
+    fits: dict[tuple, RasterConfig] = {}
+    runs = [_run(trial, p, weights, fits) for p in progress(settings, "points")]
+    errors = [np.abs(run.rgb - exact.rgb).max(axis=-1) for run in runs]
+    worst = [divmod(int(error.argmax()), shape[1])[::-1] for error in errors]
+    others = rng.integers(0, shape[1::-1], (_PIXELS, 2))
+    pixels = np.unique(np.concatenate([np.asarray(worst), others]), axis=0)
+    bounds, gap = _bounds(trial, settings, pixels, exact.rgb)
+    ms = [_times(runs, settings, name, repeats) for name in ("forward", "gradient")]
+    rows = []
+    for index, (point, run) in enumerate(zip(settings, runs)):
+        at = errors[index][pixels[:, 1], pixels[:, 0]]
+        nearest = int(np.argmax(at / bounds[index]))
+        mean = float(np.mean((run.rgb - exact.rgb) ** 2))
+        rows.append(
+            {
+                "scene": trial.name,
+                "knob": point.knob,
+                "value": point.value,
+                "forward ms": ms[0][index],
+                "gradient ms": ms[1][index],
+                "max": float(errors[index].max()),
+                "psnr": -10 * np.log10(max(mean, 1e-30)),
+                "gradient": _relative(run.grads, exact.grads),
+                "at worst": float(at[nearest]),
+                "bound": float(bounds[index][nearest]),
+                "inside": bool((at <= bounds[index]).all()) and gap < 1e-5,
+            }
+        )
+    return rows
+
+
+def _run(
+    trial: Trial, point: Point, weights: np.ndarray, fits: dict[tuple, RasterConfig]
+) -> _Runs:
+    """Compile, run once, and hand out what to time; ``fits`` keeps the capacities."""
+    with jax.enable_x64(point.double):
+        scene, camera = trial.gaussians, trial.camera
+        if point.double:
+            scene, camera = pixelwise.as_double((scene, camera))
+        degree = scene.sh_degree if point.degree is None else point.degree
+        config, sizes = point.config, point.config
+        sizes = (sizes.alpha_cut, sizes.tile_size, sizes.chunk_size)
+        if config.pair_capacity is not None:
+            fits[sizes] = config
+        if sizes not in fits:
+            fits[sizes] = exact_config(scene, camera, config)
+        config = config.replace(
+            pair_capacity=fits[sizes].pair_capacity,
+            visible_capacity=fits[sizes].visible_capacity,
+        )
+        dtype = scene.params.means.dtype
+        behind = jnp.asarray(trial.background, dtype)
+        weigh = jnp.asarray(weights, dtype)
+
+        def picture(params):
+            seen = with_sh_degree(scene.replace(params=params), degree)  # pyright: ignore
+            return render(seen, camera, config, behind).rgb
+
+        def loss(params, weigh):
+            rgb = picture(params)
+            return jnp.sum(rgb * weigh), rgb
+
+        # What is not called is not compiled: of the exact picture, the first.
+        forward = jax.jit(picture)
+        gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))
+        (_, seen), grads = gradient(scene.params, weigh)
+        rgb = np.asarray(seen, np.float64)
+        leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(grads)]
+        params = scene.params
+        return _Runs(
+            lambda: forward(params), lambda: gradient(params, weigh), rgb, leaves
+        )
+
+
+def _times(
+    runs: Sequence[_Runs], settings: Sequence[Point], name: str, repeats: int
+) -> list[float]:
+    """Median ms of each, in turn; float64 apart, as it is another mode of JAX."""
+    out = [0.0] * len(runs)
+    for double in (False, True):
+        chosen = {
+            str(i): getattr(run, name)
+            for i, (run, point) in enumerate(zip(runs, settings))
+            if point.double == double
+        }
+        with jax.enable_x64(double):
+            for index, ms in interleaved(chosen, repeats).items():
+                out[int(index)] = ms
+    return out
+
+
+def _bounds(
+    trial: Trial, settings: Sequence[Point], pixels: np.ndarray, exact: np.ndarray
+) -> tuple[list[np.ndarray], float]:
+    """What theory allows each point at the pixels; how far dense and exact differ."""
+    with jax.enable_x64(True):
+        scene, camera = pixelwise.as_double((trial.gaussians, trial.camera))
+        found = pixelwise.dense(scene, camera, trial.background, pixels)
+        gap = np.abs(found.picture - exact[pixels[:, 1], pixels[:, 0]]).max()
+        bounds = [
+            pixelwise.allowed(
+                found,
+                scene,
+                camera,
+                point.config,
+                degree=scene.sh_degree if point.degree is None else point.degree,
+                dtype="float64" if point.double else "float32",
+            )
+            for point in settings
+        ]
+    return bounds, float(gap)
+
+
+def _relative(found: Sequence[np.ndarray], wanted: Sequence[np.ndarray]) -> float:
+    """Relative L2 of all gradients together."""
+    off = sum(np.sum((a - b) ** 2) for a, b in zip(found, wanted))
+    return float(np.sqrt(off / max(sum(np.sum(b**2) for b in wanted), 1e-300)))
+
+
+def stages(trial: Trial, repeats: int = 5) -> dict[str, float]:
+    """Milliseconds of a render's parts with the default settings.
+
+    "lists" is projecting, binning and sorting; composite and backward are what the
+    whole picture, and the gradient, take beyond what comes before them.
+    """
+    config = exact_config(trial.gaussians, trial.camera)
+    camera = trial.camera
+    behind = jnp.asarray(trial.background, trial.gaussians.params.means.dtype)
+
+    def picture(params):
+        scene = trial.gaussians.replace(params=params)  # pyright: ignore
+        return render(scene, camera, config, behind)
+
+    functions = {
+        "lists": jax.jit(lambda params: picture(params).demand),
+        "forward": jax.jit(lambda params: picture(params)[:3]),
+        "gradient": jax.jit(
+            jax.value_and_grad(lambda params: jnp.sum(jnp.asarray(picture(params).rgb)))
+        ),
+    }
+    params = trial.gaussians.params
+    ms = interleaved({n: lambda f=f: f(params) for n, f in functions.items()}, repeats)
+    return {
+        "lists": ms["lists"],
+        "composite": ms["forward"] - ms["lists"],
+        "backward": ms["gradient"] - ms["forward"],
+        "forward": ms["forward"],
+        "value and gradient": ms["gradient"],
+    }
+
+
+def front(rows: Sequence[dict], time: str = "forward ms", error: str = "max"):
+    """Indices of rows that no other beats in both, by time."""
+    order = sorted(range(len(rows)), key=lambda i: (rows[i][time], rows[i][error]))
+    best, kept = float("inf"), []
+    for index in order:
+        if rows[index][error] < best:
+            best = rows[index][error]
+            kept.append(index)
+    return kept

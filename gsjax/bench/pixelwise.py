@@ -1,0 +1,140 @@
+"""What theory allows a setting to change at single pixels, in float64.
+
+The same argument as in `gsjax.bounds`, with the α of every splat at the pixel at hand:
+dense, so for some pixels only. Axis legend: N Gaussians, front to back, P pixels.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.cameras import Camera
+from gsjax.gaussians import Gaussians, with_sh_degree
+from gsjax.raster.reference import reference_colors, reference_project
+from gsjax.raster.types import RasterConfig
+
+# What rounding may do, as a share of the range of the colours.
+ROUNDING = {"float32": 1e-4, "float64": 1e-9}
+_SEEN = 1e-14
+# Depths nearer than so many units of the last place of their terms may change places.
+_ULPS = 8
+
+
+class Dense(NamedTuple):
+    """All splats at some pixels.
+
+    Attributes:
+      alpha: [N, P] without cut and cap.
+      colors: [N, 3].
+      near: [N] depth below which the next splat could be taken for the one in front.
+      spread: [P] range of the colours there, of the channel with the largest.
+      picture: [P, 3] rgb.
+    """
+
+    alpha: np.ndarray
+    colors: np.ndarray
+    near: np.ndarray
+    spread: np.ndarray
+    picture: np.ndarray
+
+
+def dense(
+    gaussians: Gaussians, camera: Camera, background, pixels: np.ndarray
+) -> Dense:
+    """Splats at ``pixels`` [P, 2] (column, row); call it with float64 on, for single
+    cameras without antialiasing and with the dilation of 0.3."""
+    projected = jax.jit(reference_project)(gaussians, camera)
+    means2d, depth, cov2d, _, seen = (np.asarray(a) for a in projected)
+    seen = seen & np.asarray(gaussians.active)
+    order = np.flatnonzero(seen)[np.argsort(depth[seen], kind="stable")]
+    colors = np.asarray(jax.jit(reference_colors)(gaussians, camera))[order]
+    inverse = np.linalg.inv(cov2d[order])
+    logits = np.asarray(gaussians.params.logit_opacities, np.float64)[order]
+    opacity = 1 / (1 + np.exp(-logits))
+    alpha = np.empty((len(order), len(pixels)))
+    for index, pixel in enumerate(np.asarray(pixels) + 0.5):
+        offset = pixel - means2d[order]
+        power = np.einsum("ni,nij,nj->n", offset, inverse, offset)
+        alpha[:, index] = opacity * np.exp(-0.5 * power)
+    # Of the sums that depths are: their largest term.
+    means = np.abs(np.asarray(gaussians.params.means)[order])
+    row = np.abs(np.asarray(camera.viewmat)[2])
+    size = means @ row[:3] + row[3]
+    near = depth[order] + _ULPS * np.finfo(np.float32).eps * size
+    behind = np.asarray(background, np.float64)
+    there = (alpha > _SEEN)[..., None]
+    low = np.minimum(np.where(there, colors[:, None], np.inf).min(0), behind)
+    high = np.maximum(np.where(there, colors[:, None], -np.inf).max(0), behind)
+    weight, left = _weights(alpha)
+    picture = weight.T @ colors + left[:, None] * behind
+    swappable = np.where(near[:-1] > depth[order][1:], 1.0, 0.0)
+    return Dense(
+        alpha, colors, np.append(swappable, 0), (high - low).max(axis=1), picture
+    )
+
+
+def _weights(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """α T [N, P], and the T that is left [P]."""
+    after = np.cumprod(1 - alpha, axis=0)
+    before = np.concatenate([np.ones_like(after[:1]), after[:-1]])
+    return alpha * before, after[-1]
+
+
+def allowed(
+    found: Dense,
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RasterConfig,
+    *,
+    degree: int,
+    dtype: str,
+) -> np.ndarray:
+    """[P] how far a channel may be off at the pixels, one knob after another.
+
+    Cap, cut, stop and SH degree as in `gsjax.bounds`; rounding by `ROUNDING`, and
+    neighbours in depth that float32 may exchange, T α_i α_j each.
+    """
+    alpha, spread = found.alpha, found.spread
+    capped = np.minimum(alpha, config.alpha_cap)
+    over = (alpha > config.alpha_cap).any(axis=0)
+    cap = over * (1 - config.alpha_cap) / config.alpha_cap
+    low = capped < config.alpha_cut * (1 + 1e-3)
+    cut = -np.expm1(np.log1p(-np.where(low, capped, 0)).sum(axis=0))
+    kept = np.where(low, 0, capped)
+    weight, left = _weights(kept)
+    most = config.stop
+    if config.stop_rule == "before":
+        most = config.stop / np.maximum(1 - kept.max(axis=0), 1e-16)
+    stop = np.where(left <= config.stop * (1 + 1e-3), np.minimum(most, 1), 0)
+    total = spread * (cap + cut + stop + ROUNDING[dtype])
+    if dtype == "float32":
+        following = np.append(alpha[1:], np.zeros_like(alpha[:1]), axis=0)
+        total = total + spread * (found.near[:, None] * weight * following).sum(axis=0)
+    if degree < gaussians.sh_degree:
+        total = total + _band_change(found, gaussians, camera, degree)
+    return total
+
+
+def _band_change(
+    found: Dense, gaussians: Gaussians, camera: Camera, degree: int
+) -> np.ndarray:
+    """Σ w_i |change of the colour|, the largest channel, [P]."""
+    projected = jax.jit(reference_project)(gaussians, camera)
+    depth, seen = np.asarray(projected[1]), np.asarray(projected[4])
+    seen = seen & np.asarray(gaussians.active)
+    order = np.flatnonzero(seen)[np.argsort(depth[seen], kind="stable")]
+    fewer = jax.jit(reference_colors)(with_sh_degree(gaussians, degree), camera)
+    change = np.abs(np.asarray(fewer)[order] - found.colors)
+    return (_weights(found.alpha)[0].T @ change).max(axis=1)
+
+
+def as_double(tree):
+    """The same pytree with its floats in float64; with float64 on."""
+
+    def one(leaf):
+        floating = jnp.issubdtype(leaf.dtype, jnp.floating)
+        return jnp.asarray(np.asarray(leaf), jnp.float64) if floating else leaf
+
+    return jax.tree.map(one, tree)

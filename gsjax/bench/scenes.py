@@ -1,0 +1,83 @@
+"""What `gsjax bench` measures on: a scene by its name, and a camera for it."""
+
+from pathlib import Path
+
+import numpy as np
+
+from gsjax.cameras import Camera, look_at, make_camera, resize_camera
+from gsjax.errors import InputError
+from gsjax.flights import path_entries
+from gsjax.gaussians import Gaussians
+from gsjax.scene.transforms import load_transforms
+from gsjax.scene.trials import TRIALS, Trial
+from gsjax.subjects import is_run, open_subject
+from gsjax.train.folder import load_data, load_settings, refined_data, run_files
+
+_SIZE = (400, 300)
+
+
+def open_trial(
+    name: str, *, cameras: Path | None = None, size: tuple[int, int] | None = None
+) -> Trial:
+    """A scene that is built in, a .ply file or a run, with one camera.
+
+    Args:
+      name: of `TRIALS`, unless there is a file or a folder of that name.
+      cameras: a transforms.json, whose first camera is taken.
+      size: (width, height) in px.
+
+    Raises:
+      InputError: if it cannot be read, or holds no Gaussian or no camera.
+    """
+    path = Path(name)
+    if name in TRIALS and not path.exists():
+        trial = TRIALS[name]()
+        camera = _first(cameras, size) if cameras else _sized(trial.camera, size)
+        return trial._replace(camera=camera)
+    if not path.exists():
+        raise InputError(
+            f"{name}: neither a run nor a .ply file, nor one of {', '.join(TRIALS)}"
+        )
+    scene, camera = None, _first(cameras, size) if cameras else None
+    if is_run(path) and camera is None:
+        settings = load_settings(path)
+        data = refined_data(load_data(settings), run_files(path))
+        scene = data.scene
+        entries = path_entries(data, "train", max_size=settings.config.max_size)
+        camera = _sized(entries[0].camera, size)
+    subject = open_subject(path, scene=scene)
+    gaussians = subject.load()
+    if camera is None:
+        camera = facing(gaussians, *(size or _SIZE))
+    red, green, blue = subject.background
+    return Trial(path.stem, gaussians, camera, (red, green, blue))
+
+
+def facing(gaussians: Gaussians, width: int, height: int) -> Camera:
+    """A camera before a scene that nothing is known of, so that most of it shows.
+
+    Raises:
+      InputError: if no Gaussian is active and finite.
+    """
+    means = np.asarray(gaussians.params.means, np.float64)
+    means = means[np.asarray(gaussians.active) & np.isfinite(means).all(axis=1)]
+    if not len(means):
+        raise InputError("the scene has no Gaussian to look at")
+    centre = np.median(means, axis=0)
+    radius = np.percentile(np.linalg.norm(means - centre, axis=1), 95)
+    eye = centre + np.asarray([0.3, 0.25, 1.0]) * max(float(radius), 1e-6) * 1.85
+    focal = 0.875 * max(width, height)
+    K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
+    viewmat = look_at(eye, centre, (0, 1, 0))
+    return make_camera(viewmat=viewmat, K=K, width=width, height=height)
+
+
+def _first(path: Path, size: tuple[int, int] | None) -> Camera:
+    entries = load_transforms(path, size=size)
+    if not entries:
+        raise InputError(f"{path}: there is no camera in it")
+    return entries[0].camera
+
+
+def _sized(camera: Camera, size: tuple[int, int] | None) -> Camera:
+    return camera if size is None else resize_camera(camera, *size)

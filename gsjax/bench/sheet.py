@@ -1,0 +1,55 @@
+"""The rows of `gsjax.bench.pareto` as a table and as a plot."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gsjax.bench.fronts import Mark, scatter
+from gsjax.bench.pareto import front
+
+_LEAST = 1e-8  # errors below are drawn here
+
+
+def table(rows: Sequence[dict], on_front: Sequence[int]) -> str:
+    """Lines to read: times, errors in grey levels of 255, and the bound."""
+    head = (
+        f"  {'':<18}{'forward':>9}{'gradient':>9}{'max':>11}{'PSNR':>8}"
+        f"{'gradient':>10}{'bound':>11}"
+    )
+    units = (
+        f"  {'':<18}{'ms':>9}{'ms':>9}{'/255':>11}{'dB':>8}{'rel. L2':>10}{'/255':>11}"
+    )
+    lines = [head, units]
+    for index, row in enumerate(rows):
+        mark = "*" if index in on_front else " "
+        label = f"{row['knob']} {row['value']}".strip()
+        told = "" if row["inside"] else "  OUTSIDE"
+        lines.append(
+            f"{mark} {label:<18}{row['forward ms']:9.2f}{row['gradient ms']:9.2f}"
+            f"{255 * row['max']:11.4g}{row['psnr']:8.1f}{row['gradient']:10.2g}"
+            f"{255 * row['bound']:11.4g}{told}"
+        )
+    lines.append("  * on the front of forward time and largest error")
+    return "\n".join(lines)
+
+
+def front_picture(rows: Sequence[dict], name: str) -> np.ndarray:
+    """Two plots [H, W, 3], one above the other: forward time against the largest
+    error, and that of value and gradient against the gradient's."""
+    plots = []
+    for time, error, title in (
+        ("forward ms", "max", f"{name}: forward, largest error of rgb"),
+        ("gradient ms", "gradient", f"{name}: value and gradient, relative L2"),
+    ):
+        marks = [
+            Mark(
+                row[time],
+                max(row[error], _LEAST),
+                f"{row['knob']} {row['value']}".strip(),
+                row["knob"],
+            )
+            for row in rows
+        ]
+        best = front(rows, time, error)
+        plots.append(scatter(marks, best, title=title, x_label="ms", y_label="error"))
+    return np.concatenate(plots)

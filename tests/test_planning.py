@@ -1,0 +1,277 @@
+"""Plans: what they leave out does not show, and the reasons add up."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import LIGHT, camera_of, frustum_points, gaussians_at
+
+import gsjax
+from gsjax import RasterConfig, bounds, planning
+from gsjax.commands.common import UsageError, parse_budget
+from gsjax.errors import InputError
+from gsjax.sh import sh_basis
+from gsjax.subjects import Subject
+from gsjax.views import prepared
+
+SIZE, BUDGET, BEHIND = 32, 1 / 255, (0.2, 0.5, 0.9)
+CONFIG = RasterConfig(**LIGHT, outputs=("rgb",))
+EXACT = RasterConfig.accurate(**LIGHT, outputs=("rgb",), alpha_cut=1e-7, stop=1e-7)
+
+
+def looking(count, seed):
+    """Cameras at about (0, 0, 0) that look along z, a little off each."""
+    rng = np.random.default_rng(seed)
+    views = []
+    for _ in range(count):
+        eye, target = rng.uniform(-0.4, 0.4, (2, 3))
+        target = target + (0, 0, 5)
+        view = gsjax.look_at(eye, target, (0, -1, 0))
+        views.append(camera_of(SIZE, SIZE, view, centre=(16, 16)))
+    return views
+
+
+def fog(count=500, opacity=(0.002, 0.02), degree=0):
+    rng = np.random.default_rng(5)
+    points, opacities = frustum_points(rng, count), rng.uniform(*opacity, count)
+    scales = rng.uniform(0.3, 1.5, (count, 3))
+    return gaussians_at(points, scales, opacities, viewmat=np.eye(4), degree=degree)
+
+
+def worst(gaussians, made, views):
+    """Largest error of the plan against the exact picture of the scene itself."""
+    errors = []
+    for view in views:
+        wanted = gsjax.render_exact(gaussians, view, EXACT, jnp.asarray(BEHIND)).rgb
+        found = gsjax.render_exact(
+            made.gaussians, view, made.config, jnp.asarray(BEHIND)
+        )
+        assert float(jnp.std(wanted)) > 0.005
+        errors.append(float(jnp.abs(found.rgb - wanted).max()))
+    return max(errors)
+
+
+def reason(made, what):
+    return next(r for r in made.reasons if r.what == what)
+
+
+def planned(gaussians, views, **options):
+    return gsjax.plan(gaussians, views, config=CONFIG, background=BEHIND, **options)
+
+
+@pytest.fixture
+def as_fitting(monkeypatch):
+    """No programs are compiled to ask for capacities."""
+
+    def fit(gaussians, _, config):
+        return config.replace(visible_capacity=gaussians.capacity), []
+
+    monkeypatch.setattr(planning, "_with_capacities", fit)
+
+
+@pytest.fixture(scope="module")
+def foggy():
+    scene = fog()
+    return scene, planned(scene, looking(4, 0), budget=BUDGET)
+
+
+def test_fog_keeps_its_budget_on_cameras_not_seen(foggy, report):
+    scene, made = foggy
+    error = worst(scene, made, looking(8, 1))
+    report("fog", error, BUDGET)
+    assert error <= BUDGET
+    assert made.error <= BUDGET
+    # The field's cut would not do, and what is chosen is no finer than need be.
+    assert made.config.alpha_cut < 1 / 255
+    assert made.measured > 0.1 * BUDGET
+    assert error > 0.05 * BUDGET
+    assert reason(made, "alpha_cut").basis == "estimate"
+    assert not made.bounded
+
+
+def test_reasons_add_up_and_are_told(foggy):
+    _, made = foggy
+    assert made.error == pytest.approx(sum(r.error for r in made.reasons))
+    lines = made.lines()
+    assert len(lines) == len(made.reasons) + 1
+    for what in ("SH degree", "stop", "alpha_cut", "capacity", "pair_capacity", "lens"):
+        assert any(line.startswith(f"{what}: ") for line in lines)
+    assert "of 1/255 (estimate)" in lines[-1]
+
+
+@pytest.mark.usefixtures("as_fitting")
+def test_one_gaussian_has_a_bound_for_every_camera():
+    scene = gaussians_at([[0, 0, 4]], 0.5, 0.7, viewmat=np.eye(4), degree=0)
+    scene = gsjax.grow(scene, 9)
+    made = planned(scene, looking(1, 0)[0], budget=0.05)
+    assert made.bounded
+    assert made.measured is None
+    assert made.gaussians.capacity == 1
+    assert worst(scene, made, looking(2, 1)) <= made.error <= 0.05
+
+
+@pytest.mark.usefixtures("as_fitting")
+def test_without_a_budget_nothing_changes():
+    scene = fog(200, opacity=(0.05, 0.9))
+    padded = gsjax.grow(gsjax.with_sh_degree(scene, 3), 300)
+    view = looking(1, 2)[0]
+    made = planned(padded, view)
+    assert (made.gaussians.sh_degree, made.gaussians.capacity) == (0, 200)
+    assert made.error == 0
+    same = ("alpha_cut", "alpha_cap", "stop", "stop_rule", "dilation", "antialias")
+    assert all(getattr(made.config, n) == getattr(CONFIG, n) for n in same)
+    wanted = gsjax.render_exact(padded, view, CONFIG).rgb
+    found = gsjax.render_exact(made.gaussians, view, made.config)
+    np.testing.assert_allclose(found.rgb, wanted, atol=1e-12)
+    assert float(found.rgb.std()) > 0.02
+    assert not found.overflowed
+
+
+def test_bands_go_only_where_their_bound_is_within_the_budget():
+    scene = fog(50, opacity=(0.3, 0.9), degree=2)
+    for size, wanted in ((1e-5, 1), (0.3, 2)):
+        sh = scene.params.sh.at[:, 4:].mul(size)
+        made, told = planning._without_bands(
+            scene.replace(params=scene.params.replace(sh=sh)), BUDGET
+        )
+        assert made.sh_degree == wanted
+        assert told.error <= BUDGET / 4
+
+
+@pytest.mark.parametrize("left", [0, 1])
+def test_bound_of_bands_holds_and_is_reached(left):
+    """One opaque splat, seen from where its bands are at their largest."""
+    direction = np.array([0.6, -0.48, 0.64])
+    basis = np.array(sh_basis(2, *direction), float)
+    scene = gaussians_at([4 * direction], 1.0, 1 - 1e-9, degree=2)
+    sh = np.broadcast_to(0.2 * basis[:, None], (1, 9, 3))
+    scene = scene.replace(params=scene.params.replace(sh=jnp.asarray(sh)))
+    change = 0.2 * np.sum(basis[(left + 1) ** 2 :] ** 2)
+    bound = bounds.degree_error(scene, left)
+    assert 0.99 * bound < change <= bound * (1 + 1e-6)
+    # Another direction sees less, and a faint splat shows less.
+    assert np.sum(basis * sh_basis(2, 1.0, 0.0, 0.0)) < np.sum(basis**2)
+    faint = scene.params.replace(logit_opacities=jnp.zeros(1))
+    assert bounds.degree_error(scene.replace(params=faint), left) == pytest.approx(
+        bound / 2
+    )
+
+
+def blend(alpha, colors, stop=0.0, rule="after"):
+    """Dense: α [N, P], colours [N]; over the background 0.9."""
+    after = np.cumprod(1 - alpha, axis=0)
+    before = np.concatenate([np.ones_like(after[:1]), after[:-1]])
+    weight = alpha * before * ((after if rule == "before" else before) > stop)
+    return colors @ weight + (1 - weight.sum(axis=0)) * 0.9
+
+
+def test_bounds_hold_where_they_matter():
+    """Of cut, cap and stop, each alone, over splats drawn at random."""
+    rng = np.random.default_rng(3)
+    count, pixels = 30, 4000
+    opacity = rng.beta(0.5, 1, count)
+    scene = gaussians_at(np.ones((count, 3)), 1.0, opacity, degree=0)
+    opacity = bounds.opacities(scene)
+    alpha = opacity[:, None] * rng.random((count, pixels)) ** rng.choice([0.01, 1, 4])
+    colors = rng.random(count)
+    exact = blend(alpha, colors)
+    cases = {
+        "cut": (np.where(alpha < 0.02, 0, alpha), {}, bounds.cut_error(scene, 0.02, 1)),
+        "cap": (np.minimum(alpha, 0.6), {}, bounds.cap_error(0.6, 1)),
+        "after": (alpha, {"stop": 0.1}, bounds.stop_error(0.1, "after", 1, 1)),
+        "before": (
+            alpha,
+            {"stop": 0.1, "rule": "before"},
+            bounds.stop_error(0.1, "before", opacity.max(), 1),
+        ),
+    }
+    for name, (changed, options, bound) in cases.items():
+        error = np.abs(blend(changed, colors, **options) - exact).max()
+        assert 0.02 * bound < error <= bound, name
+
+
+def test_faint_beyond_the_accurate_cut_are_not_overlooked():
+    """Each below 1e-5, together a fog: the reference must go finer."""
+    scene = fog(400, opacity=(4e-6, 8e-6))
+    cut = planning._reference_cut(scene, 1.0, 1e-3)
+    assert cut < 8e-6
+    total = bounds.opacities(scene)
+    assert total[total < cut].sum() <= 1e-4
+
+
+@pytest.mark.usefixtures("as_fitting")
+def test_an_empty_scene():
+    scene = gsjax.select(fog(20), jnp.zeros(20, bool))
+    made = planned(scene, looking(1, 0), budget=BUDGET)
+    assert made.gaussians.capacity == 1
+    assert int(gsjax.num_active(made.gaussians)) == 0
+    assert (made.error, made.measured) == (0, None)
+
+
+@pytest.mark.usefixtures("as_fitting")
+def test_a_splat_that_is_not_drawn_does_not_come_back():
+    """A NaN in a band keeps a splat out; without the band it still stays out."""
+    scene = gsjax.with_sh_degree(fog(20, opacity=(0.3, 0.9)), 1)
+    sh = scene.params.sh.at[3, 1].set(jnp.nan)
+    scene = scene.replace(params=scene.params.replace(sh=sh))
+    made = planned(scene, looking(1, 0))
+    assert made.gaussians.sh_degree == 0
+    assert made.gaussians.capacity == 19
+    assert reason(made, "capacity").why.startswith("19 slots in place of 20")
+
+
+@pytest.mark.usefixtures("as_fitting")
+def test_lens_and_outputs_are_those_asked_for():
+    made = planned(fog(20, opacity=(0.3, 0.9)), looking(1, 0), outputs=("depth",))
+    assert made.config.outputs == ("depth",)
+    assert reason(made, "lens").why.startswith("pinhole")
+
+
+def test_refusals():
+    scene, view = fog(20), looking(1, 0)[0]
+    with pytest.raises(InputError, match="no camera"):
+        gsjax.plan(scene, [])
+    for budget in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="above 0"):
+            gsjax.plan(scene, view, budget=budget)
+    single = jax.tree.map(lambda a: a.astype(jnp.float32), scene.params)
+    with pytest.raises(InputError, match="float32"):
+        gsjax.plan(scene.replace(params=single), view, budget=1e-5)
+
+
+def test_batches_and_many_cameras_are_sampled_evenly():
+    views = looking(30, 0)
+    batch = gsjax.stack_cameras(views)
+    chosen = planning._sampled(batch)
+    assert len(chosen) == 12
+    for found, place in zip((chosen[0], chosen[-1]), (0, 29)):
+        np.testing.assert_array_equal(found.viewmat, views[place].viewmat)
+
+
+# --- gsjax render --budget ---
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("1/255", 1 / 255), ("0.004", 0.004), ("2e-3", 2e-3)]
+)
+def test_budgets_are_read(text, value):
+    assert parse_budget(text) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("text", ["", "0", "-1", "1/0", "1/", "a", "nan", "1e999/1"])
+def test_budgets_are_refused(text):
+    with pytest.raises(UsageError, match="--budget"):
+        parse_budget(text)
+
+
+@pytest.mark.usefixtures("as_fitting")
+def test_render_takes_the_plan_and_says_why(capsys):
+    scene = gsjax.grow(gaussians_at([[0, 0, 4]], 0.5, 0.7, degree=0), 9)
+    subject = Subject(lambda: scene, CONFIG, BEHIND, budget=0.05)
+    found, config = prepared(subject, looking(1, 0), ("rgb", "alpha"))
+    made = planned(scene, looking(1, 0), budget=0.05, outputs=("rgb", "alpha"))
+    assert (found.capacity, config) == (1, made.config)
+    told = capsys.readouterr().err.splitlines()
+    assert told == [f"gsjax: {line}" for line in made.lines()]
+    same, config = prepared(subject._replace(budget=None), looking(1, 0), ("rgb",))
+    assert (same, config) == (scene, CONFIG)
