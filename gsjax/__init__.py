@@ -25,8 +25,8 @@ from gsjax.gaussians import select as select
 from gsjax.gaussians import with_sh_degree as with_sh_degree
 from gsjax.io import load as load
 from gsjax.io import save as save
-from gsjax.planning import Plan as Plan
-from gsjax.planning import plan as plan
+from gsjax.planning.plan import plan as plan
+from gsjax.planning.types import Plan as Plan
 from gsjax.raster.reference import reference_render as reference_render
 from gsjax.raster.render import exact_config as exact_config
 from gsjax.raster.render import render as render

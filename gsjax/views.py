@@ -13,7 +13,7 @@ from gsjax.console import note, progress, say
 from gsjax.errors import InputError
 from gsjax.files import make_folder, refuse_existing, write_file
 from gsjax.gaussians import Gaussians, capacity_bucket
-from gsjax.planning import plan
+from gsjax.planning.plan import plan
 from gsjax.raster.render import exact_config, render_exact
 from gsjax.raster.types import RasterConfig, Render
 from gsjax.scene.transforms import CameraEntry

@@ -7,9 +7,11 @@ import pytest
 from conftest import LIGHT, camera_of, frustum_points, gaussians_at
 
 import gsjax
-from gsjax import RasterConfig, bounds, planning
+from gsjax import RasterConfig
 from gsjax.commands.common import UsageError, parse_budget
 from gsjax.errors import InputError
+from gsjax.planning import accuracy, bounds
+from gsjax.planning import plan as planning
 from gsjax.sh import sh_basis
 from gsjax.subjects import Subject
 from gsjax.views import prepared
@@ -66,7 +68,7 @@ def as_fitting(monkeypatch):
     def fit(gaussians, _, config):
         return config.replace(visible_capacity=gaussians.capacity), []
 
-    monkeypatch.setattr(planning, "_with_capacities", fit)
+    monkeypatch.setattr(planning, "with_capacities", fit)
 
 
 @pytest.fixture(scope="module")
@@ -193,7 +195,7 @@ def test_bounds_hold_where_they_matter():
 def test_faint_beyond_the_accurate_cut_are_not_overlooked():
     """Each below 1e-5, together a fog: the reference must go finer."""
     scene = fog(400, opacity=(4e-6, 8e-6))
-    cut = planning._reference_cut(scene, 1.0, 1e-3)
+    cut = accuracy._reference_cut(scene, 1.0, 1e-3)
     assert cut < 8e-6
     total = bounds.opacities(scene)
     assert total[total < cut].sum() <= 1e-4

@@ -16,7 +16,7 @@ import numpy as np
 from gsjax.bench import pixelwise
 from gsjax.console import progress
 from gsjax.gaussians import Gaussians, with_sh_degree
-from gsjax.planning import Plan
+from gsjax.planning.types import Plan
 from gsjax.raster.render import exact_config, render
 from gsjax.raster.types import RasterConfig
 from gsjax.scene.trials import Trial

@@ -1,7 +1,9 @@
 """What theory allows a setting to change at single pixels, in float64.
 
-The same argument as in `gsjax.bounds`, with the α of every splat at the pixel at hand:
-dense, so for some pixels only. Axis legend: N Gaussians, front to back, P pixels.
+The same argument as in `gsjax.planning.bounds`, with the α of every splat at the pixel
+at hand: dense, so for some pixels only.
+
+Axis legend: N Gaussians, front to back, P pixels.
 """
 
 from typing import NamedTuple
@@ -93,8 +95,8 @@ def allowed(
 ) -> np.ndarray:
     """[P] how far a channel may be off at the pixels, one knob after another.
 
-    Cap, cut, stop and SH degree as in `gsjax.bounds`; rounding by `ROUNDING`, and
-    neighbours in depth that float32 may exchange, T α_i α_j each.
+    Cap, cut, stop and SH degree as in `gsjax.planning.bounds`; rounding by `ROUNDING`,
+    and neighbours in depth that float32 may exchange, T α_i α_j each.
     """
     alpha, spread = found.alpha, found.spread
     capped = np.minimum(alpha, config.alpha_cap)

@@ -52,7 +52,7 @@ class BenchCommand(Command):
         from gsjax.bench.pareto import front, pareto, points, stages
         from gsjax.bench.scenes import open_trial
         from gsjax.bench.sheet import front_picture, table
-        from gsjax.planning import plan
+        from gsjax.planning.plan import plan
         from gsjax.timing import machine
 
         written = [path for path in (self.json, self.plot) if path is not None]

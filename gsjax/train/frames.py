@@ -18,6 +18,9 @@ from gsjax.scene.types import Photo, View
 
 Array = jax.Array
 
+# Steps derive keys of their own from the run's, by their number; none has this one.
+_ORDER = 2**32 - 1
+
 
 @partial(
     jax.tree_util.register_dataclass,
@@ -121,6 +124,7 @@ def draw(frames: Frames, key: Array, step: Array, batch: int) -> Batch:
     would have seen.
     """
     count = frames.count
+    key = jax.random.fold_in(key, _ORDER)
     number = step * batch + jnp.arange(batch, dtype=jnp.int32)
 
     def one(number):
