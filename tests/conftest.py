@@ -4,6 +4,7 @@ Compiling dominates the run time, so every scene of the catalogue has the same n
 of Gaussians and the same image size, and all tests call the same jitted functions.
 """
 
+import gc
 import os
 import tempfile
 from functools import partial
@@ -22,8 +23,12 @@ os.environ["XDG_CACHE_HOME"] = _CACHE.name
 import jax.numpy as jnp
 
 import gsjax
+import gsjax.devices
 from gsjax import Gaussians, RasterConfig
 from gsjax.cameras import Camera
+
+# Thousands of programs of all sizes in one process: memory kept would only pile up.
+gsjax.devices.keep_memory = lambda: False
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -37,6 +42,20 @@ PRESETS = {"compat": COMPAT, "accurate": ACCURATE, "fast": FAST}
 
 COUNT, WIDTH, HEIGHT = 192, 45, 29
 BACKGROUND = np.array([0.2, 0.5, 0.9])
+
+# Every program is a handful of mappings, of which Linux gives a process 65 530. Where
+# they run out XLA crashes, or hangs, wherever it is.
+_MANY_MAPPINGS = 30_000
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _room_for_programs():
+    yield
+    mappings = Path("/proc/self/maps")
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > _MANY_MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
+
 
 needs_two_devices = pytest.mark.skipif(
     jax.local_device_count() < 2, reason="needs two local devices"

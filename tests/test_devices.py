@@ -1,6 +1,8 @@
 """What JAX keeps of its compiling, and where."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -54,3 +56,26 @@ def test_the_oldest_go_first(tmp_path):
     assert {path.name for path in Path(tmp_path).iterdir()} == {"new", "middle"}
     devices._drop_oldest(tmp_path, 0)
     assert not list(tmp_path.iterdir())
+
+
+def test_memory_is_kept():
+    """In a process of its own: of a second call no page is new, where glibc allows."""
+    code = """
+import resource, sys
+import gsjax.devices, jax, jax.numpy as jnp
+if not gsjax.devices.keep_memory():
+    sys.exit("skip")
+f = jax.jit(lambda x: jnp.sort(x.reshape(64, -1), axis=0).sum())
+x = jnp.arange(2.0**24)
+faults = []
+for _ in range(4):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    f(x).block_until_ready()
+    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+assert faults[0] > 2**14, faults
+assert faults[-1] < faults[0] / 10, faults
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    if done.stderr.strip() == "skip":
+        pytest.skip("the allocator is not that of glibc")
+    assert done.returncode == 0, done.stderr
