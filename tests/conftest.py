@@ -57,6 +57,16 @@ def _room_for_programs():
         gc.collect()
 
 
+@pytest.fixture(scope="module")
+def quick_compiles():
+    """For a module whose programs are many and run once: XLA compiles them in half of
+    the time where it optimises little. What is computed is the same, to rounding.
+    """
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 needs_two_devices = pytest.mark.skipif(
     jax.local_device_count() < 2, reason="needs two local devices"
 )

@@ -17,6 +17,8 @@ from gsjax.bench.sheet import front_picture, table
 from gsjax.errors import InputError
 from gsjax.scene.trials import TRIALS, Trial
 
+pytestmark = pytest.mark.usefixtures("quick_compiles")
+
 BEHIND = np.array([0.2, 0.5, 0.9])
 COUNT, SIZE = 60, 16
 EXACT = RasterConfig(

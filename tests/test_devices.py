@@ -59,21 +59,21 @@ def test_the_oldest_go_first(tmp_path):
 
 
 def test_memory_is_kept():
-    """In a process of its own: of a second call no page is new, where glibc allows."""
+    """In a process of its own: calls that take no new page, of which else is none."""
     code = """
 import resource, sys
 import gsjax.devices, jax, jax.numpy as jnp
 if not gsjax.devices.keep_memory():
     sys.exit("skip")
 f = jax.jit(lambda x: jnp.sort(x.reshape(64, -1), axis=0).sum())
-x = jnp.arange(2.0**24)
+x = jnp.arange(10 * 2.0**20)  # 40 MB
 faults = []
-for _ in range(4):
+for _ in range(14):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     f(x).block_until_ready()
     faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-assert faults[0] > 2**14, faults
-assert faults[-1] < faults[0] / 10, faults
+assert faults[0] > 2**13, faults
+assert sum(count < 100 for count in faults[1:]) >= 3, faults
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     if done.stderr.strip() == "skip":

@@ -35,6 +35,8 @@ from gsjax.viewer.splats import (
 )
 from gsjax.viewer.stage import UPS, eye_of_cameras, eye_of_gaussians, frusta_of
 
+pytestmark = pytest.mark.usefixtures("quick_compiles")
+
 COUNT = 64
 
 

@@ -66,7 +66,6 @@ def transmittance(alpha: Array) -> tuple[Array, Array]:
 def _transmittance_jvp(primals, tangents):
     (alpha,), (d_alpha,) = primals, tangents
     total, before = transmittance(alpha)
-
     summed, sums = _running_sum(d_alpha / (1 - alpha))
     return (total, before), (-total * summed, -before * sums)
 
@@ -266,9 +265,6 @@ def composite(
 def _last_rows(schedule: Schedule, grid: Grid, steps: int) -> Array:
     """[T] where the sums of each tile are complete, as a row of [S · G]; past the end
     for a tile that nothing covers.
-
-    By a scatter, whose result XLA stores: an index that it may work out anew for each
-    of the C · P numbers of a row costs more than the whole compositing.
     """
     group = schedule.tiles.shape[1]
     last = jnp.cumsum(schedule.levels) - 1

@@ -25,6 +25,8 @@ from gsjax.train.step import Metrics, TrainState, init_state, make_train_step
 
 # Room beyond what is wanted now, so that it lasts for a while.
 _PAIR_MARGIN, _SLOT_MARGIN = 1.5, 1.3
+# Empty slots cost next to nothing; growing costs a compilation.
+_LEAST_SLOTS = 16_384
 _MAX_BAD_STEPS = 50
 _MAX_PROBED_VIEWS = 6
 
@@ -122,7 +124,7 @@ def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
         random_count=config.initial_count if config.initial == "random" else None,
         seed=config.seed,
     )
-    wanted = min(config.max_gaussians, 4 * gaussians.capacity)
+    wanted = min(config.max_gaussians, max(4 * gaussians.capacity, _LEAST_SLOTS))
     gaussians = grow(gaussians, max(gaussians.capacity, capacity_bucket(wanted)))
     return init_state(gaussians, config, extent_of(scene), len(scene.views))
 
