@@ -214,7 +214,10 @@ def test_interrupted_leaves_what_was_there(solved, room, tmp_path, monkeypatch, 
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals to oneself are POSIX")
-def test_ctrl_c_cancels_colmap():
+def test_ctrl_c_cancels_colmap(request):
+    # A shell starts what it puts in the background with Ctrl-C ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
     cancelled = threading.Event()
 
     def work(token):
