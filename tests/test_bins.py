@@ -117,6 +117,20 @@ def test_counts_are_caught_before_they_wrap(extra):
     assert bool(safe) == (int(counts[:100].astype(np.int64).sum()) < 2**30)
 
 
+@pytest.mark.parametrize(("group", "chunk"), [(1, 1), (8, 16), (8, 32), (2048, 32)])
+def test_steps_and_pairs_that_have_room_for_one_another(group, chunk):
+    """The capacity named for so many steps holds them; any less, to a millionth, not."""
+    grid = bins.make_grid(800, 600, 8, 1, 1)
+    steps = np.unique(np.geomspace(1, 5000, 60).astype(int))
+    for wanted in steps:
+        count = jnp.int32(wanted)
+        pairs = int(bins.pairs_for_steps(count, grid, group, chunk))
+        assert bins.step_capacity(pairs, grid, group, chunk) >= wanted
+        if pairs > 0:
+            fewer = int(pairs * (1 - 2e-6)) - 1
+            assert bins.step_capacity(fewer, grid, group, chunk) < wanted
+
+
 def test_schedule_covers_every_chunk_once():
     """Steps hold each pair exactly once, blocks in order, front to back."""
     chunk, group = 8, 4

@@ -170,11 +170,11 @@ def test_mapped_over_seeds_and_scanned_equals_the_loop():
 
 
 def test_what_is_not_finite_changes_only_the_step():
-    start = plain_state()
-    sh = start.gaussians.params.sh.at[7, 0, 1].set(1e200)  # its square is too much
-    params = start.gaussians.params.replace(sh=sh)
-    start = start.replace(gaussians=start.gaussians.replace(params=params))
-    after, (metrics,) = run_plain(start, 1)
+    start = tuned_state()
+    # Of a scene and its cameras the renderer leaves out what is not finite.
+    exposures = start.tuning.exposures.at[:, 0, 3].set(jnp.inf)
+    start = start.replace(tuning=replace(start.tuning, exposures=exposures))
+    after, metrics = tuned_step(start, tuned_batch())
     assert not metrics.finite
     assert not metrics.overflowed
     assert changed(start, after) == [".step"]

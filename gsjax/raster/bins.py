@@ -283,10 +283,12 @@ def step_capacity(capacity: int, grid: Grid, group: int, chunk: int) -> int:
 
 
 def pairs_for_steps(steps: Array, grid: Grid, group: int, chunk: int) -> Array:
-    """Pair capacity whose `step_capacity` holds ``steps``; saturating int32."""
+    """Smallest pair capacity whose `step_capacity` holds ``steps``, to a millionth;
+    saturating int32."""
     blocks = -(-grid.tiles // group)
     extra = jnp.maximum(steps - -(-blocks // 2), 0).astype(jnp.float32)
-    wanted = jnp.ceil(extra * (8 * group * chunk / 9) * (1 + 1e-6))
+    above = (extra - 1) * (8 * group * chunk / 9) * (1 + 1e-6)
+    wanted = jnp.where(extra > 0, jnp.floor(above) + 1, 0)
     huge = wanted >= COUNT_LIMIT
     return jnp.where(huge, 2**31 - 1, jnp.where(huge, 0, wanted).astype(jnp.int32))
 
