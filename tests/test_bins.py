@@ -119,7 +119,7 @@ def test_counts_are_caught_before_they_wrap(extra):
 
 @pytest.mark.parametrize(("group", "chunk"), [(1, 1), (8, 16), (8, 32), (2048, 32)])
 def test_steps_and_pairs_that_have_room_for_one_another(group, chunk):
-    """The capacity named for so many steps holds them; any less, to a millionth, not."""
+    """The capacity named for so many steps holds them, and a smaller one does not."""
     grid = bins.make_grid(800, 600, 8, 1, 1)
     steps = np.unique(np.geomspace(1, 5000, 60).astype(int))
     for wanted in steps:
