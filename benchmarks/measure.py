@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
+from gsjax import files
 from gsjax.timing import interleaved as interleaved
 from gsjax.timing import machine as machine
 from gsjax.timing import time_ms as time_ms
@@ -17,7 +17,7 @@ def save(name: str, rows: list[dict], **more) -> None:
     RESULTS.mkdir(exist_ok=True)
     content = {"machine": machine(), **more, "rows": rows}
     path = RESULTS / f"{name}.json"
-    path.write_text(json.dumps(content, indent=1) + "\n")
+    files.write_json(path, content)
     print(table(rows))
     print(f"written to {path.name}: {content['machine']}")
 

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import gsjax
+from gsjax.bench.scenes import facing
 from gsjax.sh import rgb_to_dc
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -42,17 +43,7 @@ def guitar() -> Case:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # 667 opacities of +inf are clamped
         gaussians = gsjax.load(DATA / "guitar" / "guitar.ply")
-    means = np.asarray(gaussians.params.means)
-    centre = np.median(means, axis=0)
-    radius = np.percentile(np.linalg.norm(means - centre, axis=1), 95)
-    eye = centre + np.array([0.3, 0.25, 1.0]) * radius * 1.85
-    camera = gsjax.make_camera(
-        viewmat=gsjax.look_at(eye, centre, (0, 1, 0)),
-        K=[[700, 0, 400], [0, 700, 300], [0, 0, 1]],
-        width=800,
-        height=600,
-    )
-    return Case("guitar", gaussians, camera)
+    return Case("guitar", gaussians, facing(gaussians, 800, 600))
 
 
 def garden(count: int = 100_000, opacity: float = 0.1) -> Case:

@@ -57,7 +57,7 @@ def main(dataset: Path, held_out: list[str]) -> None:
     measure.RESULTS.mkdir(exist_ok=True)
     path = measure.RESULTS / f"{name}.json"
     content = {"machine": measure.machine(), "claim": __doc__, "held out": held_out}
-    path.write_text(json.dumps({**content, "rows": rows}, indent=1) + "\n")
+    files.write_json(path, {**content, "rows": rows})
     title = f"{dataset.name}: PSNR of what was held out, dB"
     picture = curves(series, title=title, x_label="seconds")
     files.write_file(path.with_suffix(".png"), images.encode_png(picture))

@@ -12,7 +12,10 @@ from gsjax.files import write_file
 from gsjax.sheets import put_text, text_width
 
 _PAPER, _INK, _GRID = (255, 255, 255), (70, 74, 82), (228, 230, 234)
-_COLORS = ((38, 98, 186), (214, 92, 52), (44, 142, 92), (142, 82, 168), (176, 138, 28))
+COLORS = (
+    (38, 98, 186), (214, 92, 52), (44, 142, 92), (142, 82, 168), (176, 138, 28),
+    (20, 150, 170), (190, 60, 120), (110, 110, 110), (90, 60, 30), (0, 0, 0),
+)  # fmt: skip
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 18, 34, 40
 _FINE = 4  # bits of a pixel's fraction that OpenCV takes
 
@@ -75,15 +78,17 @@ def axes(
     *,
     title: str = "",
     x_label: str = "",
+    y_label: str = "",
     size: tuple[int, int] = (720, 420),
-    x_text: Callable[[float], str] | None = None,
+    log: tuple[bool, bool] = (False, False),
 ) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """An empty plot [H, W, 3] uint8, and what takes points [·, 2] to its px.
 
     Args:
       x, y: the ranges, from less to more.
       title, x_label, size: as `curves`.
-      x_text: of a tick of x; the number itself by default.
+      y_label: at the right above the frame, in place of a legend.
+      log: whether x, and y, are log10 of what their ticks are to say.
 
     Raises:
       InputError: if the size is too small.
@@ -99,12 +104,12 @@ def axes(
         return low + (points - least) / (most - least) * (high - low)
 
     plot = np.full((height, width, 3), _PAPER, np.uint8)
-    for tick in _ticks(*y, (height - _TOP - _BOTTOM) // 45):
-        v, text = round(place((x[0], tick))[1]), short_number(tick)
+    for tick, text in _ticks(*y, (height - _TOP - _BOTTOM) // 45, log[1]):
+        v = round(place((x[0], tick))[1])
         cv2.line(plot, (_LEFT, v), (width - _RIGHT, v), _GRID, 1)
         put_text(plot, text, (_LEFT - 8 - text_width(text), v + 4), _INK)
-    for tick in _ticks(*x, (width - _LEFT - _RIGHT) // 90):
-        u, text = round(place((tick, y[0]))[0]), (x_text or short_number)(tick)
+    for tick, text in _ticks(*x, (width - _LEFT - _RIGHT) // 90, log[0]):
+        u = round(place((tick, y[0]))[0])
         cv2.line(plot, (u, _TOP), (u, low[1]), _GRID, 1)
         put_text(plot, text, (u - text_width(text) // 2, low[1] + 16), _INK)
     frame = np.asarray([(_LEFT, _TOP), low, (width - _RIGHT, low[1])], np.int32)
@@ -112,6 +117,7 @@ def axes(
     put_text(plot, title, (_LEFT, 21), _INK, 0.5)
     middle = (_LEFT + width - _RIGHT - text_width(x_label)) // 2
     put_text(plot, x_label, (middle, height - 8), _INK)
+    put_text(plot, y_label, (width - _RIGHT - text_width(y_label), 21), _INK)
     return plot, place
 
 
@@ -120,7 +126,7 @@ def draw_line(plot: np.ndarray, points: np.ndarray, index: int) -> None:
     cv2 = images.opencv()
     if len(points):
         at = np.rint(points * 2**_FINE).astype(np.int32)
-        color = _COLORS[index % len(_COLORS)]
+        color = COLORS[index % len(COLORS)]
         cv2.polylines(plot, [at], False, color, 2, cv2.LINE_AA, _FINE)
 
 
@@ -144,12 +150,28 @@ def _range(values: np.ndarray, margin: float) -> tuple[float, float]:
     return low - margin * spread, high + margin * spread
 
 
-def _ticks(low: float, high: float, most: int) -> np.ndarray:
-    """Multiples of 1, 2 or 5 · 10^k within the range, about ``most`` of them."""
+def _ticks(low: float, high: float, most: int, log: bool) -> list[tuple[float, str]]:
+    """Where they are, and what they say: within the range, about ``most`` of them."""
+    if log:
+        return _decades(low, high)
     least = (high - low) / max(most, 1)
     power = 10 ** np.floor(np.log10(least))
     step = power * next((m for m in (1, 2, 5) if m * power >= least), 10)
-    return step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
+    places = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
+    return [(float(place), short_number(place)) for place in places]
+
+
+def _decades(low: float, high: float) -> list[tuple[float, str]]:
+    """Powers of ten from 10^low to 10^high, and between them where there is room."""
+    wide = high - low > 2
+    factors = (1,) if high - low > 4 else (1, 3) if wide else (1, 2, 5)
+    powers = range(int(np.floor(low)), int(np.ceil(high)) + 1)
+    found = [(k + float(np.log10(f)), f, k) for k in powers for f in factors]
+    return [
+        (place, short_number(f * 10.0**k) if k >= -4 else f"{f}e{k}")
+        for place, f, k in found
+        if low <= place <= high
+    ]
 
 
 def short_number(value: float) -> str:
@@ -167,6 +189,6 @@ def legend(plot: np.ndarray, labels: list[str]) -> None:
     for index in reversed(range(len(labels))):
         right -= text_width(labels[index])
         put_text(plot, labels[index], (right, 21), _INK)
-        color = _COLORS[index % len(_COLORS)]
+        color = COLORS[index % len(COLORS)]
         cv2.line(plot, (right - 22, 17), (right - 6, 17), color, 2, cv2.LINE_AA)
         right -= 36

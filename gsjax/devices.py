@@ -4,8 +4,8 @@ One host device for each core: XLA's CPU backend hardly uses a second core insid
 compositor's loop, so the tiles are spread over several devices instead.
 
 And memory that is kept: XLA allocates the temporaries of a program anew at each call.
-From 32 MB on, glibc takes them from the system every time, page by page, which cost a
-third of the compositing of an 800 × 600 image.
+From 32 MB on, glibc takes them from the system every time, page by page, which is a
+good part of the compositing of a large image.
 """
 
 import ctypes
@@ -57,9 +57,8 @@ def keep_memory() -> bool:
 
     Where the allocator is that of glibc; elsewhere nothing is changed. A thread's own
     blocks are kept up to 64 MB each. One arena for all threads would keep larger ones
-    too, but they then wait for one another: value and gradient of the compositor took
-    two and a half times as long. What the process holds does not fall below its peak
-    by more than what is above those 2 GB.
+    too, but they then wait for one another, which costs more than it saves. What the
+    process holds does not fall below its peak by more than what is above those 2 GB.
 
     Returns:
       Whether the allocator took it.

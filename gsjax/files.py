@@ -1,6 +1,7 @@
 """Files, read or refused by name, and written complete or not at all."""
 
 import json
+import math
 import os
 import secrets
 import stat
@@ -124,6 +125,17 @@ def write_file(path: Path, data: bytes, *, durable: bool = False) -> None:
         file.write(data)
 
 
+def write_json(path: Path, data: Any, *, indent: int = 1) -> None:
+    """Write ``data`` as JSON, without numbers that it lacks; as `write_file`."""
+    text = json.dumps(data, indent=indent, ensure_ascii=False, allow_nan=False)
+    write_file(path, f"{text}\n".encode())
+
+
+def finite_or_none(value: float) -> float | None:
+    """For JSON, which has no number for infinity or NaN."""
+    return value if math.isfinite(value) else None
+
+
 def make_folder(path: Path) -> None:
     """Create a folder and those above it.
 
@@ -147,5 +159,5 @@ def refuse_existing(paths: Iterable[Path], overwrite: bool) -> None:
     if found and not overwrite:
         more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
         raise InputError(
-            f"{found[0]}{more}: exists; pass --overwrite, or another folder with -o"
+            f"{found[0]}{more}: exists; pass --overwrite, or another name"
         )

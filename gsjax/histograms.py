@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax import files, images
-from gsjax.curves import axes, draw_line, legend, short_number
+from gsjax.curves import axes, draw_line, legend
 from gsjax.gaussians import Gaussians
 
 _BINS, _SIZE = 60, (720, 300)
@@ -70,7 +70,7 @@ def _histogram(
     top = 1.06 * max(1, *(int(each.max()) for each in counts))
     plot, place = axes(
         bounds, (0.0, top), title=title, x_label=x_label, size=_SIZE,
-        x_text=None if x else _power,
+        log=(not x, False),
     )  # fmt: skip
     for index, each in enumerate(counts):
         steps = np.stack(
@@ -88,8 +88,3 @@ def _rounded(logs: np.ndarray) -> tuple[float, float]:
         return -1.0, 0.0
     low, high = np.floor(2 * logs.min()) / 2, np.ceil(2 * logs.max()) / 2
     return float(low), float(max(high, low + 1))
-
-
-def _power(log: float) -> str:
-    """10 to the power of ``log``, short."""
-    return short_number(10.0**log) if log >= -4 else f"1e{log:g}"

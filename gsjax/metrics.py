@@ -12,9 +12,8 @@ Array = jax.Array
 
 _RADIUS, _SIGMA = 5, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
-# Rows of the window's matrix taken at a time. Measured on two cores, 3 channels of
-# 400 × 267, value and gradient: 24 ms with 128 or 64, 31 ms with all at once, 104 ms
-# as eleven shifted sums, 370 ms as a convolution.
+# Rows of the window's matrix taken at a time. On CPU products with such blocks are
+# faster than with the whole, than eleven shifted sums, and by far than a convolution.
 _BLOCK = 128
 
 

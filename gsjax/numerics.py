@@ -7,6 +7,7 @@ the output alone still multiplies an infinite derivative by zero.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 Array = jax.Array
 
@@ -14,6 +15,16 @@ Array = jax.Array
 # (e^20 = 4.9e8) or loss to denormals (e^-40, squared 1.8e-35). Values beyond are
 # clipped, not culled: a finite Gaussian stays visible.
 LOG_SCALE_RANGE = (-40.0, 20.0)
+
+
+def in_float64(tree):
+    """The same pytree with its floats in float64; within ``jax.enable_x64(True)``."""
+
+    def one(leaf):
+        floating = jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
+        return jnp.asarray(np.asarray(leaf), jnp.float64) if floating else leaf
+
+    return jax.tree.map(one, tree)
 
 
 def safe_divide(numerator: Array, denominator: Array, where: Array) -> Array:

@@ -26,6 +26,7 @@ import gsjax
 import gsjax.devices
 from gsjax import Gaussians, RasterConfig
 from gsjax.cameras import Camera
+from gsjax.stress.scenes import fields_at
 
 # Thousands of programs of all sizes in one process: memory kept would only pile up.
 gsjax.devices.keep_memory = lambda: False
@@ -180,24 +181,9 @@ def gaussians_at(points, scales, opacities, *, viewmat=None, seed=0, degree=3):
 
     Values are those of float32, as float64. Colours stay clear of the clip at 0.
     """
-    rng = np.random.default_rng(seed)
-    points = np.asarray(points, np.float64)
-    count = points.shape[0]
     viewmat = np.asarray(pose() if viewmat is None else viewmat, np.float32)
-    viewmat = viewmat.astype(np.float64)
-    means = np.linalg.solve(viewmat[:3, :3], (points - viewmat[:3, 3]).T).T
-    opacities = np.broadcast_to(np.asarray(opacities, np.float64), count)
-    bases = (degree + 1) ** 2
-    sh = rng.uniform(-0.1, 0.1, (count, bases, 3))
-    sh[:, 0] = rng.uniform(0.2, 1.7, (count, 3))
-    fields = {
-        "means": means,
-        "quats": rng.normal(size=(count, 4)) * rng.uniform(0.3, 3, (count, 1)),
-        "log_scales": np.log(np.broadcast_to(scales, (count, 3))),
-        "logit_opacities": np.log(opacities) - np.log1p(-opacities),
-        "sh": sh,
-    }
-    return gsjax.make_gaussians(**{k: np.float32(v) for k, v in fields.items()})
+    fields = fields_at(points, scales, opacities, viewmat, seed, degree)
+    return gsjax.make_gaussians(**fields)
 
 
 def frustum_points(rng, count=COUNT, near=2.0, far=8.0, spread=0.6) -> np.ndarray:

@@ -159,7 +159,7 @@ def test_json_and_markdown(monkeypatch, tmp_path, capsys):
     assert "nan **(outside)**" in text
     capsys.readouterr()
     assert stress(monkeypatch, "well", *args) == 3
-    assert "exists; --overwrite replaces it" in capsys.readouterr().err
+    assert "exists; pass --overwrite" in capsys.readouterr().err
     page.write_text("no marks")
     assert stress(monkeypatch, "well", "--markdown", str(page)) == 3
     assert "no place for the table" in capsys.readouterr().err

@@ -16,6 +16,7 @@ import numpy as np
 from gsjax.bench import pixelwise
 from gsjax.console import progress
 from gsjax.gaussians import Gaussians, with_sh_degree
+from gsjax.numerics import in_float64
 from gsjax.planning.types import Plan
 from gsjax.raster.render import exact_config, render
 from gsjax.raster.types import RasterConfig
@@ -144,7 +145,7 @@ def _run(
     with jax.enable_x64(point.double):
         scene, camera = trial.gaussians, trial.camera
         if point.double:
-            scene, camera = pixelwise.as_double((scene, camera))
+            scene, camera = in_float64((scene, camera))
         degree = scene.sh_degree if point.degree is None else point.degree
         config, sizes = point.config, point.config
         sizes = (sizes.alpha_cut, sizes.tile_size, sizes.chunk_size)
@@ -202,7 +203,7 @@ def _bounds(
 ) -> tuple[list[np.ndarray], float]:
     """What theory allows each point at the pixels; how far dense and exact differ."""
     with jax.enable_x64(True):
-        scene, camera = pixelwise.as_double((trial.gaussians, trial.camera))
+        scene, camera = in_float64((trial.gaussians, trial.camera))
         found = pixelwise.dense(scene, camera, trial.background, pixels)
         gap = np.abs(found.picture - exact[pixels[:, 1], pixels[:, 0]]).max()
         bounds = [

@@ -9,7 +9,6 @@ Axis legend: N Gaussians, front to back, P pixels.
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gsjax.cameras import Camera
@@ -28,6 +27,7 @@ class Dense(NamedTuple):
     """All splats at some pixels.
 
     Attributes:
+      order: [N] their slots.
       alpha: [N, P] without cut and cap.
       colors: [N, 3].
       near: [N] depth below which the next splat could be taken for the one in front.
@@ -35,6 +35,7 @@ class Dense(NamedTuple):
       picture: [P, 3] rgb.
     """
 
+    order: np.ndarray
     alpha: np.ndarray
     colors: np.ndarray
     near: np.ndarray
@@ -72,9 +73,8 @@ def dense(
     weight, left = _weights(alpha)
     picture = weight.T @ colors + left[:, None] * behind
     swappable = np.where(near[:-1] > depth[order][1:], 1.0, 0.0)
-    return Dense(
-        alpha, colors, np.append(swappable, 0), (high - low).max(axis=1), picture
-    )
+    spread = (high - low).max(axis=1)
+    return Dense(order, alpha, colors, np.append(swappable, 0), spread, picture)
 
 
 def _weights(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -123,20 +123,6 @@ def _band_change(
     found: Dense, gaussians: Gaussians, camera: Camera, degree: int
 ) -> np.ndarray:
     """Σ w_i |change of the colour|, the largest channel, [P]."""
-    projected = jax.jit(reference_project)(gaussians, camera)
-    depth, seen = np.asarray(projected[1]), np.asarray(projected[4])
-    seen = seen & np.asarray(gaussians.active)
-    order = np.flatnonzero(seen)[np.argsort(depth[seen], kind="stable")]
     fewer = jax.jit(reference_colors)(with_sh_degree(gaussians, degree), camera)
-    change = np.abs(np.asarray(fewer)[order] - found.colors)
+    change = np.abs(np.asarray(fewer)[found.order] - found.colors)
     return (_weights(found.alpha)[0].T @ change).max(axis=1)
-
-
-def as_double(tree):
-    """The same pytree with its floats in float64; with float64 on."""
-
-    def one(leaf):
-        floating = jnp.issubdtype(leaf.dtype, jnp.floating)
-        return jnp.asarray(np.asarray(leaf), jnp.float64) if floating else leaf
-
-    return jax.tree.map(one, tree)

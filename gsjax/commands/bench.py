@@ -1,6 +1,5 @@
 """`gsjax bench`: run time against error, on this machine."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -76,9 +75,10 @@ class BenchCommand(Command):
         say(", ".join(f"{name} {ms:.3g} ms" for name, ms in parts.items()))
         if self.json is not None:
             told: dict[str, Any] = {"machine": where, "stages": parts, "rows": rows}
-            text = json.dumps(told, indent=1) + "\n"
-            files.write_file(self.json, text.encode())
+            files.make_folder(self.json.parent)
+            files.write_json(self.json, told)
         if self.plot is not None:
+            files.make_folder(self.plot.parent)
             picture = front_picture(rows, trial.name)
             files.write_file(self.plot, images.encode_png(picture))
         bad = [f"{row['knob']} {row['value']}" for row in rows if not row["inside"]]

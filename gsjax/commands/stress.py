@@ -26,11 +26,12 @@ class StressCommand(Command):
 
     def run(self) -> int:
         start_jax()
+        from gsjax import files
         from gsjax.errors import InputError
         from gsjax.stress import run as stress
 
         if self.json is not None:
-            stress.check_free(self.json, self.overwrite)
+            files.refuse_existing([self.json], self.overwrite)
         cases = [c for c in stress.chosen(self.full) if self.only in c.name]
         if not cases:
             names = ", ".join(c.name for c in stress.chosen(self.full))
@@ -42,7 +43,8 @@ class StressCommand(Command):
         say(stress.summary(results))
         told = stress.as_json(results, self.full)
         if self.json is not None:
-            stress.write_json(self.json, told, self.overwrite)
+            files.make_folder(self.json.parent)
+            files.write_json(self.json, told)
             note(f"{self.json} written")
         if self.markdown is not None:
             stress.put_between_marks(self.markdown, stress.markdown(told))

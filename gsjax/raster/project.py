@@ -210,9 +210,9 @@ def _project_components(
     `project` runs it in a branch of its own, for two reasons. How it is fused, and so
     rounded, then does not depend on what uses it: images are the same bits whatever
     the capacity and the devices. And XLA's CPU backend evaluates a shared value anew
-    for each use that indexes it differently; were the derivatives by x, y and z put
-    into one array in the same loop, they would cost 160 ms in place of 3 (48 k
-    Gaussians, jax 0.10.2). It is recomputed in the backward pass rather than kept.
+    for each use that indexes it differently (jax 0.10.2): were the derivatives by x, y
+    and z put into one array in the same loop, they would cost as much as all the rest
+    of a render. It is recomputed in the backward pass rather than kept.
     """
     live = lax.iota(jnp.int32, rows.logit_opacities.shape[0]) < count
     for value in rows.colors:

@@ -4,7 +4,6 @@ SIFT features, matching, incremental mapping by COLMAP (Schönberger and Frahm,
 "Structure-from-Motion Revisited", CVPR 2016) through pycolmap, then undistortion.
 """
 
-import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsjax.errors import InputError, SfmError
-from gsjax.files import write_file
+from gsjax.files import write_json
 from gsjax.scene.sfm_colmap import (
     Shot,
     Tell,
@@ -161,7 +160,7 @@ def run_sfm(
         with _timed("undistortion", seconds):
             tell(f"undistorting {len(report.registered)} images")
             write_dataset(models[0], photographs, work, dataset)
-        write_file(dataset / "sfm.json", _json(report))
+        write_json(dataset / "sfm.json", _facts(report), indent=2)
         install(dataset, output, stage)
     return report
 
@@ -332,9 +331,8 @@ def _report(
     )
 
 
-def _json(report: SfmReport) -> bytes:
-    facts = {**asdict(report), "pycolmap": colmap().__version__}
-    return (json.dumps(facts, indent=2, ensure_ascii=False) + "\n").encode()
+def _facts(report: SfmReport) -> dict[str, Any]:
+    return {**asdict(report), "pycolmap": colmap().__version__}
 
 
 @contextmanager

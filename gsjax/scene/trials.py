@@ -11,8 +11,7 @@ import numpy as np
 from gsjax.cameras import Camera, make_camera
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.scene.synthetic import torus_knot_scene
-
-_C0 = 0.28209479177387814
+from gsjax.sh import rgb_to_dc
 
 
 class Trial(NamedTuple):
@@ -80,7 +79,7 @@ def _trial(name: str, depth, scales, opacity, rng, size: tuple[int, int]) -> Tri
         quats=rng.normal(size=(count, 4)),
         log_scales=np.log(scales),
         logit_opacities=np.log(opacity) - np.log1p(-opacity),
-        sh=(rng.uniform(0, 1, (count, 1, 3)) - 0.5) / _C0,
+        sh=rgb_to_dc(rng.uniform(0, 1, (count, 1, 3))),
     )
     K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
     camera = make_camera(viewmat=np.eye(4), K=K, width=width, height=height)

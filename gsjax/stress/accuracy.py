@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.numerics import in_float64
 from gsjax.raster.reference import reference_render
 from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig
@@ -20,7 +21,6 @@ from gsjax.stress.scenes import (
     each_alpha_oracle,
     fields_at,
     frustum,
-    in_float64,
     scene_of,
     unequal,
     usual,

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.gaussians import make_gaussians
+from gsjax.numerics import in_float64
 from gsjax.raster.bins import total_count
 from gsjax.raster.composite import _alphas, _running_product
 from gsjax.raster.reference import reference_render
@@ -19,7 +20,6 @@ from gsjax.stress.scenes import (
     double,
     fields_at,
     frustum,
-    in_float64,
     on_host,
     oracle,
     scene_of,

@@ -8,6 +8,7 @@ import numpy as np
 
 from gsjax.cameras import Camera
 from gsjax.gaussians import Gaussians, num_active
+from gsjax.numerics import in_float64
 from gsjax.raster.project import project
 from gsjax.raster.reference import reference_project
 from gsjax.stress.scenes import (
@@ -24,7 +25,6 @@ from gsjax.stress.scenes import (
     fields_at,
     frustum,
     host_fields,
-    in_float64,
     not_finite,
     on_host,
     oracle,

@@ -9,6 +9,7 @@ import numpy as np
 
 from gsjax.cameras import Camera, look_at
 from gsjax.gaussians import Gaussians, num_active
+from gsjax.numerics import in_float64
 from gsjax.raster.project import project
 from gsjax.scene.rebase import rebase
 from gsjax.scene.types import Scene, View
@@ -24,7 +25,6 @@ from gsjax.stress.scenes import (
     double,
     fields_at,
     frustum,
-    in_float64,
     oracle,
     pose,
     scene_of,

@@ -1,17 +1,13 @@
 """All cases, one after another: the scoreboard as lines, as Markdown, as JSON."""
 
-import json
-import math
-import os
-import platform
 from collections.abc import Iterator
-from datetime import date
 from pathlib import Path
 from typing import Any
 
 import jax
 
 from gsjax.errors import InputError
+from gsjax.files import finite_or_none, write_file
 from gsjax.stress import (
     accuracy,
     compositing,
@@ -22,6 +18,7 @@ from gsjax.stress import (
     precision,
 )
 from gsjax.stress.types import Case, Result, run_case
+from gsjax.timing import machine
 
 CASES: tuple[Case, ...] = (
     *needles.CASES,
@@ -92,37 +89,14 @@ def as_json(results: list[Result], full: bool) -> dict[str, Any]:
         "form": "full" if full else "short",
         "rows": [
             {
-                **{k: _plain(v) for k, v in result._asdict().items() if k != "more"},
+                **{k: v for k, v in result._asdict().items() if k != "more"},
+                "measured": finite_or_none(result.measured),
                 "margin": margin(result),
                 **({"more": result.more} if result.more else {}),
             }
             for result in results
         ],
     }
-
-
-def _plain(value):
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def machine() -> dict[str, str]:
-    """What the numbers were measured on, and when."""
-    devices = jax.local_devices()
-    return {
-        "date": date.today().isoformat(),
-        "jax": jax.__version__,
-        "python": platform.python_version(),
-        "cpu": f"{_cpu()}, {os.cpu_count()} cores",
-        "device": f"{devices[0].platform} ({devices[0].device_kind})",
-    }
-
-
-def _cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return next(x.split(":")[1].strip() for x in lines if "model name" in x)
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
 
 
 def markdown(told: dict[str, Any]) -> str:
@@ -143,7 +117,7 @@ def markdown(told: dict[str, Any]) -> str:
     lines += [
         "",
         f"{good} of {len(rows)} within their bounds; {told['form']} form, "
-        f"jax {where['jax']}, {where['cpu']}, {where['device']}, {where['date']}.",
+        f"jax {where['jax']}, {where['cpu']}, {where['devices']}, {where['date']}.",
     ]
     return "\n".join(lines)
 
@@ -169,21 +143,4 @@ def put_between_marks(path: Path, table: str) -> None:
             f"{path}: no place for the table; put the lines {_MARKS[0]} and "
             f"{_MARKS[1]} where it is to go"
         )
-    path.write_text(f"{before}{found}\n{table}\n{closed}{after}", encoding="utf-8")
-
-
-def write_json(path: Path, told: dict[str, Any], overwrite: bool) -> None:
-    """Save what `as_json` made.
-
-    Raises:
-      InputError: if the file exists and ``overwrite`` is not set.
-    """
-    check_free(path, overwrite)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
-
-
-def check_free(path: Path, overwrite: bool) -> None:
-    """Raises `InputError` if a file is in the way."""
-    if path.exists() and not overwrite:
-        raise InputError(f"{path} exists; --overwrite replaces it")
+    write_file(path, f"{before}{found}\n{table}\n{closed}{after}".encode())

@@ -15,9 +15,11 @@ import numpy as np
 
 from gsjax.cameras import Camera, look_at, make_camera
 from gsjax.gaussians import GaussianParams, Gaussians, make_gaussians, select
+from gsjax.numerics import in_float64
 from gsjax.raster.reference import reference_render
 from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig, Render
+from gsjax.sh import num_bases
 
 Array = jax.Array
 SLOTS, SIZE, FOCAL, BASES = 128, 32, 40.0, 16
@@ -52,16 +54,6 @@ def double(values) -> np.ndarray:
     return np.asarray(values, np.float64)
 
 
-def in_float64(tree):
-    """The same pytree with its floats as float64; within ``jax.enable_x64(True)``."""
-
-    def one(leaf):
-        floating = jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
-        return jnp.asarray(np.asarray(leaf), np.float64) if floating else leaf
-
-    return jax.tree.map(one, tree)
-
-
 def on_host(tree):
     """The same pytree as numpy arrays."""
     return jax.tree.map(np.asarray, tree)
@@ -82,7 +74,9 @@ def camera_of(viewmat=None, focal=FOCAL, centre=(16.6, 15.1), **kwargs) -> Camer
     return make_camera(viewmat=viewmat, K=single(K), **{**size, **kwargs})
 
 
-def fields_at(points, scales, opacities, viewmat=None, seed: int = 0) -> dict:
+def fields_at(
+    points, scales, opacities, viewmat=None, seed: int = 0, degree: int = 3
+) -> dict:
     """Arrays of `make_gaussians` for camera coordinates ``points`` [N, 3].
 
     Values of float32, so that both precisions see the same numbers. Colours stay
@@ -93,7 +87,7 @@ def fields_at(points, scales, opacities, viewmat=None, seed: int = 0) -> dict:
     count = len(points)
     viewmat = np.asarray(pose() if viewmat is None else viewmat, np.float64)
     opacities = np.broadcast_to(np.asarray(opacities, np.float64), count)
-    sh = rng.uniform(-0.1, 0.1, (count, BASES, 3))
+    sh = rng.uniform(-0.1, 0.1, (count, num_bases(degree), 3))
     sh[:, 0] = rng.uniform(0.2, 1.7, (count, 3))
     means = np.linalg.solve(viewmat[:3, :3], (points - viewmat[:3, 3]).T).T
     fields = {

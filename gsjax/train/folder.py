@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.files import read_json, write_file
+from gsjax.files import read_json, write_json
 from gsjax.gaussians import Gaussians
 from gsjax.io import load, save
 from gsjax.scene.dataset import load_dataset
@@ -168,8 +168,8 @@ def save_settings(folder: Path, settings: RunSettings) -> None:
     data = {k: v for k, v in vars(settings).items() if k != "config"}
     data["dataset"] = str(settings.dataset.resolve())
     train = json.loads(to_json(settings.config))
-    text = json.dumps({"format": _FORMAT, **data, "train": train}, indent=2)
-    write_file(run_files(folder).config, f"{text}\n".encode())
+    told = {"format": _FORMAT, **data, "train": train}
+    write_json(run_files(folder).config, told, indent=2)
 
 
 def save_scene(

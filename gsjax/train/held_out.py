@@ -1,6 +1,5 @@
 """How well a run shows the views it did not see, and the files that tell of it."""
 
-import json
 import time
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import numpy as np
 from gsjax import images
 from gsjax.errors import InputError
 from gsjax.evaluation import Summary, ViewResult, evaluate, summarise
-from gsjax.files import make_folder, write_file
+from gsjax.files import finite_or_none, make_folder, write_file, write_json
 from gsjax.gaussians import Gaussians
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
@@ -25,7 +24,6 @@ from gsjax.train.folder import (
     refined_data,
     run_files,
 )
-from gsjax.train.history import finite_or_none
 from gsjax.train.refined import refined_photos
 
 _PREVIEWED = 4
@@ -100,7 +98,7 @@ def write_evaluation(
         "gaussians": int(np.sum(gaussians.active)),
         "each": [_told(result) for result in results],
     }
-    write_file(files.eval, (json.dumps(told, indent=2) + "\n").encode())
+    write_json(files.eval, told)
     _write_preview(files, results)
     return summary
 

@@ -1,7 +1,6 @@
 """What a run wrote of its steps, read back, and as a picture."""
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,14 +8,9 @@ from typing import Any
 import numpy as np
 
 from gsjax.curves import Series, curves_png
-from gsjax.files import read_bytes, write_file
+from gsjax.files import finite_or_none, read_bytes, write_file
 
 _NEEDED = ("step", "seconds", "gaussians")
-
-
-def finite_or_none(value: float) -> float | None:
-    """For JSON, which has no number for infinity or NaN."""
-    return value if math.isfinite(value) else None
 
 
 def record_line(record: dict[str, Any]) -> str:

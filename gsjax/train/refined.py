@@ -3,7 +3,6 @@
 Axis legend: V views that were trained on.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 
 from gsjax.cameras import make_camera
 from gsjax.errors import InputError
-from gsjax.files import read_json, write_file
+from gsjax.files import read_json, write_json
 from gsjax.scene.colmap_model import MAX_COORDINATE
 from gsjax.scene.types import Photo, Scene, View
 from gsjax.train.tuning import Tuning, tuned_camera
@@ -84,7 +83,7 @@ def save_cameras(path: Path, scene: Scene) -> None:
         }
         for view in scene.views
     ]
-    write_file(path, (json.dumps({"views": views}, indent=1) + "\n").encode())
+    write_json(path, {"views": views})
 
 
 def with_cameras(scene: Scene, path: Path) -> Scene:
