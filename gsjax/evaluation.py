@@ -3,7 +3,7 @@
 Axis legend: H W image.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -108,8 +108,9 @@ def _over(photo: Photo, background: np.ndarray) -> np.ndarray:
     return truth * alpha + background * (1 - alpha)
 
 
-def summarise(results: Sequence[ViewResult]) -> Summary:
-    """Means; of no views NaN."""
+def summarise(results: Iterable[ViewResult]) -> Summary:
+    """Means of what `evaluate` gives; of no views NaN."""
+    results = list(results)
     scores = np.array([(r.psnr, r.ssim) for r in results]).reshape(-1, 2)
     means = scores.mean(0) if results else np.full(2, np.nan)
     return Summary(len(results), psnr=float(means[0]), ssim=float(means[1]))

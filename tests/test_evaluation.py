@@ -108,7 +108,7 @@ def test_summary_is_the_mean_of_the_views():
         ViewResult(str(i), p, s, none, none, none[..., 0], None)
         for i, (p, s) in enumerate([(20.0, 0.5), (30.0, 0.9), (25.0, 0.7)])
     ]
-    assert summarise(results) == (3, 25.0, pytest.approx(0.7), LPIPS_NOTE)
+    assert summarise(iter(results)) == (3, 25.0, pytest.approx(0.7), LPIPS_NOTE)
     nothing = summarise([])
     assert nothing.views == 0
     assert np.isnan([nothing.psnr, nothing.ssim]).all()
