@@ -21,11 +21,15 @@ _FINE = 4  # bits of a pixel's fraction that OpenCV takes
 
 
 class Series(NamedTuple):
-    """A line: ``y`` over ``x``, of one length; what is not finite is left out."""
+    """A line: ``y`` over ``x``, of one length; what is not finite is left out.
+
+    A ``faint`` one is thin and pale: noise, behind what matters.
+    """
 
     label: str
     x: Sequence[float] | np.ndarray
     y: Sequence[float] | np.ndarray
+    faint: bool = False
 
 
 def curves_png(
@@ -67,8 +71,9 @@ def curves(
     for index, points in enumerate(lines):
         gaps = np.flatnonzero(~np.isfinite(points).all(axis=1))
         for piece in np.split(points, gaps):
-            draw_line(plot, place(piece[np.isfinite(piece).all(axis=1)]), index)
-    legend(plot, [line.label for line in series])
+            there = place(piece[np.isfinite(piece).all(axis=1)])
+            draw_line(plot, there, index, series[index].faint)
+    legend(plot, [line.label for line in series], [line.faint for line in series])
     return plot
 
 
@@ -121,13 +126,20 @@ def axes(
     return plot, place
 
 
-def draw_line(plot: np.ndarray, points: np.ndarray, index: int) -> None:
+def draw_line(
+    plot: np.ndarray, points: np.ndarray, index: int, faint: bool = False
+) -> None:
     """A line through points [·, 2] in px, in the colour of the ``index``-th."""
     cv2 = images.opencv()
     if len(points):
         at = np.rint(points * 2**_FINE).astype(np.int32)
-        color = COLORS[index % len(COLORS)]
-        cv2.polylines(plot, [at], False, color, 2, cv2.LINE_AA, _FINE)
+        width = 1 if faint else 2
+        cv2.polylines(plot, [at], False, _color(index, faint), width, 16, _FINE)
+
+
+def _color(index: int, faint: bool) -> tuple[int, ...]:
+    color = COLORS[index % len(COLORS)]
+    return tuple(255 - (255 - c) * 45 // 100 for c in color) if faint else color
 
 
 def _points(line: Series) -> np.ndarray:
@@ -182,13 +194,13 @@ def short_number(value: float) -> str:
     return f"{value + 0.0:.4g}" if abs(value) > 1e-12 else "0"
 
 
-def legend(plot: np.ndarray, labels: list[str]) -> None:
+def legend(plot: np.ndarray, labels: list[str], faint: Sequence[bool] = ()) -> None:
     """Names in the colours of their lines, at the right above the frame."""
     cv2 = images.opencv()
     right = plot.shape[1] - _RIGHT
     for index in reversed(range(len(labels))):
         right -= text_width(labels[index])
         put_text(plot, labels[index], (right, 21), _INK)
-        color = COLORS[index % len(COLORS)]
+        color = _color(index, index < len(faint) and faint[index])
         cv2.line(plot, (right - 22, 17), (right - 6, 17), color, 2, cv2.LINE_AA)
         right -= 36

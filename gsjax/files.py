@@ -158,6 +158,4 @@ def refuse_existing(paths: Iterable[Path], overwrite: bool) -> None:
         raise InputError(f"{folders[0]}: is a folder; a file is to be written there")
     if found and not overwrite:
         more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-        raise InputError(
-            f"{found[0]}{more}: exists; pass --overwrite, or another name"
-        )
+        raise InputError(f"{found[0]}{more}: exists; pass --overwrite, or another name")

@@ -88,7 +88,7 @@ def write_curves(
     mean = total / np.where(count > 0, count, np.nan)
     left = int(metrics[-1]["gaussians"]) if metrics else 0
     series = [
-        Series("view of the step", steps, psnr),
+        Series("view of the step", steps, psnr, faint=True),
         Series(f"mean of {window}", steps[window // 2 :][: len(mean)], mean),
     ]
     if held_out:
