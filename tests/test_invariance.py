@@ -33,7 +33,7 @@ from conftest import (
 
 import gsjax
 from gsjax.errors import CapacityError
-from gsjax.raster.bins import total_count
+from gsjax.raster.counts import total_count
 
 KINDS = ("random", "wall", "equal_depths")
 DTYPES = (jnp.float32, jnp.float64)

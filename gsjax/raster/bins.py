@@ -16,11 +16,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from gsjax.numerics import safe_sqrt
+from gsjax.raster.counts import COUNT_LIMIT, expand, running_total, total_count
 from gsjax.raster.sorting import argsort_descending, sort_pairs
 from gsjax.raster.types import Array, Projected, RasterConfig
-
-# A total above this is reported as 2^31 - 1: int32 sums must not wrap.
-COUNT_LIMIT = 2**30
 
 
 class Grid(NamedTuple):
@@ -164,25 +162,6 @@ def _pixel_range(centre: Array, extent: Array, size: int) -> tuple[Array, Array]
     return first.astype(jnp.int32), last.astype(jnp.int32)
 
 
-def total_count(counts: Array) -> tuple[Array, Array]:
-    """Sum of int32 counts, saturating: (total, whether it is below `COUNT_LIMIT`)."""
-    safe = jnp.sum(counts.astype(jnp.float32)) < COUNT_LIMIT
-    total = jnp.sum(jnp.where(safe, counts, 0), dtype=jnp.int32)
-    return jnp.where(safe, total, 2**31 - 1), safe
-
-
-def expand(counts: Array, capacity: int) -> tuple[Array, Array]:
-    """Unroll ``counts`` [n] into ``capacity`` items: (owner, place within owner).
-
-    Items past the total have owner n. The counts must sum to less than 2^31.
-    """
-    ends = jnp.cumsum(counts)
-    passed = jnp.zeros(capacity, jnp.int32).at[ends].add(1, mode="drop")
-    owner = jnp.cumsum(passed)
-    starts = (ends - counts).at[owner].get(mode="fill", fill_value=0)
-    return owner, lax.iota(jnp.int32, capacity) - starts
-
-
 def _take(values: Array, index: Array) -> Array:
     return values.at[index].get(mode="fill", fill_value=0)
 
@@ -301,7 +280,7 @@ def make_work(
     fits = schedule.steps <= room
     block, level = expand(jnp.where(fits, schedule.levels, 0), room)
     live = block < blocks
-    start = jnp.cumsum(lists.length) - lists.length
+    start = running_total(lists.length) - lists.length
     tile = schedule.tiles.at[block].get(mode="fill", fill_value=lists.length.shape[0])
     offset = level[:, None, None] * chunk + lax.iota(jnp.int32, chunk)
     inside = live[:, None, None] & (offset < _take(lists.length, tile)[..., None])

@@ -21,6 +21,7 @@ import numpy as np
 from jax import lax
 
 from gsjax.raster.bins import Grid, Schedule, Work, tile_origins
+from gsjax.raster.counts import running_total
 from gsjax.raster.types import Array, Projected, RasterConfig
 
 _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
@@ -267,7 +268,7 @@ def _last_rows(schedule: Schedule, grid: Grid, steps: int) -> Array:
     for a tile that nothing covers.
     """
     group = schedule.tiles.shape[1]
-    last = jnp.cumsum(schedule.levels) - 1
+    last = running_total(schedule.levels) - 1
     last = jnp.where(schedule.levels > 0, last, steps)
     rows = last[:, None] * group + lax.iota(jnp.int32, group)
     none = jnp.zeros(grid.tiles, jnp.int32)

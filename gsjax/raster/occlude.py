@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from gsjax.numerics import safe_sqrt
+from gsjax.raster.counts import squeeze
 from gsjax.raster.types import Array, Projected, RasterConfig
 
 SQUARE = 16  # px; small enough that a splat of that size can close it with others
@@ -49,12 +50,9 @@ def _candidates(projected: Projected) -> tuple[Array, Array]:
     trace = 1 / (projected.inv_sx * projected.inv_sx) + projected.var_y
     wide = 2 * projected.det > trace * (0.5 * SQUARE) ** 2
     chosen = wide & (projected.opacity > 0.25) & (projected.reach > 0)
-    place = jnp.cumsum(chosen, dtype=jnp.int32)
-    room = min(CANDIDATES, place.shape[0])
-    target = jnp.where(chosen, place - 1, room)
-    index = jnp.full(room, place.shape[0], jnp.int32)
-    index = index.at[target].set(lax.iota(jnp.int32, place.shape[0]), mode="drop")
-    return index, jnp.minimum(place[-1], room)
+    room = min(CANDIDATES, chosen.shape[0])
+    index, count = squeeze(chosen, room)
+    return index, jnp.minimum(count, room)
 
 
 def _closed_from(

@@ -17,6 +17,7 @@ from gsjax import sh as sh_lib
 from gsjax.cameras import Camera, camera_centre
 from gsjax.gaussians import Gaussians
 from gsjax.numerics import exp_log_scale, safe_normalize, safe_sqrt
+from gsjax.raster.counts import squeeze
 from gsjax.raster.ladder import on_ladder
 from gsjax.raster.sorting import argsort_float
 from gsjax.raster.types import Array, Projected, RasterConfig
@@ -110,11 +111,7 @@ def _compact_and_sort(
     """Live slots by depth: squeezed together first, then sorted at their number."""
     slots = live.shape[0]
     room = min(config.visible_capacity or slots, slots)
-    place = jnp.cumsum(live, dtype=jnp.int32)
-    count = place[-1]
-    target = jnp.where(live, place - 1, room)
-    packed = jnp.full(room, slots, jnp.int32)
-    packed = packed.at[target].set(lax.iota(jnp.int32, slots), mode="drop")
+    packed, count = squeeze(live, room)
 
     def sort(size: int) -> Array:
         some = packed[:size]

@@ -15,6 +15,7 @@ from jax.sharding import Mesh, PartitionSpec
 from gsjax.gaussians import capacity_bucket
 from gsjax.raster import bins
 from gsjax.raster.composite import composite
+from gsjax.raster.counts import COUNT_LIMIT
 from gsjax.raster.ladder import on_ladder
 from gsjax.raster.occlude import hidden
 from gsjax.raster.types import Array, Demand, Projected, RasterConfig
@@ -61,11 +62,11 @@ def rasterise(
     images = {name: _untile(image, grid) for name, image in images.items()}
     overflowed = jnp.any(wanted > share)
     wanted = jnp.max(wanted)
-    limit = bins.COUNT_LIMIT // devices
+    limit = COUNT_LIMIT // devices
     capacity_wanted = jnp.where(wanted < limit, wanted * devices, 2**31 - 1)
     pairs_float = jnp.sum(pairs.astype(jnp.float32))
     total = jnp.where(
-        pairs_float < bins.COUNT_LIMIT, jnp.sum(pairs, dtype=jnp.int32), 2**31 - 1
+        pairs_float < COUNT_LIMIT, jnp.sum(pairs, dtype=jnp.int32), 2**31 - 1
     )
     demand = Demand(visible=jnp.int32(0), pairs=total, capacity=capacity_wanted)
     return images, demand, overflowed

@@ -1,0 +1,48 @@
+"""Sums of counts are exact, and saturate; lists are what the counts stand for."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.raster.counts import expand, running_total, squeeze, total_count
+
+
+@pytest.mark.parametrize("size", [1, 2, 63, 64, 65, 127, 1000, 4097])
+def test_running_totals(size):
+    counts = np.random.default_rng(size).integers(0, 2**20, size).astype(np.int32)
+    wanted = np.cumsum(counts, dtype=np.int32)
+    np.testing.assert_array_equal(jax.jit(running_total)(counts), wanted)
+    odd = counts % 2 == 1
+    found = jax.jit(running_total)(odd)
+    assert found.dtype == jnp.int32
+    np.testing.assert_array_equal(found, np.cumsum(odd))
+
+
+@pytest.mark.parametrize("room", [1, 30, 300])
+def test_squeeze_keeps_the_first(room):
+    chosen = np.random.default_rng(0).random(200) < 0.3
+    where = np.flatnonzero(chosen)
+    index, count = jax.jit(squeeze, static_argnums=1)(chosen, room)
+    assert int(count) == len(where)
+    wanted = np.full(room, 200)
+    wanted[: min(room, len(where))] = where[:room]
+    np.testing.assert_array_equal(index, wanted)
+
+
+def test_expand_unrolls_counts():
+    counts = np.array([2, 0, 3, 0, 0, 1], np.int32)
+    owner, place = jax.jit(expand, static_argnums=1)(counts, 9)
+    np.testing.assert_array_equal(owner, [0, 0, 2, 2, 2, 5, 6, 6, 6])
+    np.testing.assert_array_equal(place[:6], [0, 1, 0, 1, 2, 0])
+
+
+@pytest.mark.parametrize("extra", [-2, 0, 1, 2**30])
+def test_counts_are_caught_before_they_wrap(extra):
+    counts = np.full(1024, 2**21, np.int32)  # 2^31 in all: would wrap to -2^31
+    counts[0] = 2**21 + extra
+    total, safe = jax.jit(total_count)(counts)
+    assert not safe
+    assert int(total) == 2**31 - 1
+    total, safe = jax.jit(total_count)(counts[:100])
+    assert bool(safe) == (int(counts[:100].astype(np.int64).sum()) < 2**30)
