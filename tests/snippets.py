@@ -83,6 +83,8 @@ def _run(path: Path, claims: str) -> None:
     def check(*values) -> None:
         line = sys._getframe(1).f_lineno
         told.append(" ".join(map(str, values)))
+        if lines[line - 1].endswith("("):
+            raise AssertionError(f"{path.name}, line {line}: print on one line")
         claimed = _TOLD.match(lines[line - 1])
         if claimed and " ".join(told[-1].split()) != " ".join(claimed[1].split()):
             raise AssertionError(
