@@ -46,18 +46,18 @@ def row(field: ast.AnnAssign, told: str) -> str:
     if metavar:
         value = metavar[1]
     elif choices:
-        value = "|".join(str(v) for v in ast.literal_eval(f"[{choices[1]}]"))
+        value = ", ".join(str(v) for v in ast.literal_eval(f"[{choices[1]}]"))
     else:
         value = _WORDS[plain[1]] if plain else ""
     if kind.startswith("tuple"):
         value += " …"
-    written = f"--{name.replace('_', '-')} {value}".strip()
-    if "Positional" in kind:
-        written = value
+    value = f"*{value}*" if value else ""
+    option = f"`--{name.replace('_', '-')}`"
     if "'-o'" in kind:
-        written = f"-o {value}, {written}"
+        option = f"`-o`, {option}"
+    written = value if "Positional" in kind else f"{option} {value}".strip()
     default = "" if field.value is None else _literal(field.value)
-    cells = (f"`{written}`", f"`{default}`" if default else "", told)
+    cells = (written, f"`{default}`" if default else "", told)
     return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
 
 
@@ -66,7 +66,7 @@ def _literal(value: ast.expr) -> str:
     if isinstance(value, ast.Call):  # Path("…")
         value = value.args[0]
     plain = ast.literal_eval(value)
-    return "" if plain in (None, False, (), "") else str(plain)
+    return "" if plain is None or plain is False or plain in ((), "") else str(plain)
 
 
 def table(command: str) -> str:

@@ -45,7 +45,7 @@ class Gaussians:
 
     Attributes:
       params: N slots; what is differentiated.
-      active: [N] bool; what stands in a slot that is not never matters.
+      active: [N] bool; what the other slots hold never matters, NaN included.
     """
 
     params: GaussianParams
