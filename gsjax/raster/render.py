@@ -49,7 +49,7 @@ def render(
         pixels of the absolute per-pixel gradient.
 
     Returns:
-      `Render`. Look at ``overflowed``: if True the image is incomplete and
+      `Render`. Look at ``overflowed``; if True the image is incomplete, and
       ``demand.capacity`` is the `RasterConfig.pair_capacity` that would do.
 
     Raises:

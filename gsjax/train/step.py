@@ -125,7 +125,7 @@ def make_train_step(
 
     Returns:
       (`TrainState`, `Batch` of B views) → (`TrainState`, `Metrics`). Look at
-      ``overflowed``: if True, nothing was done.
+      ``overflowed``; if True, nothing was done.
     """
     densifier = config.densifier(extent)
     raster = (raster or config.raster).replace(
