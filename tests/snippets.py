@@ -1,7 +1,7 @@
 """Python and commands in Markdown, run and parsed as they stand.
 
 A page is one program: its ```python blocks, from top to bottom. Where a `print` has a
-comment behind it, that is what it must print. Blocks marked ``no-run`` are only
+comment behind it, that is what it must print. Blocks below <!-- no-run --> are only
 compiled; those that want photographs, say. Run as a program, this file runs the pages
 it is given, all in one process, so that they share what is compiled.
 """
@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-_BLOCK = re.compile(r"^```(\w+)(.*)\n((?:.*\n)*?)```$", re.M)
+_BLOCK = re.compile(r"^(?:<!-- (\S+) -->\n)?```(\w+)\n((?:.*\n)*?)```$", re.M)
 _TOLD = re.compile(r"^\s*print\(.*\)  # (.*)$")
 
 
@@ -24,7 +24,7 @@ def blocks(text: str, language: str, *, marked: str = "") -> list[tuple[int, str
     return [
         (text[: found.start(3)].count("\n"), found[3])
         for found in _BLOCK.finditer(text)
-        if found[1] == language and found[2].strip() == marked
+        if found[2] == language and (found[1] or "") == marked
     ]
 
 

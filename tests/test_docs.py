@@ -173,7 +173,9 @@ def test_pages_fetch_nothing_from_elsewhere(site):
         r"(?:src|href)=[\"']?((?:https?:)?//[^\"'> ]+)"
     )
     for page in pages:
-        assert re.findall(fetched, page.read_text(encoding="utf-8")) == [], page
+        text = page.read_text(encoding="utf-8")
+        assert re.findall(fetched, text) == [], page
+        assert "```" not in text, "all blocks are drawn as such"
     for sheet in site.rglob("*.css"):
         text = sheet.read_text(encoding="utf-8")
         assert not re.search(r"(?:@import|url\()\s*[\"']?(?:https?:)?//", text), sheet
@@ -190,7 +192,7 @@ def test_reference_shows_what_docstrings_say(site):
 
 
 def test_blocks_know_their_lines():
-    text = "a\n```python\nx = 1\n```\n```python no-run\ny\n```\n"
+    text = "a\n```python\nx = 1\n```\n<!-- no-run -->\n```python\ny\n```\n"
     assert blocks(text, "python") == [(2, "x = 1\n")]
-    assert blocks(text, "python", marked="no-run") == [(5, "y\n")]
+    assert blocks(text, "python", marked="no-run") == [(6, "y\n")]
     assert program(text).splitlines()[2] == "x = 1"
