@@ -194,7 +194,12 @@ def camera_centre(viewmat: Array) -> Array:
 
 
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The same view at another resolution: intrinsics scale with the pixels."""
+    """The same view at another resolution: intrinsics scale with the pixels.
+
+    Args:
+      camera: one, or a batch.
+      width, height: new image size in px; another aspect ratio stretches the image.
+    """
     sx, sy = width / camera.width, height / camera.height
     scale = jnp.asarray([[sx, 1, sx], [1, sy, sy], [1, 1, 1]], camera.K.dtype)
     return replace(camera, K=camera.K * scale, width=width, height=height)
@@ -202,6 +207,9 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
 
 def stack_cameras(cameras: list[Camera]) -> Camera:
     """A batch from single cameras of one size and model.
+
+    Args:
+      cameras: B of them, arrays [4, 4], [3, 3], [] each; [B, …] in the batch.
 
     Raises:
       InputError: if there are none, or their sizes or models differ.
@@ -219,8 +227,9 @@ def look_at(eye, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
     """World → camera [4, 4] (float64, on the host) of a camera at ``eye``.
 
     Args:
-      eye, target: world positions (3,); they must differ.
-      up: world direction that points to the top of the image.
+      eye, target: [3] world positions; they must differ.
+      up: [3] world direction that points to the top of the image, of any length; where
+        it is along the view, any other is taken.
     """
     eye, target, up = (np.asarray(v, np.float64) for v in (eye, target, up))
     forward = target - eye

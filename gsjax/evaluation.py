@@ -43,7 +43,14 @@ class ViewResult(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """Means over the views; ``lpips`` says why there is none."""
+    """Means over the views.
+
+    Attributes:
+      views: how many.
+      psnr: dB; NaN of no views.
+      ssim: at most 1; NaN of no views.
+      lpips: why there is none.
+    """
 
     views: int
     psnr: float
@@ -70,10 +77,14 @@ def evaluate(
       gaussians: the scene.
       views, photos: as many of one as of the other.
       config: how to render.
-      background: RGB behind the scene, and behind transparent photographs.
+      background: [3] RGB behind the scene, and behind transparent photographs.
 
     Yields:
       One result for each view, as soon as it is there.
+
+    Raises:
+      ValueError: if there are more of one than of the other.
+      CapacityError: as `render_exact`.
     """
     config = (config or RasterConfig()).replace(outputs=("rgb", "depth"))
     behind = np.asarray(background, np.float32)
@@ -109,7 +120,7 @@ def _over(photo: Photo, background: np.ndarray) -> np.ndarray:
 
 
 def summarise(results: Iterable[ViewResult]) -> Summary:
-    """Means of what `evaluate` gives; of no views NaN."""
+    """Means of PSNR (dB) and SSIM over what `evaluate` gives; of no views NaN."""
     results = list(results)
     scores = np.array([(r.psnr, r.ssim) for r in results]).reshape(-1, 2)
     means = scores.mean(0) if results else np.full(2, np.nan)

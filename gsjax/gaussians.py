@@ -41,7 +41,12 @@ class GaussianParams:
 
 @chex.dataclass(frozen=True, mappable_dataclass=False)
 class Gaussians:
-    """Parameters and the mask [N] of the slots that hold a Gaussian."""
+    """A scene: parameters, and which slots hold a Gaussian.
+
+    Attributes:
+      params: N slots; what is differentiated.
+      active: [N] bool; what the other slots hold never matters, NaN included.
+    """
 
     params: GaussianParams
     active: Array
@@ -128,6 +133,10 @@ def capacity_bucket(count: int, minimum: int = 1024) -> int:
     """Smallest of the sizes 2^k and 1.5 · 2^k that holds ``count``.
 
     Growing through buckets recompiles once for every factor of 1.33 to 1.5.
+
+    Args:
+      count: what is to be held.
+      minimum: the smallest bucket, itself a 2^k or 1.5 · 2^k.
     """
     size = minimum
     while size < count:
@@ -145,12 +154,16 @@ def activate(params: GaussianParams) -> dict[str, Array]:
 
 
 def num_active(gaussians: Gaussians) -> Array:
-    """Count of active slots, int32."""
+    """Count of active slots, [] int32; traceable."""
     return jnp.sum(gaussians.active, dtype=jnp.int32)
 
 
 def grow(gaussians: Gaussians, capacity: int) -> Gaussians:
     """The same Gaussians in more slots; the new ones are inactive.
+
+    Args:
+      gaussians: N slots.
+      capacity: slots afterwards, N or more.
 
     Raises:
       InputError: if ``capacity`` is below the present one (see `compact`).
@@ -180,7 +193,7 @@ def empty_like(gaussians: Gaussians, capacity: int) -> Gaussians:
 
 
 def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
-    """All slots of both, in order.
+    """All slots of both, N and M, in order: N + M slots.
 
     Raises:
       InputError: if the SH degrees differ.
@@ -221,7 +234,12 @@ def compact(gaussians: Gaussians, capacity: int | None = None) -> Gaussians:
 
 
 def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """The same Gaussians at another degree: bands are cut, or added as zeros."""
+    """The same Gaussians at another degree: bands are cut, or added as zeros.
+
+    Args:
+      gaussians: ``sh`` [N, K, 3].
+      degree: 0 to 4; K is (degree + 1)² afterwards.
+    """
     sh = gaussians.params.sh
     bases = sh_lib.num_bases(degree)
     extra = max(0, bases - sh.shape[1])

@@ -12,7 +12,12 @@ Array = jax.Array
 
 
 def l1(image: Array, target: Array, weight: Array | None = None) -> Array:
-    """Mean absolute difference of [H, W, C], weighted by [H, W]."""
+    """Mean absolute difference, [].
+
+    Args:
+      image, target: [H, W, C].
+      weight: [H, W], 0 where a pixel is to be left out; or None.
+    """
     image, target = seen_only(image, target, weight)
     return weighted_mean(jnp.mean(jnp.abs(image - target), -1), weight)
 

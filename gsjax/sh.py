@@ -22,7 +22,11 @@ def num_bases(degree: int) -> int:
 
 
 def degree_of(bases: int) -> int:
-    """Degree with ``bases`` basis functions; `ValueError` if there is none."""
+    """Degree with ``bases`` basis functions.
+
+    Raises:
+      ValueError: if there is none, from 0 to 4.
+    """
     degree = math.isqrt(bases) - 1
     if degree < 0 or degree > MAX_DEGREE or num_bases(degree) != bases:
         wanted = [num_bases(d) for d in range(MAX_DEGREE + 1)]

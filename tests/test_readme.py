@@ -1,16 +1,12 @@
 """The README's Python runs as it stands, and its table is that of the code."""
 
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
+from snippets import ROOT, blocks, run_pages
 
 import gsjax
 
-ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 # What the snippets claim in their comments.
 CLAIMS = """
@@ -26,19 +22,8 @@ assert np.abs(screen).max() > 0
 
 @pytest.mark.long
 def test_python_blocks_run(tmp_path):
-    """In a process of their own: float32, all cores, as a user would."""
-    blocks = re.findall(r"^```python\n(.*?)^```$", README, re.M | re.S)
-    assert len(blocks) >= 5
-    script = tmp_path / "readme.py"
-    script.write_text("\n".join([*blocks, CLAIMS]), encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, "-W", "error::UserWarning", str(script)],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    assert len(blocks(README, "python")) >= 5
+    assert run_pages([ROOT / "README.md"], claims=CLAIMS, cwd=tmp_path) == ""
     assert (tmp_path / "scene.ply").exists()
 
 

@@ -49,6 +49,9 @@ class AdaptiveSettings:
       max_gaussians: never more than that.
       initial_opacity: of the Gaussians that a run starts from.
       initial_scale: of those, times the distance to the nearest neighbours.
+
+    Raises:
+      InputError: if a setting is out of its range.
     """
 
     start: int = 500
@@ -102,7 +105,12 @@ class AdaptiveStats(NamedTuple):
 
 
 def adaptive(settings: AdaptiveSettings, extent: float) -> Densifier:
-    """The strategy for a scene of this extent (in its units)."""
+    """The strategy, for `TrainConfig.densifier` and tests.
+
+    Args:
+      settings: see there.
+      extent: of the scene, in its units; see `gsjax.scene.initialise.scene_extent`.
+    """
 
     def init(gaussians: Gaussians) -> AdaptiveStats:
         def zeros():  # each its own: a step that is donated takes no array twice

@@ -42,6 +42,9 @@ class McmcSettings:
       opacity_penalty, scale_penalty: weights of the means over all Gaussians.
       initial_opacity: of the Gaussians that a run starts from.
       initial_scale: of those, times the distance to the nearest neighbours.
+
+    Raises:
+      InputError: if a setting is out of its range.
     """
 
     start: int = 500

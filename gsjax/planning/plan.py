@@ -56,7 +56,7 @@ def plan(
       tune: also time tile and chunk sizes on the first camera.
 
     Returns:
-      `Plan`: render its ``gaussians`` with its ``config``.
+      A plan; render its ``gaussians`` with its ``config``.
 
     Raises:
       InputError: if there is no camera, or the budget is not above 0, or is below what

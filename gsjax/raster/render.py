@@ -49,7 +49,7 @@ def render(
         pixels of the absolute per-pixel gradient.
 
     Returns:
-      `Render`. Look at ``overflowed``: if True the image is incomplete and
+      `Render`. Look at ``overflowed``; if True the image is incomplete, and
       ``demand.capacity`` is the `RasterConfig.pair_capacity` that would do.
 
     Raises:
@@ -200,6 +200,7 @@ def render_exact(
 
     Raises:
       CapacityError: if more than ``max_capacity`` is wanted.
+      InputError: as `render`.
     """
     while True:
         result = _render_jit(gaussians, camera, config, background, **kwargs)
@@ -217,8 +218,14 @@ def exact_config(
 ) -> RasterConfig:
     """``config`` with capacities that fit these cameras, for use under jit.
 
-    They are the buckets just above what this view wants: larger than needed by a
-    third at most, so that nothing is paid for slots that are empty or out of view.
+    They are the buckets just above what this view wants, larger by half at most (or
+    1024), so that little is paid for slots that are empty or out of view.
+
+    Args:
+      gaussians: N slots, concrete.
+      camera: one, or a batch, which is then rendered in one call.
+      config: all else stays as it is.
+      max_capacity: as for `render_exact`.
 
     Raises:
       CapacityError: as `render_exact`.

@@ -53,6 +53,9 @@ class RasterConfig:
       rungs: how many sizes, each a quarter of the one before, sorting, binning and
         compositing are compiled for; the smallest that fits is run.
       devices: how many devices share the tiles; None means all local ones.
+
+    Raises:
+      InputError: if a setting is out of its range.
     """
 
     alpha_cut: float = 1 / 255

@@ -22,7 +22,12 @@ _MAX_WHOLE = 1 << 63
 
 @dataclass(frozen=True)
 class Level:
-    """From ``start``, a share of all steps, images are ``divisor`` times smaller."""
+    """From ``start`` on, images are ``divisor`` times smaller.
+
+    Attributes:
+      start: share of all steps, 0 to 1.
+      divisor: of width and height.
+    """
 
     start: float
     divisor: int
@@ -52,6 +57,9 @@ class TrainConfig:
       every_eval: in steps, measure the held-out views; 0 only at the end.
       every_checkpoint: in steps; 0 only at the end.
       raster: how to render; sizes in it are set by the run.
+
+    Raises:
+      InputError: if a setting is out of its range.
     """
 
     steps: int = 30_000

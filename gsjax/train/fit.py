@@ -164,6 +164,9 @@ def fit(
       pair_capacity: of that state's run.
       hooks: see `Hooks`.
 
+    Returns:
+      The state after the last step, and what it needed; the scene is ``.gaussians``.
+
     Raises:
       InputError: if photos and views do not match, or there is nothing to start from.
       CapacityError: if a view wants more pairs than can be addressed.
@@ -321,5 +324,5 @@ def grow_state(state: TrainState, capacity: int) -> TrainState:
 
 
 def subset(scene: Scene, indices: Sequence[int]) -> Scene:
-    """The scene with some of its views."""
+    """The scene with some of its views, by their indices, in this order."""
     return replace(scene, views=tuple(scene.views[i] for i in indices))

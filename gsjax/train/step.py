@@ -122,6 +122,10 @@ def make_train_step(
       extent: of the scene, in its units.
       raster: how to render, with a `pair_capacity` that fits; default
         ``config.raster``.
+
+    Returns:
+      (`TrainState`, `Batch` of B views) → (`TrainState`, `Metrics`). Look at
+      ``overflowed``; if True, nothing was done.
     """
     densifier = config.densifier(extent)
     raster = (raster or config.raster).replace(
