@@ -35,6 +35,7 @@ from gsjax.train.folder import (
     save_scene,
     save_settings,
 )
+from gsjax.train.health import is_seen
 from gsjax.train.held_out import results_of, write_evaluation, write_preview
 from gsjax.train.history import keep_steps, read_metrics, record_line, write_curves
 from gsjax.train.refined import refined_photos, refined_scene, save_cameras
@@ -246,7 +247,7 @@ def _hooks(sitting: _Sitting) -> Iterator[Hooks]:
 
     def measure(state: TrainState, progress: Progress) -> None:
         scene, photos = sitting.held_out(sitting.cameras(state))
-        if photos:
+        if any(map(is_seen, photos)):
             found = results_of(state.gaussians, scene, photos, config)
             summary = summarise(list(found))
             sitting.log_held_out(state, summary, sitting.seconds(progress))
@@ -279,13 +280,23 @@ def _save(sitting: _Sitting, result: FitResult) -> None:
         save_cameras(files.cameras, cameras)
 
 
+def _any_to_measure(sitting: _Sitting) -> bool:
+    if not sitting.data.test:
+        return False
+    _, photos = sitting.held_out(sitting.data.scene)
+    if any(map(is_seen, photos)):
+        return True
+    note("warning: all held-out views are masked altogether: nothing is measured")
+    return False
+
+
 def _evaluate(
     sitting: _Sitting, result: FitResult, photos: list[Photo]
 ) -> Summary | None:
     """Of the held-out views; where there are none, only the preview is written."""
     config, data, files = sitting.config, sitting.data, sitting.files
     cameras = sitting.cameras(result.state)
-    if not data.test:
+    if not _any_to_measure(sitting):
         scene = subset(cameras, data.train)
         photos = refined_photos(photos, sitting.scene.views, scene.views)
         write_preview(files, config, result.gaussians, scene, photos)

@@ -1,0 +1,206 @@
+"""Datasets that no one should train on end in a finite scene, or in one clear line.
+
+By the real entry, both strategies. Programs are shared among runs: compiling would be
+all that is done here.
+"""
+
+import json
+import warnings
+
+import jax
+import numpy as np
+import pytest
+from hostile import HOSTILE, harmless, write_hostile
+
+import gsjax
+import gsjax.train.fit as fit_module
+from gsjax.densify.adaptive import AdaptiveSettings
+from gsjax.densify.mcmc import McmcSettings
+from gsjax.errors import DivergedError, InputError
+from gsjax.raster.types import RasterConfig
+from gsjax.train.checkpoint import load_checkpoint
+from gsjax.train.config import TrainConfig
+from gsjax.train.folder import RunSettings
+from gsjax.train.health import Health
+from gsjax.train.held_out import evaluate_run
+from gsjax.train.history import read_metrics
+from gsjax.train.run import start_run
+from gsjax.train.step import Metrics
+
+pytestmark = pytest.mark.usefixtures("quick_compiles", "float32", "shared_programs")
+
+STEPS = 24
+MOST = 60  # on 16 tiles: one capacity of pairs does for all
+CONFIG = TrainConfig(
+    steps=STEPS,
+    sh_degree=0,
+    every_checkpoint=10,
+    adaptive=AdaptiveSettings(
+        start=0, stop=20, every=5, threshold=1e-6, reset_every=10, max_gaussians=MOST
+    ),
+    mcmc=McmcSettings(start=0, stop=20, every=5, growth=1.3, max_gaussians=MOST),
+    raster=RasterConfig(rungs=1, devices=1, chunk_size=4, occlusion=False),
+)
+# Of another shape: with one strategy, to compile less.
+ONE_PROGRAM_MORE = "one photograph"
+REFUSED = {
+    "no points": "no points to start from; start from random ones",
+    "all behind the cameras": "all 5,000 points lie behind all 2 cameras",
+    "all masked": "all 2 photographs are masked altogether",
+}
+
+
+@pytest.fixture(scope="module")
+def float32():
+    """As users have it."""
+    jax.config.update("jax_enable_x64", False)
+    yield
+    jax.config.update("jax_enable_x64", True)
+
+
+@pytest.fixture(scope="module")
+def shared_programs():
+    """A program for each strategy and shape of the photographs, whosever run it is."""
+    compiled, compile_one = {}, fit_module._Run.program
+
+    def program(self, state, frames, raster):
+        extent = np.float32(fit_module.extent_of(self.scene))
+        key = (self.config, extent, frames.valid is None)
+        self.programs = compiled.setdefault(key, {})
+        return compile_one(self, state, frames, raster)
+
+    fit_module._Run.program = program
+    yield compiled
+    fit_module._Run.program = compile_one
+
+
+def settings_of(folder, made, strategy, **changes) -> RunSettings:
+    data = write_hostile(folder / "data", made)
+    return RunSettings(data, CONFIG.replace(strategy=strategy, **changes))
+
+
+def assert_sound(run) -> gsjax.Gaussians:
+    """Its scene loads and is finite, as is all that was logged."""
+    with warnings.catch_warnings():
+        # Far from the origin what float32 rounds is told.
+        warnings.filterwarnings("ignore", message=".*jax_enable_x64")
+        gaussians = gsjax.load(run / "splat.ply")
+    for leaf in jax.tree.leaves(gaussians.params):
+        assert np.isfinite(leaf).all()
+    lines = [json.loads(x) for x in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == list(range(1, STEPS + 1))
+    assert all(line["finite"] and line["loss"] is not None for line in lines)
+    return gaussians
+
+
+@pytest.mark.filterwarnings("ignore:.*masked altogether and teach nothing")
+@pytest.mark.parametrize(
+    ("name", "strategy"),
+    [
+        (name, strategy)
+        for name in HOSTILE
+        for strategy in ("adaptive", "mcmc")
+        if strategy == "mcmc" or name != ONE_PROGRAM_MORE
+    ],
+)
+def test_ends_in_a_finite_scene_or_in_one_line(name, strategy, tmp_path):
+    settings, run = settings_of(tmp_path, HOSTILE[name](), strategy), tmp_path / "run"
+    if name in REFUSED:
+        with pytest.raises(InputError, match=REFUSED[name]):
+            start_run(settings, run)
+        assert not (run / "splat.ply").exists()
+        return
+    result = start_run(settings, run)
+    assert result.finished
+    gaussians = assert_sound(run)
+    assert result.gaussians == int(gaussians.active.sum()) <= MOST
+    if result.summary is None:
+        assert name == ONE_PROGRAM_MORE
+        with pytest.raises(InputError, match=r"no test views .* --views train"):
+            evaluate_run(run)
+        return
+    told = json.loads((run / "eval.json").read_text())
+    assert np.isfinite(told["ssim"])
+    assert result.summary.views == 1
+
+
+# --- divergence ---
+
+
+def wild(state):
+    """As absurd learning rates leave it: with steps that lead out of the numbers."""
+    mu = jax.tree.map(lambda a: a + 1e30, state.moments.mu)
+    return state.replace(moments=state.moments._replace(mu=mu))
+
+
+def garish(state):
+    """Colours that no picture has."""
+    params = state.gaussians.params
+    params = params.replace(sh=params.sh + 1e3)
+    return state.replace(gaussians=state.gaussians.replace(params=params))
+
+
+FAULTS = {
+    wild: "a Gaussian was not finite in 12",
+    garish: "farther from the photograph than any can be in 12",
+}
+
+
+@pytest.mark.parametrize("change", FAULTS, ids=lambda change: change.__name__)
+def test_a_diverging_run_is_stopped_and_what_was_good_is_kept(
+    change, tmp_path, monkeypatch
+):
+    """After step 11 something happens; half of so short a run is time enough."""
+    settings = settings_of(tmp_path, harmless(), "mcmc")
+    run, happened = tmp_path / "run", 11
+    advance = fit_module._Run.with_room
+
+    def with_room(self, state, metrics):
+        state = advance(self, state, metrics)
+        return change(state) if metrics.step == happened else state
+
+    monkeypatch.setattr(fit_module._Run, "with_room", with_room)
+    with pytest.raises(DivergedError, match=FAULTS[change]) as caught:
+        start_run(settings, run)
+    assert caught.value.exit_code == 5
+    assert len(read_metrics(run / "metrics.jsonl")) == happened + STEPS // 2 - 1
+    (kept,) = (run / "checkpoints").iterdir()
+    good = load_checkpoint(kept)
+    assert good.step == 10  # and not 20, though that was due
+    for name, array in good.arrays.items():
+        assert not name.startswith(".gaussians.params") or np.isfinite(array).all()
+
+
+def metrics_of(step, **changes) -> Metrics:
+    fine = {"loss": 0.2, "psnr": 15.0, "pairs": 99, "finite": True}
+    rest = dict.fromkeys(Metrics._fields, 0)
+    told = {**rest, "overflowed": False, **fine, **changes, "step": step}
+    return Metrics(**{name: np.asarray(value) for name, value in told.items()})
+
+
+def test_what_counts_as_diverging():
+    """Steps in a row, and only what can be nothing else."""
+
+    def run(bad, steps=1000, start=1):
+        health = Health(steps)
+        for step in range(start):
+            health.look(metrics_of(step))
+        for step in range(start, start + 50):
+            health.look(metrics_of(step, **bad))
+        return health
+
+    nothing = {"pairs": 0}
+    for bad in ({"finite": False}, {"psnr": -0.1}, nothing):
+        with pytest.raises(DivergedError, match=r"in 50 steps running, up to step 50"):
+            run(bad)
+    with pytest.raises(DivergedError, match=r"in 8 steps running"):
+        run({"finite": False}, steps=16)
+    # Photographs of nothing are shown by nothing; and what never was cannot be lost.
+    assert run({**nothing, "loss": 0.001}).bad == 0
+    assert run(nothing, start=0).bad == 0
+    for fine in ({"psnr": 0.1}, {"psnr": np.inf}, {"loss": 50.0}):
+        assert run(fine).bad == 0
+    health = run({})
+    for step in range(200):
+        health.look(metrics_of(step, finite=bool(step % 40)))
+    assert health.bad == 0
