@@ -119,7 +119,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
             temporary.unlink()
 
 
-def write_file(path: Path, data: bytes, *, durable: bool = False) -> None:
+def write_file(path: Path, data: bytes | memoryview, *, durable: bool = False) -> None:
     """Write all of a file; as `replacing`."""
     with replacing(path, durable=durable) as file:
         file.write(data)

@@ -14,9 +14,10 @@ from hostile import HOSTILE, harmless, write_hostile
 
 import gsjax
 import gsjax.train.fit as fit_module
+from gsjax import memory
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
-from gsjax.errors import DivergedError, InputError
+from gsjax.errors import CapacityError, DivergedError, InputError
 from gsjax.raster.types import RasterConfig
 from gsjax.train.checkpoint import load_checkpoint
 from gsjax.train.config import TrainConfig
@@ -24,7 +25,7 @@ from gsjax.train.folder import RunSettings
 from gsjax.train.health import Health
 from gsjax.train.held_out import evaluate_run
 from gsjax.train.history import read_metrics
-from gsjax.train.run import start_run
+from gsjax.train.run import resume_run, start_run
 from gsjax.train.step import Metrics
 
 pytestmark = pytest.mark.usefixtures("quick_compiles", "float32", "shared_programs")
@@ -204,3 +205,38 @@ def test_what_counts_as_diverging():
     for step in range(200):
         health.look(metrics_of(step, finite=bool(step % 40)))
     assert health.bad == 0
+
+
+# --- memory ---
+
+
+def test_a_run_that_would_not_fit_does_not_start(tmp_path, monkeypatch):
+    settings, run = settings_of(tmp_path, harmless(), "mcmc"), tmp_path / "run"
+    monkeypatch.setattr(memory, "available", lambda: 10**8)
+    with pytest.raises(CapacityError, match=r"this run .* 100 MB is free; lower"):
+        start_run(settings, run)
+    assert not (run / "checkpoints").exists()
+    with memory.unlimited():
+        assert resume_run(run).finished
+
+
+def test_a_run_that_outgrows_the_memory_is_saved(tmp_path, monkeypatch):
+    """And ends, once it may, as if nothing had been."""
+    whole = start_run(settings_of(tmp_path, harmless(), "mcmc"), tmp_path / "whole")
+    compile_one, calls = fit_module._Run.program, []
+
+    def program(self, *sizes):
+        calls.append(1)
+        if len(calls) == 13:
+            raise CapacityError("too much")
+        return compile_one(self, *sizes)
+
+    monkeypatch.setattr(fit_module._Run, "program", program)
+    run = tmp_path / "run"
+    with pytest.raises(CapacityError, match="too much"):
+        start_run(settings_of(tmp_path / "again", harmless(), "mcmc"), run)
+    kept = sorted(path.name for path in (run / "checkpoints").iterdir())
+    assert kept == ["step_000000010.npz", "step_000000012.npz"]
+    assert resume_run(run).finished
+    splats = (f.read_bytes() for f in (run / "splat.ply", whole.files.splat))
+    assert len(set(splats)) == 1

@@ -6,12 +6,12 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.commands.common import Command, UsageError, start_jax
+from gsjax.commands.common import HeavyCommand, UsageError, start_jax
 from gsjax.console import decibels, note, say
 
 
 @dataclass(kw_only=True)
-class TrainCommand(Command):
+class TrainCommand(HeavyCommand):
     """Train a scene on a dataset: COLMAP, nerfstudio, NeRF or LLFF."""
 
     dataset: Positional[Path]

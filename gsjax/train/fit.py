@@ -14,12 +14,14 @@ import numpy as np
 
 from gsjax.errors import CapacityError
 from gsjax.gaussians import Gaussians, capacity_bucket, grow, make_gaussians
+from gsjax.memory import require
 from gsjax.raster.render import exact_config
 from gsjax.raster.types import RasterConfig
 from gsjax.scene.initialise import init_gaussians, scene_extent
 from gsjax.scene.types import Photo, Scene
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
+from gsjax.train.footprint import step_estimate
 from gsjax.train.frames import Frames, draw, make_frames
 from gsjax.train.health import Health, check_photos, check_points
 from gsjax.train.step import Metrics, TrainState, init_state, make_train_step
@@ -127,9 +129,14 @@ def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
         random_count=config.initial_count if config.initial == "random" else None,
         seed=config.seed,
     )
-    wanted = min(config.max_gaussians, max(4 * gaussians.capacity, _LEAST_SLOTS))
-    gaussians = grow(gaussians, max(gaussians.capacity, capacity_bucket(wanted)))
+    gaussians = grow(gaussians, first_slots(gaussians.capacity, config))
     return init_state(gaussians, config, extent_of(scene), len(scene.views))
+
+
+def first_slots(count: int, config: TrainConfig) -> int:
+    """Slots that a run which starts with ``count`` Gaussians starts with."""
+    wanted = min(config.max_gaussians, max(4 * count, _LEAST_SLOTS))
+    return max(count, capacity_bucket(wanted))
 
 
 def empty_state(
@@ -170,15 +177,18 @@ def fit(
     Raises:
       InputError: if photos and views do not match, or there is nothing to start from,
         or to learn from.
-      CapacityError: if a view wants more pairs than can be addressed.
+      CapacityError: if a view wants more pairs than can be addressed, or a step more
+        memory than there is (see `gsjax.memory`); what was learnt until then has gone
+        to ``hooks.checkpoint``.
       DivergedError: if for 50 steps running, or half of a short run, numbers are not
         finite, pictures are worse than any can be, or nothing is in view any more.
     """
     check_photos(scene, photos)
     hooks = hooks or Hooks()
-    begun = initial_state(scene, config) if state is None else state
     # The step takes the state's memory over: not the caller's, and none twice.
-    own: TrainState = jax.tree.map(jnp.copy, begun)
+    own: TrainState = jax.tree.map(
+        jnp.copy, initial_state(scene, config) if state is None else state
+    )
     return _Run(scene, photos, config, hooks).loop(own, pair_capacity)
 
 
@@ -210,7 +220,12 @@ class _Run:
             raster = config.raster.replace(
                 pair_capacity=pair_capacity, visible_capacity=None
             )
-            program = self.program(state, frames, raster)
+            try:
+                program = self.program(state, frames, raster)
+            except CapacityError:
+                if progress is not None:  # nothing that was learnt is lost
+                    hooks.checkpoint(state, pair_capacity, progress)
+                raise
             state, metrics = program(state, frames)
             metrics = jax.device_get(metrics)
             if metrics.overflowed:
@@ -264,9 +279,15 @@ class _Run:
         shapes = (frames.pixels.shape, state.gaussians.capacity, raster)
         if shapes not in self.programs:
             height, width = frames.pixels.shape[1:3]
-            self.hooks.phase(
-                f"compiling for {width} × {height} px, "
-                f"{state.gaussians.capacity:,} slots, {raster.pair_capacity:,} pairs"
+            slots, pairs = state.gaussians.capacity, raster.pair_capacity
+            told = f"{width} × {height} px, {slots:,} slots, {pairs:,} pairs"
+            self.hooks.phase(f"compiling for {told}")
+            nbytes = frames.pixels.nbytes
+            require(
+                step_estimate(slots, (width, height), self.config, raster, nbytes),
+                f"a step for {told},",
+                "train with smaller photographs (--max-size) or fewer Gaussians "
+                "(--max-gaussians)",
             )
             begun = time.perf_counter()
             train_step = make_train_step(self.config, extent_of(self.scene), raster)

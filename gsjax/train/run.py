@@ -12,6 +12,8 @@ from gsjax.console import decibels, note, stopping_on_ctrl_c
 from gsjax.errors import InputError
 from gsjax.evaluation import Summary, summarise
 from gsjax.files import make_folder
+from gsjax.gaussians import capacity_bucket
+from gsjax.memory import available, require, size_text
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.checkpoint import load_latest, restore, save_checkpoint
@@ -22,6 +24,7 @@ from gsjax.train.fit import (
     Progress,
     empty_state,
     extent_of,
+    first_slots,
     fit,
     subset,
 )
@@ -35,6 +38,7 @@ from gsjax.train.folder import (
     save_scene,
     save_settings,
 )
+from gsjax.train.footprint import run_estimate
 from gsjax.train.health import is_seen
 from gsjax.train.held_out import results_of, write_evaluation, write_preview
 from gsjax.train.history import keep_steps, read_metrics, record_line, write_curves
@@ -195,6 +199,7 @@ def _train(sitting: _Sitting, watch: Watch | None) -> RunResult:
         f"{len(data.scene.views)} views ({len(data.test)} held out), "
         f"{len(data.scene.points):,} points; loading the photographs"
     )
+    _check_memory(sitting)
     photos = load_photos(scene.views, config.max_size)
     for path in (files.metrics, files.held_out):
         keep_steps(path, start.step)
@@ -222,6 +227,33 @@ def _train(sitting: _Sitting, watch: Watch | None) -> RunResult:
         gaussians=int(np.sum(result.gaussians.active)),
         summary=summary,
     )
+
+
+def _check_memory(sitting: _Sitting) -> None:
+    """Tell what the run will take, and refuse what would not fit as it is."""
+    config, scene, state = sitting.config, sitting.scene, sitting.start.state
+    if state is None:
+        given = len(scene.points)
+        given = config.initial_count if config.initial == "random" else given
+        count = max(1, min(given, config.max_initial, config.max_gaussians))
+        slots = first_slots(count, config)
+    else:
+        count, slots = int(np.sum(state.gaussians.active)), state.gaussians.capacity
+    now = run_estimate(scene, config, count, slots)
+    most = max(config.max_gaussians, count)
+    then = run_estimate(scene, config, most, capacity_bucket(most)).total
+    free = available()
+    told = "" if free is None else f"; {size_text(free)} is free"
+    note(
+        f"memory: about {size_text(now.total)} at first, {size_text(then)} with "
+        f"{most:,} Gaussians{told}"
+    )
+    require(now, "this run", "lower --max-size or --max-gaussians")
+    if free is not None and then > free:
+        note(
+            f"warning: {most:,} Gaussians would not fit; the run is saved and stops "
+            "where it would take more than there is: lower --max-gaussians to avoid it"
+        )
 
 
 @contextmanager
