@@ -4,8 +4,12 @@ By the real entry, both strategies. Programs are shared among runs: compiling wo
 all that is done here.
 """
 
+import errno
 import json
+import signal
 import warnings
+from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -14,7 +18,8 @@ from hostile import HOSTILE, harmless, write_hostile
 
 import gsjax
 import gsjax.train.fit as fit_module
-from gsjax import memory
+from gsjax import cli, memory
+from gsjax.commands.train import TrainCommand
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import CapacityError, DivergedError, InputError
@@ -240,3 +245,105 @@ def test_a_run_that_outgrows_the_memory_is_saved(tmp_path, monkeypatch):
     assert resume_run(run).finished
     splats = (f.read_bytes() for f in (run / "splat.ply", whole.files.splat))
     assert len(set(splats)) == 1
+
+
+# --- out of space ---
+
+
+@pytest.fixture
+def train(tmp_path, monkeypatch, capsys):
+    """`gsjax train` of a small dataset: its code, and the lines on stderr."""
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    settings = settings_of(tmp_path, harmless(), "mcmc")
+    monkeypatch.setattr(TrainCommand, "_settings", lambda _: settings)
+
+    def run(folder, *more):
+        code = cli.main(["train", str(settings.dataset), "-o", str(folder), *more])
+        return code, capsys.readouterr().err.splitlines()
+
+    yield run
+    signal.signal(signal.SIGINT, handler)
+
+
+class Whole(NamedTuple):
+    """What a run leaves behind, and how many bytes it wrote on the way."""
+
+    left: tuple
+    written: int
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What a run leaves that nothing happened to."""
+    folder = tmp_path_factory.mktemp("whole")
+    settings, plenty = settings_of(folder, harmless(), "mcmc"), 10**9
+    with pytest.MonkeyPatch.context() as patched:
+        left = full_after(patched, plenty)
+        start_run(settings, folder / "run")
+    return Whole(left_behind(folder / "run"), plenty - left[0])
+
+
+def left_behind(run):
+    """All that may not differ, and nothing that may."""
+    lines = read_metrics(run / "metrics.jsonl")
+    varying = ("seconds", "compile_seconds", "compilations")
+    log = [{k: v for k, v in x.items() if k not in varying} for x in lines]
+    assert not list(run.rglob("*.tmp"))
+    (last,) = list((run / "checkpoints").glob(f"step_*{STEPS}.npz"))
+    arrays = {k: v.tobytes() for k, v in load_checkpoint(last).arrays.items()}
+    scores = json.loads((run / "eval.json").read_text())["each"]
+    return log, arrays, scores, (run / "splat.ply").read_bytes()
+
+
+class Full:
+    """A file on a disk that takes so many bytes more, ``left``."""
+
+    def __init__(self, file, left):
+        self._file, self._left = file, left
+
+    def __getattr__(self, name):
+        return getattr(self._file, name)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._file.close()
+
+    def write(self, data):
+        if len(data) > self._left[0]:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self._left[0] -= len(data)
+        return self._file.write(data)
+
+
+def full_after(monkeypatch, budget):
+    """Let whatever is opened to write take so many bytes together; what is left."""
+    left, open_ = [budget], Path.open
+
+    def opened(self, mode="r", *args, **kwargs):
+        file = open_(self, mode, *args, **kwargs)
+        return Full(file, left) if {"w", "a", "x"} & set(mode) else file
+
+    monkeypatch.setattr(Path, "open", opened)
+    return left
+
+
+# As shares of all that is written: settings, log, three checkpoints, scene, pictures.
+@pytest.mark.parametrize("share", [0, 0.01, 0.2, 0.5, 0.8, 0.9, 0.99, 0.9999])
+def test_a_full_disk_loses_nothing(share, train, whole, tmp_path, monkeypatch):
+    """What was saved stays; one line says so; once there is room, the same bits."""
+    run = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        full_after(patched, int(share * whole.written))
+        code, told = train(run)
+    assert code == 3
+    assert "No space left on device; free some space" in told[-1]
+    assert not list(run.rglob("*.tmp"))
+    kept = sorted(run.glob("checkpoints/*"))
+    assert len(kept) == min(int(share * 4), 2)
+    for path in kept:
+        load_checkpoint(path)
+    code, told = train(run, "--resume")
+    assert code == 0, told
+    assert left_behind(run) == whole.left

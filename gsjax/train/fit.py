@@ -21,15 +21,13 @@ from gsjax.scene.initialise import init_gaussians, scene_extent
 from gsjax.scene.types import Photo, Scene
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
-from gsjax.train.footprint import step_estimate
+from gsjax.train.footprint import first_slots, step_estimate
 from gsjax.train.frames import Frames, draw, make_frames
 from gsjax.train.health import Health, check_photos, check_points
 from gsjax.train.step import Metrics, TrainState, init_state, make_train_step
 
 # Room beyond what is wanted now, so that it lasts for a while.
 _PAIR_MARGIN, _SLOT_MARGIN = 1.5, 1.3
-# Empty slots cost next to nothing; growing costs a compilation.
-_LEAST_SLOTS = 16_384
 _MAX_PROBED_VIEWS = 6
 
 
@@ -131,12 +129,6 @@ def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
     )
     gaussians = grow(gaussians, first_slots(gaussians.capacity, config))
     return init_state(gaussians, config, extent_of(scene), len(scene.views))
-
-
-def first_slots(count: int, config: TrainConfig) -> int:
-    """Slots that a run which starts with ``count`` Gaussians starts with."""
-    wanted = min(config.max_gaussians, max(4 * count, _LEAST_SLOTS))
-    return max(count, capacity_bucket(wanted))
 
 
 def empty_state(

@@ -7,20 +7,31 @@ beside its state and its photographs.
 import math
 
 import jax
+import numpy as np
 
+from gsjax.console import note
 from gsjax.gaussians import capacity_bucket
-from gsjax.memory import Estimate
+from gsjax.memory import Estimate, available, require, size_text
 from gsjax.raster.render import render_estimate
 from gsjax.raster.types import RasterConfig
 from gsjax.scene.types import Scene
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
+from gsjax.train.step import TrainState
 
+# Empty slots cost next to nothing; growing costs a compilation.
+_LEAST_SLOTS = 16_384
 # Compiling a step: 0.9 GB for two CPU devices, most of which stays with the process.
 _COMPILING = 900_000_000
 # Pairs of a Gaussian before they are counted: four to five in trained scenes, with the
 # room that `fit` leaves beyond them.
 _PAIRS = 7.5
+
+
+def first_slots(count: int, config: TrainConfig) -> int:
+    """Slots that a run which starts with ``count`` Gaussians starts with."""
+    wanted = min(config.max_gaussians, max(4 * count, _LEAST_SLOTS))
+    return max(count, capacity_bucket(wanted))
 
 
 def state_bytes(slots: int, config: TrainConfig) -> int:
@@ -81,6 +92,41 @@ def run_estimate(scene: Scene, config: TrainConfig, count: int, slots: int) -> E
         "of Gaussians and their moments": state_bytes(slots, config),
     }
     return Estimate({**held, **step.parts})
+
+
+def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) -> None:
+    """Tell what a run will take, and refuse what would not fit as it is.
+
+    Args:
+      scene: the views to train on.
+      config: of the run.
+      state: to go on from; None at the beginning.
+
+    Raises:
+      CapacityError: with the numbers.
+    """
+    if state is None:
+        given = len(scene.points)
+        given = config.initial_count if config.initial == "random" else given
+        count = max(1, min(given, config.max_initial, config.max_gaussians))
+        slots = first_slots(count, config)
+    else:
+        count, slots = int(np.sum(state.gaussians.active)), state.gaussians.capacity
+    now = run_estimate(scene, config, count, slots)
+    most = max(config.max_gaussians, count)
+    then = run_estimate(scene, config, most, capacity_bucket(most)).total
+    free = available()
+    told = "" if free is None else f"; {size_text(free)} is free"
+    note(
+        f"memory: about {size_text(now.total)} at first, {size_text(then)} with "
+        f"{most:,} Gaussians{told}"
+    )
+    require(now, "this run", "lower --max-size or --max-gaussians")
+    if free is not None and then > free:
+        note(
+            f"warning: {most:,} Gaussians would not fit; the run is saved and stops "
+            "where it would take more than there is: lower --max-gaussians to avoid it"
+        )
 
 
 def _scaled(width: int, height: int, longest: int | None) -> tuple[int, int]:
