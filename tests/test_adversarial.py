@@ -6,6 +6,7 @@ all that is done here.
 
 import errno
 import json
+import os
 import signal
 import warnings
 from pathlib import Path
@@ -18,6 +19,7 @@ from hostile import HOSTILE, harmless, write_hostile
 
 import gsjax
 import gsjax.train.fit as fit_module
+import gsjax.train.run as run_module
 from gsjax import cli, memory
 from gsjax.commands.train import TrainCommand
 from gsjax.densify.adaptive import AdaptiveSettings
@@ -247,7 +249,20 @@ def test_a_run_that_outgrows_the_memory_is_saved(tmp_path, monkeypatch):
     assert len(set(splats)) == 1
 
 
-# --- out of space ---
+# --- the command line: interrupted, and out of space ---
+
+# Where a Ctrl-C comes, how often, and the step that is then saved; None: none is.
+INTERRUPTED = {
+    "loading": (1, None),
+    "compiling": (1, 1),
+    "compiling, twice": (2, None),
+    "stepping": (1, 7),
+    "densifying": (1, 5),
+    "saving": (1, 10),
+    "saving, twice": (2, 10),
+    "at the end": (1, STEPS),
+    "evaluating": (1, STEPS),
+}
 
 
 @pytest.fixture
@@ -293,6 +308,67 @@ def left_behind(run):
     arrays = {k: v.tobytes() for k, v in load_checkpoint(last).arrays.items()}
     scores = json.loads((run / "eval.json").read_text())["each"]
     return log, arrays, scores, (run / "splat.ply").read_bytes()
+
+
+def interrupt(monkeypatch, where, times):
+    """Raise that many signals there, the first time that it is come to."""
+    done = []
+
+    def now():
+        if not done:
+            done.append(1)
+            for _ in range(times):
+                signal.raise_signal(signal.SIGINT)
+
+    def before(owner, name, when=lambda *_: True):
+        original = getattr(owner, name)
+
+        def replaced(*args, **kwargs):
+            if when(*args):
+                now()
+            return original(*args, **kwargs)
+
+        monkeypatch.setattr(owner, name, replaced)
+
+    phase = where.partition(",")[0]
+    if phase == "loading":
+        before(run_module, "load_photos")
+    elif phase == "compiling":
+        before(fit_module._Run, "program")
+    elif phase == "stepping":
+        before(fit_module._Run, "with_room", lambda _r, _s, m: m.step == 7)
+    elif phase == "densifying":  # after the fifth step, in its program
+        before(fit_module._Run, "program", lambda _r, s, *_: s.step == 4)
+    elif phase == "saving":  # the file is written, and has no name yet
+        before(os, "replace", lambda _, to: to.name.endswith("010.npz"))
+    elif phase == "at the end":
+        before(os, "replace", lambda _, to: to.name == "splat.ply")
+    else:
+        before(run_module, "write_evaluation")
+
+
+@pytest.mark.parametrize("where", INTERRUPTED)
+def test_ctrl_c_at_any_time(where, train, whole, tmp_path, monkeypatch):
+    """130, no traceback, and a folder to go on with to the same bits."""
+    times, step = INTERRUPTED[where]
+    run = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        interrupt(patched, where, times)
+        code, told = train(run)
+    assert code == 130
+    assert not any("Traceback" in line for line in told)
+    kept = sorted(run.glob("checkpoints/*"))
+    if where == "saving, twice":  # in the middle: as if it had not begun
+        step = None
+    if step is None:
+        assert kept == []
+        assert "no step is saved yet; --resume starts from the beginning" in told[-2]
+    else:
+        assert kept[-1].name == f"step_{step:09d}.npz"
+        assert "go on with --resume" in "".join(told[-2:])
+    code, told = train(run, "--resume")
+    assert code == 0, told
+    assert left_behind(run) == whole.left
 
 
 class Full:

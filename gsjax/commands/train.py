@@ -75,8 +75,16 @@ class TrainCommand(HeavyCommand):
         if not 1 <= self.viewer_port < 2**16:
             raise UsageError(f"--viewer-port {self.viewer_port}: from 1 to 65535")
         start_jax()
-        if not self.viewer:
-            return self._train(None)
+        try:
+            return self._watched() if self.viewer else self._train(None)
+        except KeyboardInterrupt:
+            from gsjax.train.folder import run_files
+            from gsjax.train.run import saved_text
+
+            note(saved_text(run_files(self.out)))
+            raise
+
+    def _watched(self) -> int:
         from gsjax.viewer.live import LiveViewer
 
         viewer = LiveViewer(port=self.viewer_port)
