@@ -21,8 +21,9 @@ from gsjax.train.step import TrainState
 
 # Empty slots cost next to nothing; growing costs a compilation.
 _LEAST_SLOTS = 16_384
-# Compiling a step: 0.9 GB for two CPU devices, most of which stays with the process.
-_COMPILING = 900_000_000
+# Compiling a step for two CPU devices, most of which stays with the process; and each
+# further size of the pictures.
+_COMPILING, _COMPILING_MORE = 900_000_000, 150_000_000
 # Pairs of a Gaussian before they are counted: four to five in trained scenes, with the
 # room that `fit` leaves beyond them.
 _PAIRS = 7.5
@@ -86,12 +87,13 @@ def run_estimate(scene: Scene, config: TrainConfig, count: int, slots: int) -> E
     step = step_estimate(
         slots, size, config, config.raster.replace(pair_capacity=pairs), frames
     )
+    compiling = _COMPILING + _COMPILING_MORE * len(config.levels)
     # Photographs as loaded, as put together, and as they are on the device.
     held = {
         "of photographs": photos + 2 * frames,
         "of Gaussians and their moments": state_bytes(slots, config),
     }
-    return Estimate({**held, **step.parts})
+    return Estimate({**held, **step.parts, "to compile": compiling})
 
 
 def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) -> None:
