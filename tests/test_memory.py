@@ -1,11 +1,13 @@
 """Memory: what there is, what a render takes, and that too much is refused in time."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from captures import scene_of_views
 from conftest import LIGHT, camera_of, frustum_points, gaussians_at
 
 import gsjax
@@ -14,6 +16,8 @@ from gsjax import CapacityError, RasterConfig, memory
 from gsjax.memory import Estimate, require, size_text, system_available, unlimited
 from gsjax.raster.render import render_estimate
 from gsjax.raster.types import Demand
+from gsjax.train.config import preset
+from gsjax.train.footprint import first_slots, run_estimate
 
 GB = 10**9
 
@@ -146,3 +150,27 @@ def test_the_estimate_is_what_xla_reserves(slots, pairs, report, quick_compiles)
     estimate = render_estimate(slots, 4, (128, 96), config, width=8).total
     report("estimate of memory", abs(np.log(estimate / found)), np.log(1.5))
     assert 1 / 1.5 < estimate / found < 1.5
+
+
+# Peaks of `gsjax train`, less what the imports had taken; two CPU devices, jax 0.10.2,
+# 21 photographs of 800 × 600 px: preset, changes, and MB.
+MEASURED = [
+    ("fast", {}, 1270),
+    ("default", {"initial": "random", "max_size": 640}, 2288),
+    ("quality", {"initial": "random", "strategy": "adaptive"}, 4376),
+]
+
+
+@pytest.mark.skipif(jax.local_device_count() != 2, reason="measured with two devices")
+@pytest.mark.parametrize(("name", "changes", "measured"), MEASURED)
+def test_the_estimate_of_a_run_is_what_runs_took(name, changes, measured, report):
+    config = preset(name).replace(**changes)
+    made = scene_of_views(21, points=20_000)
+    views = tuple(replace(view, width=800, height=600) for view in made.views)
+    count = 20_000 if config.initial == "points" else config.initial_count
+    slots = first_slots(count, config)
+    if name == "quality":  # it was run with --max-gaussians 100000
+        slots = 131_072
+    found = run_estimate(replace(made, views=views), config, count, slots, begins=True)
+    report(f"memory of {name}", abs(np.log(found.total / 1e6 / measured)), np.log(1.5))
+    assert 1 / 1.5 < found.total / 1e6 / measured < 1.5
