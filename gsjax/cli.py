@@ -31,7 +31,8 @@ from gsjax.commands.stress import StressCommand
 from gsjax.commands.train import TrainCommand
 from gsjax.commands.view import ViewCommand
 from gsjax.console import one_line, warnings_as_lines
-from gsjax.errors import GsjaxError, InputError
+from gsjax.errors import CapacityError, GsjaxError, InputError
+from gsjax.memory import unlimited
 
 _COMMANDS = (
     Annotated[DemoCommand, subcommand("demo")]
@@ -47,6 +48,8 @@ _COMMANDS = (
     | Annotated[StressCommand, subcommand("stress")]
 )
 
+_EXHAUSTED = "RESOURCE_EXHAUSTED"  # as XLA tells it
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
@@ -61,7 +64,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     try:
         with warnings_as_lines():
-            return _parse(argv).run()
+            command = _parse(argv)
+            with unlimited(getattr(command, "ignore_memory", False)):
+                return command.run()
     except KeyboardInterrupt:
         return _report("interrupted", 130, debug)
     except GsjaxError as error:
@@ -69,6 +74,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         return _report(one_line(error), InputError.exit_code, debug)
     except Exception as error:
+        if isinstance(error, MemoryError) or _EXHAUSTED in str(error):
+            text = "the memory of this machine does not hold what this takes; make it "
+            text += "smaller: fewer Gaussians, smaller photographs or pictures"
+            return _report(text, CapacityError.exit_code, debug)
         # Not foreseen: still one line, which says how to see more.
         text = f"{type(error).__name__}: {one_line(error)[:300]}"
         return _report(f"{text} (--debug shows where)", 1, debug)

@@ -25,7 +25,8 @@ class ViewResult(NamedTuple):
 
     Attributes:
       name: of the view.
-      psnr: dB, of the render clipped to [0, 1].
+      psnr: dB, of the render clipped to [0, 1]; NaN, as is ``ssim``, where no pixel
+        counts.
       ssim: see `gsjax.metrics.ssim`.
       truth, render: [H, W, 3] float32; where the photograph is transparent it is over
         the background.
@@ -43,7 +44,7 @@ class ViewResult(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """Means over the views.
+    """Means over the views of which any pixel counts.
 
     Attributes:
       views: how many.
@@ -98,7 +99,9 @@ def evaluate(
         image = np.clip(np.asarray(result.rgb, np.float32), 0, 1)
         truth = _over(photo, behind)
         weight = None if photo.valid is None else photo.valid.astype(np.float32)
-        quality, likeness = _scores(image, truth, weight)
+        quality = likeness = np.nan
+        if weight is None or weight.any():
+            quality, likeness = _scores(image, truth, weight)
         yield ViewResult(
             name=view.name,
             psnr=float(quality),
@@ -123,5 +126,6 @@ def summarise(results: Iterable[ViewResult]) -> Summary:
     """Means of PSNR (dB) and SSIM over what `evaluate` gives; of no views NaN."""
     results = list(results)
     scores = np.array([(r.psnr, r.ssim) for r in results]).reshape(-1, 2)
-    means = scores.mean(0) if results else np.full(2, np.nan)
-    return Summary(len(results), psnr=float(means[0]), ssim=float(means[1]))
+    scores = scores[~np.isnan(scores).any(1)]
+    means = scores.mean(0) if len(scores) else np.full(2, np.nan)
+    return Summary(len(scores), psnr=float(means[0]), ssim=float(means[1]))

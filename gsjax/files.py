@@ -1,5 +1,6 @@
 """Files, read or refused by name, and written complete or not at all."""
 
+import errno
 import json
 import math
 import os
@@ -11,6 +12,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from gsjax.errors import InputError
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextmanager
@@ -85,9 +88,11 @@ def writing(path: Path, what: str = "written") -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        remedy = "check permissions and space"
+        if error.errno in _FULL:
+            remedy = "free some space, then do this again"
         raise InputError(
-            f"{path}: cannot be {what}: {error.strerror or error}; check permissions "
-            "and space"
+            f"{path}: cannot be {what}: {error.strerror or error}; {remedy}"
         ) from error
 
 
@@ -119,10 +124,28 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
             temporary.unlink()
 
 
-def write_file(path: Path, data: bytes, *, durable: bool = False) -> None:
+def write_file(path: Path, data: bytes | memoryview, *, durable: bool = False) -> None:
     """Write all of a file; as `replacing`."""
     with replacing(path, durable=durable) as file:
         file.write(data)
+
+
+def append_to_file(path: Path, data: bytes) -> None:
+    """Add to the end of a file, all or nothing; it is made if it is missing.
+
+    Raises:
+      InputError: as `writing`.
+    """
+    with writing(path), path.open("ab", buffering=0) as file:
+        size = file.tell()
+        try:
+            rest = memoryview(data)
+            while rest:
+                rest = rest[file.write(rest) or 0 :]
+        except BaseException:
+            with suppress(OSError):  # what is there stays readable to its end
+                file.truncate(size)
+            raise
 
 
 def write_json(path: Path, data: Any, *, indent: int = 1) -> None:

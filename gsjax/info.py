@@ -5,9 +5,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from gsjax.gaussians import Gaussians
+from gsjax.gaussians import Gaussians, capacity_bucket
+from gsjax.raster.render import render_estimate
+from gsjax.raster.types import RasterConfig
 
 _PERCENTILES = (1, 25, 50, 75, 99)
+_SIZE = (1920, 1080)
+_PAIRS = 5  # a Gaussian has about so many, where it is one of a trained scene
 
 
 def describe(gaussians: Gaussians) -> dict[str, Any]:
@@ -39,8 +43,17 @@ def describe(gaussians: Gaussians) -> dict[str, Any]:
         "anisotropy": _percentiles(anisotropy),
         "zero_quaternions": int(zero.sum()),
         "parameter_bytes": sum(int(leaf.nbytes) for leaf in leaves),
+        "render_bytes": _render_bytes(gaussians),
         "dtype": str(params.means.dtype),
     }
+
+
+def _render_bytes(gaussians: Gaussians) -> int:
+    """What a picture of `_SIZE` takes, about, of scenes as training makes them."""
+    pairs = capacity_bucket(_PAIRS * gaussians.capacity)
+    config = RasterConfig(pair_capacity=min(pairs, 2**30 - 1))
+    bases = gaussians.params.sh.shape[-2]
+    return render_estimate(gaussians.capacity, bases, _SIZE, config).total
 
 
 def _percentiles(values: np.ndarray) -> dict[str, float | None]:
@@ -93,6 +106,10 @@ def info_text(path: str, facts: dict[str, Any]) -> str:
             row("zero quaternions", f"{facts['zero_quaternions']:,}"),
             row("file", _size(facts["file_bytes"])),
             row("parameters", f"{_size(facts['parameter_bytes'])} ({facts['dtype']})"),
+            row(
+                "memory to render",
+                f"about {_size(facts['render_bytes'])} at {_SIZE[0]} × {_SIZE[1]}",
+            ),
         ]
     )
 

@@ -66,6 +66,14 @@ def logit(probability: Array) -> Array:
     return jnp.log(p) - jnp.log1p(-p)
 
 
+def all_within(tree, limit: float = float("inf")) -> Array:
+    """[] bool: whether all numbers of a pytree, in size, are below ``limit``."""
+    good = jnp.asarray(True)
+    for leaf in jax.tree.leaves(tree):
+        good &= jnp.all(jnp.abs(leaf) < limit)
+    return good
+
+
 def exp_log_scale(log_scale: Array) -> Array:
     """``exp`` clipped to `LOG_SCALE_RANGE` in the log domain; zero slope beyond."""
     low, high = LOG_SCALE_RANGE

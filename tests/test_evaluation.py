@@ -86,6 +86,16 @@ def test_only_valid_pixels_count(gaussians, scene, renders):
     np.testing.assert_array_equal(result.valid, valid)
 
 
+def test_what_is_masked_altogether_does_not_count(gaussians, scene, renders):
+    masked = photo_of(scene.views[0], renders[0], valid=np.zeros((24, 32), bool))
+    photos = [masked, photo_of(scene.views[1], renders[1])]
+    first, second = scored(gaussians, scene, photos)
+    assert np.isnan([first.psnr, first.ssim]).all()
+    np.testing.assert_allclose(first.render * 255, renders[0], atol=0.51)
+    assert summarise([first, second])[:3] == (1, second.psnr, second.ssim)
+    assert summarise([first]).views == 0
+
+
 def test_transparent_photographs_lie_over_the_background(gaussians, scene, renders):
     alpha = np.zeros((24, 32), np.uint8)
     alpha[:, ::2], alpha[:, 1::4] = 255, 51

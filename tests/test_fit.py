@@ -257,9 +257,9 @@ def test_leaving_the_numbers_is_told():
     state = initial_state(scene(), config)
     tuning = replace(state.tuning, exposures=state.tuning.exposures * jnp.nan)
     log = Log()
-    with pytest.raises(DivergedError, match="in 50 steps running, up to step 50"):
+    with pytest.raises(DivergedError, match="in 30 steps running, up to step 30"):
         run(config, log, state=state.replace(tuning=tuning))
-    assert [r["finite"] for r in log.records] == [False] * 49
+    assert [r["finite"] for r in log.records] == [False] * 29
 
 
 def test_a_finished_run_has_nothing_to_do():

@@ -32,6 +32,7 @@ from training import (
 )
 
 import gsjax
+import gsjax.train.step as step_module
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.losses import photometric
@@ -180,6 +181,45 @@ def test_what_is_not_finite_changes_only_the_step():
     assert changed(start, after) == [".step"]
     assert int(after.step) == int(metrics.step) == 1
     assert metrics.wanted == 0
+
+
+def test_a_step_out_of_the_numbers_is_not_made():
+    """By what it would take out alone; and it is told."""
+    start = plain_state()
+    mu = start.moments.mu
+    mu = mu.replace(means=mu.means.at[:7, 1].set(1e308))
+    after, told = plain_step(
+        copy(start.replace(moments=start.moments._replace(mu=mu))), plain_batch()
+    )
+    assert not told.finite
+    assert int(told.step) == 1
+    wanted, _ = run_plain(start, 1)
+    before, found, wanted = (
+        np.asarray(s.gaussians.params.means) for s in (start, after, wanted)
+    )
+    np.testing.assert_array_equal(found[:7, 1], before[:7, 1])
+    held = np.zeros_like(before, bool)
+    held[:7, 1] = True
+    np.testing.assert_array_equal(found[~held], wanted[~held])
+    assert (found[~held] != before[~held]).sum() > 100
+
+
+def test_guards_change_no_bit_where_nothing_is_wrong(monkeypatch):
+    start = plain_state()
+    wanted, told = run_plain(start, 3)
+    assert all(m.finite for m in told)
+    monkeypatch.setattr(step_module, "all_within", lambda *_: jnp.asarray(True))
+    monkeypatch.setattr(
+        step_module, "_still_numbers", lambda _, params: (jnp.asarray(True), params)
+    )
+    unguarded = jax.jit(
+        make_train_step(PLAIN, EXTENT), donate_argnums=0, compiler_options=QUICKLY
+    )
+    state = copy(start)
+    for _ in range(3):
+        state, metrics = unguarded(state, plain_batch(state.step))
+    assert changed(state, wanted) == []
+    assert bits(metrics) == bits(told[-1])
 
 
 def test_the_statistic_is_the_slope_by_a_shift_of_the_projection(report):

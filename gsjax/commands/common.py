@@ -25,6 +25,12 @@ class Command:
     """Show the whole traceback of an error."""
 
 
+@dataclass(kw_only=True)
+class HeavyCommand(Command):
+    ignore_memory: bool = False
+    """Go on even where the memory of this machine looks too small."""
+
+
 def parse_size(text: str) -> tuple[int, int]:
     """Width and height of ``800x600``.
 

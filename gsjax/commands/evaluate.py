@@ -7,12 +7,12 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from gsjax.commands.common import Command, start_jax
+from gsjax.commands.common import HeavyCommand, start_jax
 from gsjax.console import decibels, say
 
 
 @dataclass(kw_only=True)
-class EvalCommand(Command):
+class EvalCommand(HeavyCommand):
     """Measure a run: PSNR and SSIM of held-out views, with pictures."""
 
     folder: Positional[Path]
@@ -34,6 +34,9 @@ class EvalCommand(Command):
             say(json.dumps(told, indent=2))
             return 0
         for each in told["each"]:
+            if each["ssim"] is None:
+                say(f"{each['name']}  masked altogether")
+                continue
             say(
                 f"{each['name']}  PSNR {decibels(each['psnr'])}  "
                 f"SSIM {each['ssim']:.4f}"

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from gsjax.commands.common import (
-    Command,
+    HeavyCommand,
     UsageError,
     parse_background,
     parse_budget,
@@ -21,7 +21,7 @@ _OTHER_MOVIES = (".mp4", ".mov", ".m4v", ".avi", ".mkv")
 
 
 @dataclass(kw_only=True)
-class RenderCommand(Command):
+class RenderCommand(HeavyCommand):
     """Render a scene from a list of cameras or along a path: images or a movie."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]

@@ -6,12 +6,12 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.commands.common import Command, UsageError, start_jax
+from gsjax.commands.common import HeavyCommand, UsageError, start_jax
 from gsjax.console import decibels, note, say
 
 
 @dataclass(kw_only=True)
-class TrainCommand(Command):
+class TrainCommand(HeavyCommand):
     """Train a scene on a dataset: COLMAP, nerfstudio, NeRF or LLFF."""
 
     dataset: Positional[Path]
@@ -75,8 +75,16 @@ class TrainCommand(Command):
         if not 1 <= self.viewer_port < 2**16:
             raise UsageError(f"--viewer-port {self.viewer_port}: from 1 to 65535")
         start_jax()
-        if not self.viewer:
-            return self._train(None)
+        try:
+            return self._watched() if self.viewer else self._train(None)
+        except KeyboardInterrupt:
+            from gsjax.train.folder import run_files
+            from gsjax.train.run import saved_text
+
+            note(saved_text(run_files(self.out)))
+            raise
+
+    def _watched(self) -> int:
         from gsjax.viewer.live import LiveViewer
 
         viewer = LiveViewer(port=self.viewer_port)

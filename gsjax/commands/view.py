@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.commands.common import Command, UsageError, start_jax
+from gsjax.commands.common import HeavyCommand, UsageError, start_jax
 from gsjax.console import note, say
 
 _LARGE_PAGE = 32 * 2**20
@@ -15,7 +15,7 @@ _PHOTO_OF_PAGE = 160  # px, longest side
 
 
 @dataclass(kw_only=True)
-class ViewCommand(Command):
+class ViewCommand(HeavyCommand):
     """Look at a scene in the browser; needs the extra gsjax[viewer]."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]

@@ -116,8 +116,9 @@ def mcmc(settings: McmcSettings) -> Densifier:
         shift = jnp.einsum("nij,nj->ni", spread, noise, precision="highest")
         # The rate may be wider than the parameters, and must not widen them.
         shift = shift * (gate * settings.noise * rate.astype(gate.dtype))[:, None]
-        good = gaussians.active[:, None] & jnp.isfinite(shift)
-        means = params.means + jnp.where(good, shift, 0)
+        moved = params.means + shift
+        good = gaussians.active[:, None] & jnp.isfinite(moved)
+        means = jnp.where(good, moved, params.means)
         return params.replace(means=means)  # pyright: ignore
 
     def due(step: Array) -> Array:

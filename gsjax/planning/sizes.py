@@ -9,9 +9,10 @@ import numpy as np
 
 from gsjax.cameras import Camera
 from gsjax.gaussians import Gaussians, capacity_bucket, compact, select
+from gsjax.memory import size_text
 from gsjax.planning import bounds
 from gsjax.planning.types import Reason
-from gsjax.raster.render import exact_config, render, render_exact
+from gsjax.raster.render import exact_config, render, render_estimate, render_exact
 from gsjax.raster.types import Demand, RasterConfig
 from gsjax.timing import time_ms
 
@@ -58,7 +59,11 @@ def with_capacities(
         Reason("pair_capacity", f"{_roomy(pairs):,}: views ask for {pairs:,} at most"),
     ]
     config = config.replace(pair_capacity=_roomy(pairs), visible_capacity=visible)
-    return config, reasons
+    size = views[0].width, views[0].height
+    bases = gaussians.params.sh.shape[-2]
+    estimate = render_estimate(gaussians.capacity, bases, size, config)
+    told = f"about {size_text(estimate.total)} for a picture of {size[0]} × {size[1]}"
+    return config, [*reasons, Reason("memory", told)]
 
 
 @partial(jax.jit, static_argnames="config")

@@ -13,7 +13,9 @@ from jax import lax
 from gsjax.cameras import Camera
 from gsjax.errors import CapacityError, InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
+from gsjax.memory import require
 from gsjax.numerics import safe_divide
+from gsjax.raster.footprint import render_estimate as render_estimate
 from gsjax.raster.project import COLOR_LIMIT, depth_order, project, radii_of
 from gsjax.raster.rasterise import rasterise
 from gsjax.raster.types import Array, Demand, Projected, RasterConfig, Render
@@ -199,10 +201,12 @@ def render_exact(
       **kwargs: features, probe, abs_probe.
 
     Raises:
-      CapacityError: if more than ``max_capacity`` is wanted.
+      CapacityError: if more than ``max_capacity`` is wanted, or more memory than there
+        is (see `gsjax.memory`).
       InputError: as `render`.
     """
     while True:
+        _check_memory(gaussians, camera, config)
         result = _render_jit(gaussians, camera, config, background, **kwargs)
         if not bool(result.overflowed):
             return result
@@ -232,6 +236,7 @@ def exact_config(
     """
     light = config.replace(outputs=("alpha",), absgrad=False, rungs=1)
     while True:
+        _check_memory(gaussians, camera, light)
         demand, overflowed = _demand_jit(gaussians, camera, light)
         if not bool(overflowed):
             fitted = _fit(demand, max_capacity)
@@ -240,6 +245,28 @@ def exact_config(
                 visible_capacity=min(fitted["visible_capacity"], gaussians.capacity),
             )
         light = _regrow(light, demand, max_capacity)
+
+
+def _check_memory(gaussians: Gaussians, camera: Camera, config: RasterConfig) -> None:
+    """Refuse what would not fit, before a byte of it is taken."""
+    cameras = camera.viewmat.shape[0] if camera.batched else 1
+    estimate = render_estimate(
+        gaussians.capacity,
+        gaussians.params.sh.shape[-2],
+        (camera.width, camera.height),
+        config,
+        cameras=cameras,
+        width=gaussians.params.means.dtype.itemsize,
+    )
+    several = f"{cameras} images" if cameras > 1 else "an image"
+    pairs = config.pair_capacity
+    require(
+        estimate,
+        f"{several} of {camera.width} × {camera.height} px of {gaussians.capacity:,} "
+        "Gaussians" + (f", {pairs:,} (tile, Gaussian) pairs," if pairs else ""),
+        "render smaller images, or fewer Gaussians (export --min-opacity), or larger "
+        "tiles (RasterConfig.tile_size)",
+    )
 
 
 def _fit(demand: Demand, max_capacity: int) -> dict[str, int]:

@@ -12,22 +12,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.errors import CapacityError, DivergedError, InputError
+from gsjax.errors import CapacityError
 from gsjax.gaussians import Gaussians, capacity_bucket, grow, make_gaussians
+from gsjax.memory import require
 from gsjax.raster.render import exact_config
 from gsjax.raster.types import RasterConfig
 from gsjax.scene.initialise import init_gaussians, scene_extent
 from gsjax.scene.types import Photo, Scene
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
+from gsjax.train.footprint import first_slots, step_estimate
 from gsjax.train.frames import Frames, draw, make_frames
+from gsjax.train.health import Health, check_photos, check_points
 from gsjax.train.step import Metrics, TrainState, init_state, make_train_step
 
 # Room beyond what is wanted now, so that it lasts for a while.
 _PAIR_MARGIN, _SLOT_MARGIN = 1.5, 1.3
-# Empty slots cost next to nothing; growing costs a compilation.
-_LEAST_SLOTS = 16_384
-_MAX_BAD_STEPS = 50
 _MAX_PROBED_VIEWS = 6
 
 
@@ -67,8 +67,8 @@ class Hooks:
     Attributes:
       step: after each step.
       phase: before something that takes a while, with what it is.
-      checkpoint: every ``config.every_checkpoint`` steps: state, pair capacity, and
-        the record of that step.
+      checkpoint: every ``config.every_checkpoint`` steps, unless something is wrong
+        just then: state, pair capacity, and the record of that step.
       measure: every ``config.every_eval`` steps: state and record; the time that it
         takes does not count.
       stop: asked after each step; True ends the run there.
@@ -113,8 +113,11 @@ def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
     """A run on this scene before its first step.
 
     Raises:
-      InputError: if it has no points and the settings ask for them.
+      InputError: if the settings ask for its points, and it has none, or none before
+        any camera.
     """
+    if config.initial == "points":
+        check_points(scene)
     gaussians = init_gaussians(
         scene,
         sh_degree=config.sh_degree,
@@ -124,8 +127,7 @@ def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
         random_count=config.initial_count if config.initial == "random" else None,
         seed=config.seed,
     )
-    wanted = min(config.max_gaussians, max(4 * gaussians.capacity, _LEAST_SLOTS))
-    gaussians = grow(gaussians, max(gaussians.capacity, capacity_bucket(wanted)))
+    gaussians = grow(gaussians, first_slots(gaussians.capacity, config))
     return init_state(gaussians, config, extent_of(scene), len(scene.views))
 
 
@@ -168,18 +170,20 @@ def fit(
       The state after the last step, and what it needed; the scene is ``.gaussians``.
 
     Raises:
-      InputError: if photos and views do not match, or there is nothing to start from.
-      CapacityError: if a view wants more pairs than can be addressed.
-      DivergedError: if loss or gradients stay not finite.
+      InputError: if photos and views do not match, or there is nothing to start from,
+        or to learn from.
+      CapacityError: if a view wants more pairs than can be addressed, or a step more
+        memory than there is (see `gsjax.memory`); what was learnt until then has gone
+        to ``hooks.checkpoint``.
+      DivergedError: if for 50 steps running, or half of a short run, numbers are not
+        finite, pictures are worse than any can be, or nothing is in view any more.
     """
-    if len(photos) != len(scene.views) or not photos:
-        raise InputError(
-            f"{len(photos)} photos for {len(scene.views)} views; one for each is wanted"
-        )
+    check_photos(scene, photos)
     hooks = hooks or Hooks()
-    begun = initial_state(scene, config) if state is None else state
     # The step takes the state's memory over: not the caller's, and none twice.
-    own: TrainState = jax.tree.map(jnp.copy, begun)
+    own: TrainState = jax.tree.map(
+        jnp.copy, initial_state(scene, config) if state is None else state
+    )
     return _Run(scene, photos, config, hooks).loop(own, pair_capacity)
 
 
@@ -197,7 +201,7 @@ class _Run:
 
     def loop(self, state: TrainState, pair_capacity: int | None) -> FitResult:
         config, hooks = self.config, self.hooks
-        step, bad = int(state.step), 0
+        step, health = int(state.step), Health(config.steps)
         divisor = config.divisor(max(step - 1, 0))  # of the step before
         frames, progress = None, None
         while step < config.steps:
@@ -211,7 +215,12 @@ class _Run:
             raster = config.raster.replace(
                 pair_capacity=pair_capacity, visible_capacity=None
             )
-            program = self.program(state, frames, raster)
+            try:
+                program = self.program(state, frames, raster)
+            except CapacityError:
+                if progress is not None:  # nothing that was learnt is lost
+                    hooks.checkpoint(state, pair_capacity, progress)
+                raise
             state, metrics = program(state, frames)
             metrics = jax.device_get(metrics)
             if metrics.overflowed:
@@ -219,19 +228,14 @@ class _Run:
                 continue
             step = int(metrics.step)
             progress = self.progress(metrics, divisor, state)
-            bad = 0 if metrics.finite else bad + 1
-            if bad >= _MAX_BAD_STEPS:
-                raise DivergedError(
-                    f"the loss or its gradient was not finite in {bad} steps running, "
-                    f"up to step {step}; lower the learning rates, or look for a "
-                    "photograph or a pose that is off"
-                )
+            health.look(metrics)
             hooks.step(progress)
             hooks.state(state, progress)
             state = self.with_room(state, metrics)
             # The last is saved by the caller, with what belongs to the end.
             every = config.every_checkpoint
-            if every and step % every == 0 and step < config.steps:
+            due = every and step % every == 0 and step < config.steps
+            if due and not health.bad:  # what is lost is not to push out what is not
                 hooks.checkpoint(state, pair_capacity, progress)
             every = config.every_eval
             if every and step % every == 0 and step < config.steps:
@@ -270,9 +274,15 @@ class _Run:
         shapes = (frames.pixels.shape, state.gaussians.capacity, raster)
         if shapes not in self.programs:
             height, width = frames.pixels.shape[1:3]
-            self.hooks.phase(
-                f"compiling for {width} × {height} px, "
-                f"{state.gaussians.capacity:,} slots, {raster.pair_capacity:,} pairs"
+            slots, pairs = state.gaussians.capacity, raster.pair_capacity
+            told = f"{width} × {height} px, {slots:,} slots, {pairs:,} pairs"
+            self.hooks.phase(f"compiling for {told}")
+            nbytes = frames.pixels.nbytes
+            require(
+                step_estimate(slots, (width, height), self.config, raster, nbytes),
+                f"a step for {told},",
+                "train with smaller photographs (--max-size) or fewer Gaussians "
+                "(--max-gaussians)",
             )
             begun = time.perf_counter()
             train_step = make_train_step(self.config, extent_of(self.scene), raster)

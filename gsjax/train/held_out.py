@@ -24,6 +24,7 @@ from gsjax.train.folder import (
     refined_data,
     run_files,
 )
+from gsjax.train.health import is_seen
 from gsjax.train.refined import refined_photos
 
 _PREVIEWED = 4
@@ -37,7 +38,7 @@ def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
       which: "test", or "train" where nothing was held out.
 
     Raises:
-      InputError: if there is no run or no such view.
+      InputError: if there is no run or no such view, or they are masked altogether.
     """
     settings, files = load_settings(folder), run_files(folder)
     given = load_data(settings)
@@ -53,6 +54,11 @@ def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
     before = subset(given.scene, chosen).views
     photos = load_photos(before, settings.config.max_size)
     photos = refined_photos(photos, before, scene.views)
+    if not any(map(is_seen, photos)):
+        raise InputError(
+            f"all {len(photos)} {which} views of this run are masked altogether: there "
+            "is nothing to measure; hold out others (--test-images)"
+        )
     return write_evaluation(files, settings.config, gaussians, scene, photos, which)
 
 
@@ -94,6 +100,7 @@ def write_evaluation(
         "which": which,
         **summary._asdict(),
         "psnr": finite_or_none(summary.psnr),
+        "ssim": finite_or_none(summary.ssim),
         "seconds": round(time.perf_counter() - begun, 3),
         "gaussians": int(np.sum(gaussians.active)),
         "each": [_told(result) for result in results],
@@ -104,11 +111,13 @@ def write_evaluation(
 
 
 def _told(result: ViewResult) -> dict:
-    """Of one view, for JSON; PSNR null where the render is the photograph itself."""
+    """Of one view, for JSON; PSNR null where the render is the photograph itself, both
+    where no pixel counts.
+    """
     return {
         "name": result.name,
         "psnr": finite_or_none(result.psnr),
-        "ssim": result.ssim,
+        "ssim": finite_or_none(result.ssim),
         "size": result.depth.shape[::-1],
     }
 

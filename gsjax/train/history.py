@@ -2,15 +2,18 @@
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsjax.curves import Series, curves_png
-from gsjax.files import finite_or_none, read_bytes, write_file
+from gsjax.errors import InputError
+from gsjax.files import append_to_file, finite_or_none, read_bytes, write_file
 
 _NEEDED = ("step", "seconds", "gaussians")
+_LINES = 20  # written together
 
 
 def record_line(record: dict[str, Any]) -> str:
@@ -19,6 +22,34 @@ def record_line(record: dict[str, Any]) -> str:
         k: finite_or_none(v) if isinstance(v, float) else v for k, v in record.items()
     }
     return json.dumps(plain, allow_nan=False) + "\n"
+
+
+class Journal:
+    """Lines for the end of a `.jsonl`, kept in memory until they are written.
+
+    What a full disk does not take is kept on, and written later if that is possible.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._lines: list[str] = []
+
+    def add(self, record: dict[str, Any]) -> None:
+        """A line more; every so many are written, or stay for the next time."""
+        self._lines.append(record_line(record))
+        if len(self._lines) % _LINES == 0:
+            with suppress(InputError):
+                self.write()
+
+    def write(self) -> None:
+        """Write what is not yet.
+
+        Raises:
+          InputError: if it cannot be written.
+        """
+        if self._lines:
+            append_to_file(self.path, "".join(self._lines).encode())
+            self._lines.clear()
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,8 +35,10 @@ from gsjax.train.folder import (
     save_scene,
     save_settings,
 )
+from gsjax.train.footprint import check_memory
+from gsjax.train.health import is_seen
 from gsjax.train.held_out import results_of, write_evaluation, write_preview
-from gsjax.train.history import keep_steps, read_metrics, record_line, write_curves
+from gsjax.train.history import Journal, keep_steps, read_metrics, write_curves
 from gsjax.train.refined import refined_photos, refined_scene, save_cameras
 from gsjax.train.report import Reporter
 from gsjax.train.step import TrainState
@@ -80,6 +82,7 @@ class _Sitting:
     def __init__(self, config: TrainConfig, data: Data, files: RunFiles, start: _Start):
         self.config, self.data, self.files, self.start = config, data, files, start
         self.scene = subset(data.scene, data.train)
+        self.metrics, self.measured = Journal(files.metrics), Journal(files.held_out)
         self._held_out: list[Photo] | None = None
 
     def seconds(self, progress: Progress | None) -> float:
@@ -89,7 +92,11 @@ class _Sitting:
     def save(
         self, state: TrainState, pair_capacity: int, progress: Progress | None
     ) -> None:
-        """A checkpoint."""
+        """A checkpoint, and before it what was logged: a run that is taken up there
+        logs no step before it again.
+        """
+        self.metrics.write()
+        self.measured.write()
         meta = {"pair_capacity": pair_capacity, "seconds": self.seconds(progress)}
         save_checkpoint(self.files.checkpoints, state, meta)
 
@@ -116,8 +123,7 @@ class _Sitting:
             "ssim": summary.ssim,
             "gaussians": int(np.sum(state.gaussians.active)),
         }
-        with self.files.held_out.open("a", encoding="utf-8") as log:
-            log.write(record_line(record))
+        self.measured.add(record)
 
 
 # Given what a training begins with, what is to be done after each step.
@@ -194,6 +200,7 @@ def _train(sitting: _Sitting, watch: Watch | None) -> RunResult:
         f"{len(data.scene.views)} views ({len(data.test)} held out), "
         f"{len(data.scene.points):,} points; loading the photographs"
     )
+    check_memory(scene, config, start.state)
     photos = load_photos(scene.views, config.max_size)
     for path in (files.metrics, files.held_out):
         keep_steps(path, start.step)
@@ -208,9 +215,11 @@ def _train(sitting: _Sitting, watch: Watch | None) -> RunResult:
             pair_capacity=start.pair_capacity,
             hooks=hooks,
         )
-    finished = int(result.state.step) >= config.steps
-    _save(sitting, result)
+        # Within, so that Ctrl-C does not cut it in two either.
+        _save(sitting, result)
+        finished = int(result.state.step) >= config.steps and not hooks.stop()
     summary = _evaluate(sitting, result, photos) if finished else None
+    sitting.measured.write()
     metrics, held_out = (read_metrics(p) for p in (files.metrics, files.held_out))
     write_curves(files.curves, metrics, len(photos), held_out)
     return RunResult(
@@ -226,18 +235,16 @@ def _train(sitting: _Sitting, watch: Watch | None) -> RunResult:
 @contextmanager
 def _hooks(sitting: _Sitting) -> Iterator[Hooks]:
     """What is told and written while a run goes on."""
-    config, files = sitting.config, sitting.files
+    config = sitting.config
     reporter = Reporter(config.steps, sitting.start.step)
-    log = files.metrics.open("a", encoding="utf-8")
 
     def step(progress: Progress) -> None:
         reporter.step(progress)
         record = progress.record()
         record["seconds"] = round(sitting.seconds(progress), 3)
-        log.write(record_line(record))
+        sitting.metrics.add(record)
 
     def checkpoint(state: TrainState, pair_capacity: int, progress: Progress) -> None:
-        log.flush()
         try:
             sitting.save(state, pair_capacity, progress)
         except InputError as error:
@@ -246,7 +253,7 @@ def _hooks(sitting: _Sitting) -> Iterator[Hooks]:
 
     def measure(state: TrainState, progress: Progress) -> None:
         scene, photos = sitting.held_out(sitting.cameras(state))
-        if photos:
+        if any(map(is_seen, photos)):
             found = results_of(state.gaussians, scene, photos, config)
             summary = summarise(list(found))
             sitting.log_held_out(state, summary, sitting.seconds(progress))
@@ -266,17 +273,42 @@ def _hooks(sitting: _Sitting) -> Iterator[Hooks]:
             )
     finally:
         reporter.close()
-        log.close()
+        with suppress(InputError):  # told of by whatever is to be saved next
+            sitting.metrics.write()
 
 
 def _save(sitting: _Sitting, result: FitResult) -> None:
     """What a run leaves behind whether or not it came to its end."""
     files, scene = sitting.files, sitting.data.scene
-    sitting.save(result.state, result.pair_capacity, result.progress)
-    save_scene(files.splat, result.gaussians, scene, overwrite=True)
-    cameras = sitting.cameras(result.state)
-    if cameras is not scene:
-        save_cameras(files.cameras, cameras)
+    try:
+        sitting.save(result.state, result.pair_capacity, result.progress)
+        save_scene(files.splat, result.gaussians, scene, overwrite=True)
+        cameras = sitting.cameras(result.state)
+        if cameras is not scene:
+            save_cameras(files.cameras, cameras)
+    except InputError as error:
+        raise InputError(f"{error}: {saved_text(files)}") from error
+
+
+def saved_text(files: RunFiles) -> str:
+    """From where a run that was cut short can be gone on with."""
+    kept = sorted(files.checkpoints.glob("step_*.npz"))
+    if kept:
+        step = int(kept[-1].stem.removeprefix("step_"))
+        return f"step {step} is saved; go on with --resume"
+    if files.config.exists():
+        return "no step is saved yet; --resume starts from the beginning"
+    return "nothing is saved yet"
+
+
+def _any_to_measure(sitting: _Sitting) -> bool:
+    if not sitting.data.test:
+        return False
+    _, photos = sitting.held_out(sitting.data.scene)
+    if any(map(is_seen, photos)):
+        return True
+    note("warning: all held-out views are masked altogether: nothing is measured")
+    return False
 
 
 def _evaluate(
@@ -285,7 +317,7 @@ def _evaluate(
     """Of the held-out views; where there are none, only the preview is written."""
     config, data, files = sitting.config, sitting.data, sitting.files
     cameras = sitting.cameras(result.state)
-    if not data.test:
+    if not _any_to_measure(sitting):
         scene = subset(cameras, data.train)
         photos = refined_photos(photos, sitting.scene.views, scene.views)
         write_preview(files, config, result.gaussians, scene, photos)

@@ -16,6 +16,7 @@ from gsjax.densify.types import Densifier, Observation, apply_edit
 from gsjax.gaussians import Gaussians, num_active
 from gsjax.losses import photometric
 from gsjax.metrics import psnr
+from gsjax.numerics import all_within
 from gsjax.optim import adam_step, init_moments, means_rate
 from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig
@@ -31,6 +32,10 @@ from gsjax.train.tuning import (
 )
 
 Array = jax.Array
+
+# A gradient from there on counts as infinite: Adam squares it, and in float32 the
+# second moment of a slot would never come back from infinity.
+_STEEPEST = 1e18
 
 
 @jax.tree_util.register_dataclass
@@ -72,7 +77,8 @@ class Metrics(NamedTuple):
       pairs, pair_capacity: (tile, Gaussian) pairs, and the capacity that they want.
       overflowed: the pairs did not fit, and nothing was changed, nor counted as a
         step: grow `RasterConfig.pair_capacity`, and go on.
-      finite: False if loss or gradients were not, and nothing but ``step`` changed.
+      finite: False if loss or gradients were not, and nothing but ``step`` changed; or
+        if a number would have left the finite ones by this step, and stayed.
     """
 
     step: Array
@@ -167,9 +173,7 @@ def make_train_step(
         (loss, (quality, radii, demand, overflowed)), grads = differentiate(
             params, state.tuning, probe, state, batch, background
         )
-        finite = jnp.isfinite(loss)
-        for leaf in jax.tree.leaves(grads):
-            finite &= jnp.all(jnp.isfinite(leaf))
+        finite = jnp.isfinite(loss) & all_within(grads, _STEEPEST)
         observation = Observation(
             # The loss is a mean over the views of the step.
             grads[2] * count,
@@ -179,17 +183,18 @@ def make_train_step(
         )
 
         def keep():
-            return state, jnp.int32(0)
+            return state, jnp.int32(0), jnp.asarray(True)
 
         def skip():
-            return state.replace(step=state.step + 1), jnp.int32(0)
+            return state.replace(step=state.step + 1), jnp.int32(0), jnp.asarray(True)
 
         def update():
-            moved = _optimise(state, grads, config, extent)
+            moved, good = _optimise(state, grads, config, extent)
             rate = means_rate(config.rates, moved.step / config.steps, extent)
-            return _densify(moved, observation, (by_noise, by_plan), densifier, rate)
+            keys = by_noise, by_plan
+            return *_densify(moved, observation, keys, densifier, rate), good
 
-        state, wanted = lax.cond(
+        state, wanted, good = lax.cond(
             overflowed, keep, lambda: lax.cond(finite, update, skip)
         )
         return state, Metrics(
@@ -201,7 +206,7 @@ def make_train_step(
             pairs=demand.pairs,
             pair_capacity=demand.capacity,
             overflowed=overflowed,
-            finite=finite,
+            finite=finite & good,
         )
 
     return train_step
@@ -226,8 +231,8 @@ def targets(batch: Batch, background: Array, dtype) -> tuple[Array, Array | None
 
 def _optimise(
     state: TrainState, grads, config: TrainConfig, extent: float
-) -> TrainState:
-    """Parameters and corrections after one step of Adam."""
+) -> tuple[TrainState, Array]:
+    """Parameters and corrections after one step of Adam; whether all made it."""
     by_params, by_tuning, _ = grads
     bases = by_params.sh.shape[-2]
     degree = jnp.floor(jnp.sqrt(jnp.arange(bases, dtype=jnp.float32))).astype(jnp.int32)
@@ -241,16 +246,31 @@ def _optimise(
         state.step / config.steps,
         extent,
     )
+    good, params = _still_numbers(state.gaussians, params)
     tuning, tuning_moments = tuning_step(
         state.tuning, by_tuning, state.tuning_moments, config
     )
-    return state.replace(
+    moved = state.replace(
         step=state.step + 1,
         gaussians=state.gaussians.replace(params=params),  # pyright: ignore
         moments=moments,
         tuning=tuning,
         tuning_moments=tuning_moments,
     )
+    return moved, good & all_within(tuning)
+
+
+def _still_numbers(before: Gaussians, params) -> tuple[Array, Any]:
+    """Whether all numbers are still finite; parameters, with those that are not as
+    they were before."""
+
+    def is_good(number):
+        active = before.active.reshape(-1, *(1,) * (number.ndim - 1))
+        return jnp.isfinite(number) | ~active
+
+    good = jax.tree.map(is_good, params)
+    kept = jax.tree.map(jnp.where, good, params, before.params)
+    return jnp.all(jnp.stack([jnp.all(g) for g in jax.tree.leaves(good)])), kept
 
 
 def _densify(

@@ -1,0 +1,105 @@
+"""Whether there is anything to learn, and whether a run still learns it.
+
+Both are looked at on the host, and neither changes a bit of what is computed.
+"""
+
+import warnings
+from collections.abc import Sequence
+
+from gsjax.errors import DivergedError, InputError
+from gsjax.scene.types import Photo, Scene
+from gsjax.train.step import Metrics
+
+_MAX_BAD_STEPS = 50
+_LOST = "nothing of the scene was in view any more"
+# A loss above it is not that of photographs of nothing.
+_SOMETHING = 0.01
+
+
+def is_seen(photo: Photo) -> bool:
+    """Whether any pixel of a photograph counts."""
+    return photo.valid is None or bool(photo.valid.any())
+
+
+def check_photos(scene: Scene, photos: Sequence[Photo]) -> None:
+    """Warn of photographs that are masked altogether.
+
+    Raises:
+      InputError: if all are, or there is not one for each view.
+    """
+    if len(photos) != len(scene.views) or not photos:
+        raise InputError(
+            f"{len(photos)} photos for {len(scene.views)} views; one for each is wanted"
+        )
+    masked = [v.name for v, photo in zip(scene.views, photos) if not is_seen(photo)]
+    if len(masked) == len(photos):
+        raise InputError(
+            f"{scene.source}: no pixel is left to learn from: all {len(photos)} "
+            "photographs are masked altogether; black is what a mask leaves out: "
+            "invert the masks, or remove them"
+        )
+    if masked:
+        warnings.warn(
+            f"{scene.source}: {len(masked)} of {len(photos)} photographs are masked "
+            f"altogether and teach nothing: {', '.join(masked[:3])}",
+            UserWarning,
+            stacklevel=2,
+        )
+
+
+def check_points(scene: Scene) -> None:
+    """See that some point lies before some camera.
+
+    Raises:
+      InputError: if none does: such Gaussians would never be seen, nor ever move.
+    """
+    points = scene.points
+    for view in scene.views:
+        depth = points @ view.viewmat[2, :3] + view.viewmat[2, 3]
+        if len(points) == 0 or (depth > 0).any():
+            return
+    raise InputError(
+        f"{scene.source}: all {len(points):,} points lie behind all {len(scene.views)} "
+        "cameras; are the poses camera → world where world → camera is wanted, or "
+        "their axes others? Mend the dataset, or start from random points (--initial "
+        "random)"
+    )
+
+
+class Health:
+    """Counts the steps in a row that did a run no good.
+
+    Attributes:
+      bad: that many, up to now.
+    """
+
+    def __init__(self, steps: int):
+        self.bad = 0
+        # A short run has an end before so many have come together.
+        self._limit = min(_MAX_BAD_STEPS, max(1, steps // 2))
+        self._saw = False
+
+    def look(self, metrics: Metrics) -> None:
+        """Take a step into account.
+
+        Raises:
+          DivergedError: at the last of too many bad ones.
+        """
+        fault = self._fault(metrics)
+        self._saw |= bool(metrics.pairs > 0)
+        self.bad = 0 if fault is None else self.bad + 1
+        if self.bad >= (_MAX_BAD_STEPS if fault == _LOST else self._limit):
+            raise DivergedError(
+                f"{fault} in {self.bad} steps running, up to step {int(metrics.step)}; "
+                "lower the learning rates, or look for a photograph or a pose that is "
+                "off"
+            )
+
+    def _fault(self, metrics: Metrics) -> str | None:
+        if not metrics.finite:
+            return "the loss, its gradient or a Gaussian was not finite"
+        if metrics.psnr < 0:  # an error above 1, of colours from 0 to 1
+            return "the picture was farther from the photograph than any can be"
+        if self._saw and metrics.pairs == 0 and metrics.loss > _SOMETHING:
+            return _LOST
+        return None

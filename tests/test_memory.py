@@ -1,0 +1,176 @@
+"""Memory: what there is, what a render takes, and that too much is refused in time."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from captures import scene_of_views
+from conftest import LIGHT, camera_of, frustum_points, gaussians_at
+
+import gsjax
+import gsjax.raster.render as render_module
+from gsjax import CapacityError, RasterConfig, memory
+from gsjax.memory import Estimate, require, size_text, system_available, unlimited
+from gsjax.raster.render import render_estimate
+from gsjax.raster.types import Demand
+from gsjax.train.config import preset
+from gsjax.train.footprint import first_slots, run_estimate
+
+GB = 10**9
+
+
+def write(root, **files):
+    for path, text in files.items():
+        (root / path).parent.mkdir(parents=True, exist_ok=True)
+        (root / path).write_text(text)
+
+
+def test_the_least_of_all_limits_counts(tmp_path):
+    root = tmp_path
+    assert system_available(root) is None
+    write(root, **{"proc/meminfo": "MemTotal: 99 kB\nMemAvailable:  4000 kB\n"})
+    assert system_available(root) == 4_096_000
+    # Version 2: the limit of a group above binds as well; read files do not count.
+    write(root, **{"proc/self/cgroup": "0::/a/b\n"})
+    groups = root / "sys/fs/cgroup"
+    write(
+        groups,
+        **{
+            "a/memory.max": "3000000\n",
+            "a/memory.current": "1500000\n",
+            "a/memory.stat": "anon 5\ninactive_file 500000\n",
+            "a/b/memory.max": "max\n",
+            "a/b/memory.current": "77\n",
+        },
+    )
+    assert system_available(root) == 2_000_000
+    # Version 1, beside it, and in a container, whose path is that outside.
+    write(root, **{"proc/self/cgroup": "4:cpu:/\n3:hugetlb,memory:/x\n0::/\n"})
+    write(
+        groups / "memory",
+        **{
+            "memory.limit_in_bytes": "1000000",
+            "memory.usage_in_bytes": "950000",
+            "memory.stat": "total_inactive_file 20000\n",
+        },
+    )
+    assert system_available(root) == 70_000
+    write(groups / "memory", **{"memory.usage_in_bytes": "2000000"})
+    assert system_available(root) == 0
+
+
+def test_this_machine_answers():
+    if jax.default_backend() == "cpu" and memory.Path("/proc/meminfo").exists():
+        assert 10**7 < memory.available() < 10**15
+
+
+def test_what_does_not_fit_is_refused_with_the_numbers(monkeypatch):
+    asked = []
+    monkeypatch.setattr(memory, "available", lambda: asked.append(1) or 3 * GB)
+    estimate = Estimate({"for a": 2 * GB, "for b": 1_200_000_000, "for c": 0})
+    told = (
+        r"^a render would take about 3\.2 GB \(2\.0 GB for a, 1\.2 GB for b\) of "
+        r"memory, and 3\.0 GB is free; make it small, or .* --ignore-memory"
+    )
+    with pytest.raises(CapacityError, match=told) as caught:
+        require(estimate, "a render", "make it small")
+    assert caught.value.exit_code == 3
+    require(Estimate({"for a": 2 * GB}), "a render", "")
+    with unlimited():
+        with unlimited(False):
+            require(estimate, "a render", "")
+        require(estimate, "a render", "")
+    with pytest.raises(CapacityError):
+        require(estimate, "a render", "")
+    assert len(asked) == 3
+    require(Estimate({"for a": 10**8}), "a render", "")  # too little to ask
+    assert len(asked) == 3
+    monkeypatch.setattr(memory, "available", lambda: None)
+    require(estimate, "a render", "")
+
+
+def test_sizes():
+    assert [size_text(n) for n in (0, 999_499_999, 10**9, 123_456_789_000)] == [
+        *("0 MB", "999 MB", "1.0 GB", "123.5 GB"),
+    ]
+
+
+@pytest.mark.parametrize("call", ["render_exact", "exact_config"])
+def test_full_screen_splats_are_refused_before_they_are_allocated(call, monkeypatch):
+    """120 000 of them want 900 million pairs; what they want is found with few."""
+    count, tiles = 120_000, 7500
+    grown = []
+
+    def rendered(gaussians, camera, config, *_, **__):
+        assert (gaussians.capacity, camera.width) == (count, 800)
+        grown.append(config.pair_capacity)
+        items = Demand(jnp.int32(count), jnp.int32(0), jnp.int32(count * 75))
+        pairs = items._replace(capacity=jnp.int32(count * tiles))
+        demand = items if len(grown) == 1 else pairs
+        found = SimpleNamespace(demand=demand, overflowed=jnp.asarray(True))
+        return found if call == "render_exact" else (demand, found.overflowed)
+
+    monkeypatch.setattr(render_module, "_render_jit", rendered)
+    monkeypatch.setattr(render_module, "_demand_jit", rendered)
+    monkeypatch.setattr(memory, "available", lambda: 16 * GB)
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
+    scene = {name: np.zeros((count, *shape)) for name, shape in shapes.items()}
+    gaussians = gsjax.make_gaussians(**scene, sh=np.zeros((count, 1, 3)))
+    camera = camera_of(800, 600)
+    with pytest.raises(CapacityError, match=r"800 × 600 px .* 1,073,741,823 .* pairs"):
+        getattr(gsjax, call)(gaussians, camera)
+    assert len(grown) == 2
+    assert grown[1] < 20_000_000
+
+
+def test_huge_images_are_refused_at_once(monkeypatch):
+    monkeypatch.setattr(memory, "available", lambda: 16 * GB)
+    scene = gaussians_at(frustum_points(np.random.default_rng(0), 16), 0.1, 0.5)
+    with pytest.raises(CapacityError, match="render smaller images"):
+        gsjax.render_exact(scene, camera_of(60_000, 60_000))
+
+
+@pytest.mark.parametrize(("slots", "pairs"), [(4096, 2**18), (2**16, 2**14)])
+def test_the_estimate_is_what_xla_reserves(slots, pairs, report, quick_compiles):
+    """Within 1.5 times; where pairs decide, and where Gaussians do."""
+    del quick_compiles
+    config = RasterConfig(**{**LIGHT, "pair_capacity": pairs}, occlusion=False)
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
+    scene = {name: np.zeros((slots, *shape)) for name, shape in shapes.items()}
+    gaussians = gsjax.make_gaussians(**scene, sh=np.zeros((slots, 4, 3)))
+    camera = camera_of(128, 96)
+    lowered = jax.jit(gsjax.render, static_argnames="config").lower(
+        gaussians, camera, config
+    )
+    sizes = lowered.compile().memory_analysis()
+    found = sizes.temp_size_in_bytes + sizes.output_size_in_bytes
+    estimate = render_estimate(slots, 4, (128, 96), config, width=8).total
+    report("estimate of memory", abs(np.log(estimate / found)), np.log(1.5))
+    assert 1 / 1.5 < estimate / found < 1.5
+
+
+# Peaks of `gsjax train`, less what the imports had taken; two CPU devices, jax 0.10.2,
+# 21 photographs of 800 × 600 px: preset, changes, and MB.
+MEASURED = [
+    ("fast", {}, 1270),
+    ("default", {"initial": "random", "max_size": 640}, 2288),
+    ("quality", {"initial": "random", "strategy": "adaptive"}, 4376),
+]
+
+
+@pytest.mark.skipif(jax.local_device_count() != 2, reason="measured with two devices")
+@pytest.mark.parametrize(("name", "changes", "measured"), MEASURED)
+def test_the_estimate_of_a_run_is_what_runs_took(name, changes, measured, report):
+    config = preset(name).replace(**changes)
+    made = scene_of_views(21, points=20_000)
+    views = tuple(replace(view, width=800, height=600) for view in made.views)
+    count = 20_000 if config.initial == "points" else config.initial_count
+    slots = first_slots(count, config)
+    if name == "quality":  # it was run with --max-gaussians 100000
+        slots = 131_072
+    found = run_estimate(replace(made, views=views), config, count, slots, begins=True)
+    report(f"memory of {name}", abs(np.log(found.total / 1e6 / measured)), np.log(1.5))
+    assert 1 / 1.5 < found.total / 1e6 / measured < 1.5
