@@ -1,5 +1,6 @@
 """3D Gaussian splatting in pure JAX: exact, differentiable, tiled."""
 
+from gsjax import notebook as notebook
 from gsjax.cameras import Camera as Camera
 from gsjax.cameras import CameraModel as CameraModel
 from gsjax.cameras import look_at as look_at
