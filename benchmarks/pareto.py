@@ -13,7 +13,7 @@ import sys
 
 import gsjax
 
-gsjax.use_all_cores()
+gsjax.use_all_cores(queued=False)
 
 import measure  # noqa: E402
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import gsjax
 
-gsjax.use_all_cores()
+gsjax.use_all_cores(queued=False)
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402

@@ -26,7 +26,7 @@ def point(count: int, width: int, height: int) -> dict:
     """One scene at one size, in this process."""
     import gsjax
 
-    gsjax.use_all_cores()
+    gsjax.use_all_cores(queued=False)
     import jax
     import jax.numpy as jnp
     import scenes

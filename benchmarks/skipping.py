@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import gsjax
 
-gsjax.use_all_cores()
+gsjax.use_all_cores(queued=False)
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402

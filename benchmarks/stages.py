@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import gsjax
 
-gsjax.use_all_cores()
+gsjax.use_all_cores(queued=False)
 
 import compositor  # noqa: E402
 import jax  # noqa: E402

@@ -12,6 +12,8 @@ import ctypes
 import hashlib
 import os
 import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import jax
@@ -23,12 +25,22 @@ _MAX_KEPT_BYTES = 500_000_000
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
 
 
-def use_all_cores(count: int | None = None) -> int:
+def use_all_cores(count: int | None = None, *, queued: bool = True) -> int:
     """Let JAX show ``count`` CPU devices (default: the cores this process may use).
 
     Call it before the first computation: ``import gsjax; gsjax.use_all_cores()``. On
     a GPU or TPU it changes nothing that matters. `RasterConfig.devices` then
     defaults to all of them; images do not depend on it. It also calls `keep_memory`.
+
+    Args:
+      count: how many.
+      queued: whether calls of jitted functions may pile up before a result is waited
+        for, as in a training loop that does not look at its loss. XLA's CPU client
+        (jax 0.10.2) lets 32 computations wait for a device; whoever starts one more
+        blocks a thread for each device, and with as many threads as devices none is
+        left to finish one: the process is aborted. So JAX is given twice the threads,
+        unless ``NPROC`` in the environment says how many. That costs speed; pass False
+        where each result is waited for, or every tenth.
 
     Returns:
       The number of local devices.
@@ -40,16 +52,31 @@ def use_all_cores(count: int | None = None) -> int:
         available = getattr(os, "sched_getaffinity", None)
         count = len(available(0)) if available else (os.cpu_count() or 1)
     keep_memory()
+    threads = 2 * count if queued and count > 1 else None
+    with _threads(threads):
+        try:
+            jax.config.update("jax_num_cpu_devices", count)
+        except RuntimeError as error:
+            if jax.default_backend() != "cpu" or jax.local_device_count() == count:
+                return jax.local_device_count()
+            raise RuntimeError(
+                "use_all_cores came after JAX had started; call it before the first "
+                "computation, right after import gsjax"
+            ) from error
+        return jax.local_device_count()  # starts JAX
+
+
+@contextmanager
+def _threads(count: int | None) -> Iterator[None]:
+    """Within, XLA's CPU client is started with so many threads, unless NPROC is set."""
+    if count is None or "NPROC" in os.environ:
+        yield
+        return
+    os.environ["NPROC"] = str(count)
     try:
-        jax.config.update("jax_num_cpu_devices", count)
-    except RuntimeError as error:
-        if jax.default_backend() != "cpu" or jax.local_device_count() == count:
-            return jax.local_device_count()
-        raise RuntimeError(
-            "use_all_cores came after JAX had started; call it before the first "
-            "computation, right after import gsjax"
-        ) from error
-    return jax.local_device_count()
+        yield
+    finally:
+        del os.environ["NPROC"]
 
 
 def keep_memory() -> bool:

@@ -79,3 +79,30 @@ assert sum(count < 100 for count in faults[1:]) >= 3, faults
     if done.stderr.strip() == "skip":
         pytest.skip("the allocator is not that of glibc")
     assert done.returncode == 0, done.stderr
+
+
+QUEUE = """
+import jax, jax.numpy as jnp, numpy as np, gsjax
+gsjax.use_all_cores(2)
+mesh = jax.sharding.Mesh(np.array(jax.local_devices()), ("x",))
+spec = jax.sharding.PartitionSpec
+share = jax.shard_map(
+    lambda shift, x: jnp.sin(x + shift)[None],
+    mesh=mesh, in_specs=(spec("x"), spec()), out_specs=spec("x"), check_vma=False,
+)
+step = jax.jit(lambda x: share(jnp.arange(2.0), x).sum(0))
+x = step(jnp.ones(2000))
+for _ in range(500):
+    x = step(x)
+assert jnp.isfinite(x).all()
+"""
+
+
+def test_calls_may_pile_up():
+    """XLA aborts this within a minute where it has as many threads as devices."""
+    env = {name: value for name, value in os.environ.items() if name != "NPROC"}
+    env |= {"PYTHONPATH": str(Path(__file__).parents[1]), "XLA_FLAGS": ""}
+    done = subprocess.run(
+        [sys.executable, "-c", QUEUE], env=env, timeout=150, capture_output=True
+    )
+    assert done.returncode == 0, done.stderr[-2000:]

@@ -90,4 +90,4 @@ def start_jax() -> None:
     devices.keep_programs()
     # Called from a program in which JAX has started, its devices are used.
     with contextlib.suppress(RuntimeError):
-        devices.use_all_cores()
+        devices.use_all_cores(queued=False)  # every result is waited for
