@@ -39,6 +39,7 @@ from gsjax.scene.initialise import init_gaussians as init_gaussians
 from gsjax.scene.photos import load_photos as load_photos
 from gsjax.scene.splits import split_views as split_views
 from gsjax.train.config import TrainConfig as TrainConfig
+from gsjax.train.fit import Hooks as Hooks
 from gsjax.train.fit import fit as fit
 from gsjax.train.fit import subset as subset
 from gsjax.train.step import init_state as init_state

@@ -201,7 +201,7 @@ def live(
       background: RGB behind the scene.
 
     Returns:
-      The hook for `gsjax.train.fit.Hooks.state`.
+      The hook for `gsjax.Hooks.state`.
 
     Raises:
       InputError: if ``every`` is below 1.

@@ -42,7 +42,7 @@ class LiveViewer:
     def begin(
         self, scene: Scene, photos: Sequence[Photo], config: TrainConfig
     ) -> Callable[[TrainState, Progress], None]:
-        """The hook for `gsjax.train.fit.Hooks.state`; serving begins at its first."""
+        """The hook for `gsjax.Hooks.state`; serving begins at its first."""
 
         def after_step(state: TrainState, progress: Progress) -> None:
             step = int(progress.metrics.step)
