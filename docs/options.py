@@ -22,13 +22,21 @@ def command_classes() -> dict[str, str]:
 
 
 def fields(command: str) -> list[tuple[ast.AnnAssign, str]]:
-    """The fields of a command, each with its help."""
-    wanted = command_classes()[command]
-    for path in sorted((SOURCE / "commands").glob("*.py")):
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.ClassDef) and node.name == wanted:
-                return list(_told(node.body))
-    raise LookupError(f"no class {wanted} in {SOURCE / 'commands'}")
+    """The fields of a command, each with its help; those that it inherits last, but
+    for those that all have."""
+    classes = {
+        node.name: node
+        for path in sorted((SOURCE / "commands").glob("*.py"))
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef)
+    }
+    found, names = [], [command_classes()[command]]
+    while names:
+        node = classes[names.pop(0)]
+        found += _told(node.body)
+        bases = {ast.unparse(base) for base in node.bases}
+        names += sorted(bases - {"Command"})
+    return found
 
 
 def _told(body: list[ast.stmt]):

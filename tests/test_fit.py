@@ -43,6 +43,8 @@ from gsjax.train.fit import (
 )
 from gsjax.train.step import init_state
 
+pytestmark = pytest.mark.usefixtures("quick_compiles")
+
 STEPS, FINER = 60, 30
 _PAUSE = 2.0  # s
 CONFIG = TrainConfig(

@@ -43,6 +43,8 @@ from gsjax.train.frames import Batch, draw, make_frames
 from gsjax.train.step import background_of, init_state, make_train_step, targets
 from gsjax.train.tuning import tuned_camera
 
+pytestmark = pytest.mark.usefixtures("quick_compiles")
+
 SLOTS = 96
 PLAIN = TrainConfig(
     steps=100,

@@ -27,6 +27,8 @@ class Command:
 
 @dataclass(kw_only=True)
 class HeavyCommand(Command):
+    """A command that may take more memory than there is."""
+
     ignore_memory: bool = False
     """Go on even where the memory of this machine looks too small."""
 
