@@ -1,13 +1,14 @@
 """Claim: a held-out photograph is shown well within minutes on two cores.
 
 ``python benchmarks/training.py DATASET [IMAGE …]`` trains with `gsjax train --preset
-fast`, once for each strategy, with the named images held out (else every 8th), in a
-process that has nothing compiled. Kept are PSNR and SSIM of the held-out views over
-seconds; compiling counts, measuring does not.
+fast`, once for each strategy (or the one of ``--strategy``), with the named images held
+out (else every 8th), in a process that has nothing compiled. Kept are PSNR and SSIM of
+the held-out views over seconds; compiling counts, measuring does not.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import subprocess
@@ -22,6 +23,7 @@ from gsjax import files, images
 from gsjax.curves import Series, curves
 
 EVERY = 50
+STRATEGIES = ("mcmc", "adaptive")
 
 
 def train(dataset: Path, held_out: list[str], strategy: str, run: Path) -> None:
@@ -39,11 +41,11 @@ def lines(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def main(dataset: Path, held_out: list[str]) -> None:
+def main(dataset: Path, held_out: list[str], strategies: list[str]) -> None:
     """Measure, save and draw."""
     rows, series = [], []
     with tempfile.TemporaryDirectory() as folder:
-        for strategy in ("mcmc", "adaptive"):
+        for strategy in strategies:
             run = Path(folder) / strategy
             train(dataset, held_out, strategy, run)
             found = lines(run / "held_out.jsonl")
@@ -66,4 +68,9 @@ def main(dataset: Path, held_out: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2:])
+    parser = argparse.ArgumentParser()
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("images", nargs="*")
+    parser.add_argument("--strategy", action="append", choices=STRATEGIES)
+    given = parser.parse_args()
+    main(given.dataset, given.images, given.strategy or list(STRATEGIES))
