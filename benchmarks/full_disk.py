@@ -10,7 +10,6 @@ must end with the bits of the first.
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -19,7 +18,6 @@ from pathlib import Path
 import kills
 import measure
 
-from gsjax.scene.caster import DemoDatasetSettings, write_demo_dataset
 from gsjax.train.checkpoint import load_checkpoint
 
 
@@ -36,10 +34,7 @@ def main(count: int) -> None:
     rows = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        cache = {"JAX_COMPILATION_CACHE_DIR": str(folder / "programs")}
-        environment = {**os.environ, **cache}
-        size = DemoDatasetSettings(photos=9, width=48, height=32, points=150, seed=0)
-        write_demo_dataset(folder / "dataset", size, overwrite=True)
+        environment = kills.prepared(folder)
 
         def train(run: Path, *more: str):
             return subprocess.run(

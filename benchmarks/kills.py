@@ -66,16 +66,22 @@ def killed_after(arguments: list[str], seconds: float, environment) -> bool:
         return True
 
 
+def prepared(folder: Path) -> dict[str, str]:
+    """Write a small dataset into ``folder``; the environment of runs that share what
+    they compile there.
+    """
+    size = DemoDatasetSettings(photos=9, width=48, height=32, points=150, seed=0)
+    write_demo_dataset(folder / "dataset", size, overwrite=True)
+    return {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder / "programs")}
+
+
 def main(count: int) -> None:
     """Measure and save."""
     rng = np.random.default_rng(0)
     rows = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        cache = {"JAX_COMPILATION_CACHE_DIR": str(folder / "programs")}
-        environment = {**os.environ, **cache}
-        size = DemoDatasetSettings(photos=9, width=48, height=32, points=150, seed=0)
-        write_demo_dataset(folder / "dataset", size, overwrite=True)
+        environment = prepared(folder)
 
         def finish(arguments):
             subprocess.run(arguments, env=environment, check=True, capture_output=True)
