@@ -104,9 +104,9 @@ def _row(row: SheetRow, width: int, with_depth: bool) -> np.ndarray:
         )
     error = np.abs(truth - render)
     cells = [
-        _cell(_visible(truth), row.name, width),
-        _cell(_visible(render), f"render  {_psnr(error)}", width),
-        _cell(_visible(MAGNIFIED * error), f"error x {MAGNIFIED}", width),
+        _cell(visible(truth), row.name, width),
+        _cell(visible(render), f"render  {_psnr(error)}", width),
+        _cell(visible(MAGNIFIED * error), f"error x {MAGNIFIED}", width),
     ]
     if row.depth is not None:
         pixels, near, far = depth_colors(row.depth)
@@ -129,8 +129,8 @@ def _floats(picture: np.ndarray) -> np.ndarray:
     return picture / 255.0 if picture.dtype == np.uint8 else np.asarray(picture, float)
 
 
-def _visible(picture: np.ndarray) -> np.ndarray:
-    """uint8, magenta where a channel is not finite."""
+def visible(picture: np.ndarray) -> np.ndarray:
+    """[H, W, 3] uint8 of floats in [0, 1] (clipped); magenta where not finite."""
     finite = np.isfinite(picture).all(axis=-1, keepdims=True)
     pixels = images.to_8_bit(np.where(finite, picture, 0))
     return np.where(finite, pixels, np.asarray(_MISSING, np.uint8))

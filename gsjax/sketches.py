@@ -11,17 +11,16 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from gsjax import images
+from gsjax import images, sheets
 from gsjax.cameras import look_at
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.raster.types import Render
-from gsjax.sh import C0
+from gsjax.sh import dc_to_rgb
 from gsjax.sheets import depth_colors, put_text, text_width
 from gsjax.viewer.splats import Cut, most_important, within
 
 _PAPER, _TEXT, _ALARM = (24, 26, 31), (200, 204, 212), (255, 120, 90)
-_MISSING = (255, 0, 255)
 _GAP, _BAR, _LINE = 4, 18, 17
 _SHEET = 960  # px, how wide a sheet becomes by itself
 _MOST_CELLS = 24
@@ -51,10 +50,7 @@ def visible(picture) -> np.ndarray:
         )
     if picture.dtype == np.uint8:
         return picture
-    picture = picture.astype(np.float64)
-    finite = np.isfinite(picture).all(axis=-1, keepdims=True)
-    pixels = images.to_8_bit(np.where(finite, picture, 0))
-    return np.where(finite, pixels, np.asarray(_MISSING, np.uint8))
+    return sheets.visible(picture.astype(np.float64))
 
 
 def of_depth(depth: np.ndarray) -> Cell:
@@ -182,7 +178,7 @@ def drawn(gaussians: Gaussians, view: Viewpoint | None = None) -> np.ndarray:
     focal = height  # a field of view of 53°
     middle = np.median(np.asarray(gaussians.params.log_scales, np.float64)[shown], 1)
     colors = np.asarray(gaussians.params.sh, np.float64)[shown, 0]
-    colors = images.to_8_bit(0.5 + C0 * colors)
+    colors = images.to_8_bit(np.asarray(dc_to_rgb(colors)))  # pyright: ignore
     order = np.argsort(-local[:, 2])
     order = order[local[order, 2] > 0.02 * distance]
     z = local[order, 2]

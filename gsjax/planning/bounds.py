@@ -14,8 +14,7 @@ in float64. Axis legend: N Gaussians, L bands of spherical harmonics.
 import numpy as np
 
 from gsjax.gaussians import Gaussians
-
-_C0 = 0.28209479177387814
+from gsjax.sh import C0
 
 
 def opacities(gaussians: Gaussians) -> np.ndarray:
@@ -60,7 +59,7 @@ def color_range(gaussians: Gaussians, background=(0.0, 0.0, 0.0)) -> float:
     """D: largest range of a channel, over all splats, directions and the background."""
     sh = np.asarray(gaussians.params.sh, np.float64)[np.asarray(gaussians.active), 0]
     swing = band_changes(gaussians).sum(axis=1)[:, None]
-    middle = 0.5 + _C0 * sh
+    middle = 0.5 + C0 * sh
     behind = np.asarray(background, np.float64)[None]
     low = np.concatenate([np.maximum(middle - swing, 0), behind]).min(axis=0)
     high = np.concatenate([np.maximum(middle + swing, 0), behind]).max(axis=0)
