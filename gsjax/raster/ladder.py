@@ -11,8 +11,10 @@ from gsjax.raster.types import Array
 T = TypeVar("T")
 
 
-def on_ladder(wanted: Array, full: int, rungs: int, run: Callable[[int], T]) -> T:
-    """``run(size)`` with the smallest of full, full / 4, … that holds ``wanted``.
+def on_ladder(
+    wanted: Array, full: int, rungs: int, run: Callable[[int], T], step: int = 4
+) -> T:
+    """``run(size)`` with the smallest of full, full / step, … that holds ``wanted``.
 
     Every size is compiled and one is run (`lax.switch`; under `jax.vmap` all are, and
     one is picked). What ``run`` returns must have the same shapes for every size.
@@ -24,7 +26,7 @@ def on_ladder(wanted: Array, full: int, rungs: int, run: Callable[[int], T]) -> 
     """
     sizes = [full]
     while len(sizes) < rungs and sizes[-1] >= 1024:
-        sizes.append(-(-sizes[-1] // 4))
+        sizes.append(-(-sizes[-1] // step))
     if len(sizes) == 1:
         return run(full)
     index = sum((wanted <= size).astype(jnp.int32) for size in sizes[1:])

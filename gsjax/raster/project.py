@@ -6,6 +6,7 @@ All arithmetic is on components (structure of arrays); no matrix product is used
 no accelerator can lower its precision.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ from gsjax import sh as sh_lib
 from gsjax.cameras import Camera, camera_centre
 from gsjax.gaussians import Gaussians
 from gsjax.numerics import exp_log_scale, safe_normalize, safe_sqrt
+from gsjax.raster.blocks import by_blocks
 from gsjax.raster.counts import squeeze
 from gsjax.raster.ladder import on_ladder
 from gsjax.raster.sorting import argsort_float
@@ -77,20 +79,39 @@ def depth_order(
         last. If more than R are visible, those of the lowest slots are kept.
       count: [] int32, not limited to R.
     """
-    params = lax.stop_gradient(gaussians.params)
-    camera = lax.stop_gradient(camera)
-    means, log_scales = params.means.T, params.log_scales.T
-    logits = params.logit_opacities
+    params, camera = lax.stop_gradient((gaussians.params, camera))
+
+    def look(active: Array, inputs) -> Array:
+        means, log_scales, logits = inputs
+        return _depths_in_view(active, means, log_scales, logits, camera, config)
+
+    def none(active: Array, inputs) -> Array:
+        return jnp.full(active.shape, jnp.inf, inputs[0].dtype)
+
+    inputs = (params.means, params.log_scales, params.logit_opacities)
+    z = by_blocks(look, none, gaussians.active, inputs)
+    return _compact_and_sort(z < jnp.inf, z, config)
+
+
+def _depths_in_view(
+    active: Array,
+    means: Array,
+    log_scales: Array,
+    logits: Array,
+    camera: Camera,
+    config: RasterConfig,
+) -> Array:
+    """Camera z [K] of the slots that may be visible, infinity of others."""
+    means, log_scales = means.T, log_scales.T
     x, y, z = transform_point(camera.viewmat, means)
-    live = gaussians.active & in_depth_range(camera, z) & jnp.isfinite(logits)
+    live = active & in_depth_range(camera, z) & jnp.isfinite(logits)
     live &= usable(camera)
     for value in (*means, *log_scales):
         live &= jnp.isfinite(value)
     point = (jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1))
     u, v = camera.model.project_point(camera.K, point)
     largest = exp_log_scale(jnp.max(jnp.where(live, log_scales, 0), axis=0))
-    opacity = jax.nn.sigmoid(logits)
-    reach = reach_of(opacity, config)
+    reach = reach_of(jax.nn.sigmoid(logits), config)
     for centre, row, size in zip(
         (u, v), ewa_jacobian(camera, point), (camera.width, camera.height)
     ):
@@ -101,8 +122,7 @@ def depth_order(
         # Phrased so that neither an overflow nor a NaN gets through.
         live &= (square < jnp.inf) & (jnp.abs(centre) < jnp.inf)
         live &= (centre + extent >= 0.5) & (centre - extent <= size - 0.5)
-    live &= reach > 0
-    return _compact_and_sort(live, z, config)
+    return jnp.where(live & (reach > 0), z, jnp.inf)
 
 
 def _compact_and_sort(
@@ -153,7 +173,9 @@ def project(
         statistic. Or None.
       abs_probe: [N, 2] zeros that collect the absolute gradient. Or None.
     """
+    room = order.shape[0]
     order = jnp.minimum(order, gaussians.capacity - 1)
+
     rows = jax.tree.map(lambda a: a[order], gaussians.params)
     colour_rows = rows.sh if features is None else features[order]
     components = _Components(
@@ -161,21 +183,27 @@ def project(
         quats=tuple(rows.quats.T),
         log_scales=tuple(rows.log_scales.T),
         logit_opacities=rows.logit_opacities,
-        colors=tuple(colour_rows.reshape(order.shape[0], -1).T),
+        colors=tuple(colour_rows.reshape(room, -1).T),
         shift=None if probe is None else tuple(probe[order].T),
     )
 
-    @jax.checkpoint
-    def some(components: _Components, camera: Camera, count: Array) -> Projected:
-        return _project_components(components, camera, config, count, features is None)
+    def some(size: int, components: _Components, camera, count) -> Projected:
+        live = lax.iota(jnp.int32, size) < count
+        front = jax.tree.map(lambda a: a[:size], components)
+        out = _project_components(front, camera, config, live, features is None)
+        beyond = _unseen(room - size, out.colors.shape[0], out.u.dtype)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a, b], -1), out, beyond)
 
-    def none(*operands) -> Projected:
-        shapes = jax.eval_shape(some, *operands)
-        empty = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
-        ones = jnp.ones_like(empty.u)
-        return empty._replace(inv_sx=ones, inv_sy=ones, det=ones)
+    def none(components: _Components, *_) -> Projected:
+        colors = 3 if features is None else len(components.colors)
+        return _unseen(room, colors, components.logit_opacities.dtype)
 
-    out = lax.cond(count > 0, some, none, components, camera, count)
+    def run(size: int) -> Projected:
+        project_some = jax.checkpoint(partial(some, size))
+        return lax.cond(count > 0, project_some, none, components, camera, count)
+
+    # Two sizes: every one more costs a second and more of compiling.
+    out = on_ladder(count, room, min(config.rungs, 2), run, step=16)
     return out if abs_probe is None else out._replace(probe=abs_probe[order].T)
 
 
@@ -195,11 +223,31 @@ class _Components(NamedTuple):
     shift: tuple[Array, ...] | None
 
 
+def _unseen(count: int, channels: int, dtype) -> Projected:
+    """Ranks of which nothing shows."""
+    zeros, ones = jnp.zeros(count, dtype), jnp.ones(count, dtype)
+    return Projected(
+        u=zeros,
+        v=zeros,
+        depth=zeros,
+        inv_sx=ones,
+        slope=zeros,
+        inv_sy=ones,
+        var_y=ones,
+        det=ones,
+        opacity=zeros,
+        reach=zeros,
+        colors=jnp.zeros((channels, count), dtype),
+        compensation=ones,
+        probe=None,
+    )
+
+
 def _project_components(
     rows: _Components,
     camera: Camera,
     config: RasterConfig,
-    count: Array,
+    live: Array,
     harmonic: bool,
 ) -> Projected:
     """The arithmetic of `project`, on components.
@@ -211,7 +259,6 @@ def _project_components(
     and z put into one array in the same loop, they would cost as much as all the rest
     of a render. It is recomputed in the backward pass rather than kept.
     """
-    live = lax.iota(jnp.int32, rows.logit_opacities.shape[0]) < count
     for value in rows.colors:
         live &= jnp.abs(value) < COLOR_LIMIT
     unit, good = safe_normalize(

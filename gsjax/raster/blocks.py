@@ -1,0 +1,48 @@
+"""Work on one slot at a time, block by block; blocks that need none are skipped.
+
+What is paid then goes with the slots in use and not with the capacity. Made for what
+no derivative is taken of: the transposed loop copies more than it saves (on two cores,
+30 ms more for a gradient by 56 k Gaussians). Nor are the blocks shared by devices: on
+CPU the exchange of what comes out costs as much as is saved.
+"""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from gsjax.raster.types import Array
+
+T = TypeVar("T")
+
+BLOCK = 8192  # slots; what they hold stays in a core's cache
+
+
+def by_blocks(
+    run: Callable[..., T], skip: Callable[..., T], needed: Array, inputs
+) -> T:
+    """``run(needed, inputs)``, and ``skip`` where a block holds nothing needed.
+
+    Args:
+      run, skip: from arrays [K, …] to arrays [K, …] alike, element by element.
+      needed: [N] bool.
+      inputs: arrays [N, …].
+
+    Returns:
+      Arrays [N, …].
+    """
+    size = needed.shape[0]
+    block = max(1, min(BLOCK, size))
+    blocks = -(-size // block)
+
+    def split(a: Array) -> Array:
+        fill = [(0, blocks * block - size)] + [(0, 0)] * (a.ndim - 1)
+        return jnp.pad(a, fill).reshape(blocks, block, *a.shape[1:])
+
+    def one(part):
+        return lax.cond(jnp.any(part[0]), run, skip, *part)
+
+    out = lax.map(one, jax.tree.map(split, (needed, inputs)))
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:size], out)

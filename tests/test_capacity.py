@@ -1,0 +1,113 @@
+"""Capacity is never silent: one too few is reported, exactly enough is exact."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import (
+    BACKGROUND,
+    COMPAT,
+    camera_of,
+    cast,
+    needs_two_devices,
+    render,
+    scene_of,
+)
+from pictures import assert_same, images
+
+import gsjax
+from gsjax.errors import CapacityError
+from gsjax.raster.counts import total_count
+
+pytestmark = pytest.mark.usefixtures("quick_compiles")
+
+
+def test_capacity_of_exactly_the_need():
+    gaussians, camera = scene_of("random")
+    wanted = images(gaussians, camera)
+    need, visible = int(wanted.demand.capacity), int(wanted.demand.visible)
+    assert need == wanted.demand.pairs > 100
+    exact = COMPAT.replace(pair_capacity=need, visible_capacity=visible)
+    assert_same(images(gaussians, camera, exact), wanted)
+    given = cast((gaussians, camera), jnp.float32)
+    for name, size in (("pair_capacity", need), ("visible_capacity", visible)):
+        out = render(*given, exact.replace(**{name: size - 1}), np.float32(BACKGROUND))
+        assert out.overflowed
+        found = {
+            "pair_capacity": out.demand.capacity,
+            "visible_capacity": out.demand.visible,
+        }
+        assert found[name] == size
+
+
+@needs_two_devices
+def test_capacity_over_two_devices():
+    """The demand is that of the device with the most, times the devices."""
+    gaussians, camera = cast(scene_of("random"), jnp.float32)
+    config = COMPAT.replace(devices=2)
+    wanted = images(gaussians, camera)
+    need = int(render(gaussians, camera, config).demand.capacity)
+    assert need >= wanted.demand.capacity
+    enough = config.replace(pair_capacity=need)
+    assert_same(images(gaussians, camera, enough), wanted)
+    out = render(gaussians, camera, enough.replace(pair_capacity=need - 2))
+    assert out.overflowed
+    assert out.demand.capacity == need
+
+
+def test_render_exact_regrows():
+    gaussians, camera = cast(scene_of("random"), jnp.float32)
+    wanted = images(gaussians, camera)
+    tiny = COMPAT.replace(pair_capacity=1, visible_capacity=1)
+    background = jnp.float32(BACKGROUND)
+    assert render(gaussians, camera, tiny, background).overflowed
+    out = gsjax.render_exact(gaussians, camera, tiny, background)
+    assert not out.overflowed
+    assert_same(out, wanted)
+    fitted = gsjax.exact_config(gaussians, camera, tiny)
+    assert fitted.replace(pair_capacity=1, visible_capacity=1) == tiny
+    assert_same(images(gaussians, camera, fitted), wanted)
+    with pytest.raises(CapacityError, match="wants a pair capacity"):
+        gsjax.render_exact(gaussians, camera, tiny, background, max_capacity=100)
+
+
+def test_counts_past_32_bits_do_not_wrap():
+    """4096 splats over 2^20 tiles of one pixel: 2^32 pairs, which wraps to 0."""
+    scene = gsjax.make_gaussians(
+        means=np.tile([0.0, 0, 1], (4096, 1)),
+        quats=np.tile([1.0, 0, 0, 0], (4096, 1)),
+        log_scales=np.full((4096, 3), 18.0),
+        logit_opacities=np.zeros(4096),
+        sh=np.zeros((4096, 1, 3)),
+    )
+    camera = camera_of(2**20, 1, viewmat=np.eye(4), focal=(1.0, 1.0))
+    config = COMPAT.replace(
+        outputs=("alpha",),
+        tile_size=1,
+        chunk_size=1,
+        tiles_per_step=1024,
+        pair_capacity=8192,
+        occlusion=False,
+    )
+    out = render(*cast((scene, camera), jnp.float32), config)
+    assert out.overflowed
+    assert out.demand.pairs == out.demand.capacity == 2**31 - 1
+    with pytest.raises(CapacityError, match="2,147,483,647 or more"):
+        gsjax.render_exact(*cast((scene, camera), jnp.float32), config)
+
+
+@pytest.mark.parametrize(
+    ("counts", "wanted"),
+    [
+        ([3, 0, 4], 7),
+        ([2**30 - 2**12, 5], 2**30 - 2**12 + 5),
+        ([2**30, 2**10], 2**31 - 1),
+        ([2**30, 2**30, 1], 2**31 - 1),  # wraps to -2^31 + 1
+        ([2**30] * 4, 2**31 - 1),  # wraps to 0
+        ([2**30] * 4 + [100], 2**31 - 1),  # wraps to 100
+    ],
+)
+def test_total_count_saturates(counts, wanted):
+    total, safe = total_count(jnp.asarray(counts, jnp.int32))
+    assert total.dtype == jnp.int32
+    assert total == wanted
+    assert safe == (wanted < 2**30)
