@@ -1,14 +1,16 @@
 """Claim: time and memory grow with the pairs a view asks for, not with worse.
 
 ``python benchmarks/scaling.py`` renders synthetic shells of 1 k … 1 M Gaussians, at
-sizes from 320 × 180 to 1920 × 1080, forward and gradient, each point in a process of
-its own so that its peak of resident memory can be read; fits slopes, and plots. With a
-GPU, ``--gpu`` measures 0.1, 1 and 3 M Gaussians at 1920 × 1080 instead.
+sizes from 320 × 180 to 1920 × 1080, with room for up to 8 times as many, and up to 8
+cameras in a call; forward and gradient, each point in a process of its own so that its
+peak of resident memory can be read; fits slopes, and plots. With a GPU, ``--gpu``
+measures 0.1, 1 and 3 M Gaussians at 1920 × 1080 instead.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import resource
 import subprocess
@@ -22,8 +24,8 @@ COUNTS = (1_000, 10_000, 100_000, 1_000_000)
 SIZES = ((320, 180), (640, 360), (1280, 720), (1920, 1080))
 
 
-def point(count: int, width: int, height: int) -> dict:
-    """One scene at one size, in this process."""
+def point(count: int, width: int, height: int, room: int, cameras: int) -> dict:
+    """One scene at one size, in this process, with ``room`` times the slots."""
     import gsjax
 
     gsjax.use_all_cores(queued=False)
@@ -32,7 +34,10 @@ def point(count: int, width: int, height: int) -> dict:
     import scenes
 
     case = scenes.shell(count, width, height)
-    gaussians, camera = case.gaussians, case.camera
+    gaussians = gsjax.grow(case.gaussians, room * case.gaussians.capacity)
+    camera = case.camera
+    if cameras > 1:
+        camera = gsjax.stack_cameras([shifted(camera, i) for i in range(cameras)])
     jax.block_until_ready(gaussians.params.means)
     start = time.perf_counter()
     config = gsjax.exact_config(gaussians, camera)
@@ -62,6 +67,9 @@ def point(count: int, width: int, height: int) -> dict:
         "Gaussians": count,
         "width": width,
         "height": height,
+        "room": room,
+        "cameras": cameras,
+        "devices": jax.local_device_count(),
         "visible": int(result.demand.visible),
         "pairs": int(result.demand.pairs),
         "alpha mean": float(jnp.mean(result.alpha)),
@@ -75,6 +83,13 @@ def point(count: int, width: int, height: int) -> dict:
     }
 
 
+def shifted(camera, index: int):
+    """The camera moved sideways a little, so that a batch is not one view twice."""
+    move = np.zeros((4, 4), np.float32)
+    move[0, 3] = 0.02 * index
+    return dataclasses.replace(camera, viewmat=camera.viewmat + move)
+
+
 def _peak_gb() -> float:
     """Peak memory: of the first accelerator if there is one, else resident."""
     import jax
@@ -86,7 +101,7 @@ def _peak_gb() -> float:
 
 def slopes(rows: list[dict]) -> dict[str, float]:
     """Exponents of time against pairs (log-log) over the points above 10 k pairs."""
-    large = [row for row in rows if row["pairs"] > 10_000]
+    large = [row for row in rows if row["pairs"] > 10_000 and row["room"] == 1]
     pairs = np.log([row["pairs"] for row in large])
     return {
         key: float(np.polyfit(pairs, np.log([row[key] for row in large]), 1)[0])
@@ -101,12 +116,21 @@ def plot(rows: list[dict], path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, 3, figsize=(13, 4))
-    by_count = [row for row in rows if row["width"] == 1280]
-    by_size = [row for row in rows if row["Gaussians"] == 100_000]
+    figure, axes = plt.subplots(1, 5, figsize=(20, 4))
+
+    def pixels(row: dict) -> int:
+        return row["width"] * row["height"]
+
+    plain = [row for row in rows if row["room"] == row["cameras"] == 1]
+    by_count = [row for row in plain if row["width"] == 1280]
+    by_size = sorted((r for r in plain if r["Gaussians"] == 100_000), key=pixels)
+    batches = [row for row in rows if row["width"] == 320 and row["room"] == 1]
+    roomy = [row for row in rows if row["width"] == 320 and row["cameras"] == 1]
     panels = (
         (axes[0], by_count, lambda r: r["Gaussians"], "Gaussians (1280 × 720)"),
-        (axes[1], by_size, lambda r: r["width"] * r["height"], "pixels (100 k)"),
+        (axes[1], by_size, pixels, "pixels (100 k)"),
+        (axes[2], batches, lambda r: r["cameras"], "cameras (100 k, 320 × 180)"),
+        (axes[3], roomy, lambda r: r["room"], "capacity / active (100 k, 320 × 180)"),
     )
     for axis, chosen, x, label in panels:
         for key in ("forward ms", "v+g ms"):
@@ -117,15 +141,15 @@ def plot(rows: list[dict], path) -> None:
         axis.set_ylabel("ms")
         axis.legend()
     for key in ("forward GB", "v+g GB"):
-        axes[2].loglog(
+        axes[4].loglog(
             [r["Gaussians"] for r in by_count],
             [r[key] for r in by_count],
             "o-",
             label=key,
         )
-    axes[2].set_xlabel("Gaussians (1280 × 720)")
-    axes[2].set_ylabel("peak memory, GB")
-    axes[2].legend()
+    axes[4].set_xlabel("Gaussians (1280 × 720)")
+    axes[4].set_ylabel("peak memory, GB")
+    axes[4].legend()
     for axis in axes:
         axis.grid(True, which="both", alpha=0.3)
     figure.tight_layout()
@@ -135,17 +159,19 @@ def plot(rows: list[dict], path) -> None:
 def main() -> None:
     """Run every point in its own process, save, fit and plot."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--point", nargs=3, type=int, help="COUNT WIDTH HEIGHT")
+    parser.add_argument("--point", nargs=5, type=int, help="as of `point`")
     parser.add_argument("--gpu", action="store_true")
     options = parser.parse_args()
     if options.point:
         print(json.dumps(point(*options.point)))
         return
     if options.gpu:
-        points = [(n, 1920, 1080) for n in (100_000, 1_000_000, 3_000_000)]
+        points = [(n, 1920, 1080, 1, 1) for n in (100_000, 1_000_000, 3_000_000)]
     else:
-        points = [(n, 1280, 720) for n in COUNTS]
-        points += [(100_000, *size) for size in SIZES if size != (1280, 720)]
+        points = [(n, 1280, 720, 1, 1) for n in COUNTS]
+        points += [(100_000, *size, 1, 1) for size in SIZES if size != (1280, 720)]
+        points += [(100_000, 320, 180, n, 1) for n in (2, 4, 8)]
+        points += [(100_000, 320, 180, 1, n) for n in (2, 4, 8)]
     rows = []
     for values in points:
         command = [sys.executable, __file__, "--point", *map(str, values)]

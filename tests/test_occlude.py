@@ -19,6 +19,8 @@ from gsjax import RasterConfig
 from gsjax.raster.occlude import OPEN, _closed_from, _halve, hidden
 from gsjax.raster.project import depth_order, project
 
+pytestmark = pytest.mark.usefixtures("quick_compiles")
+
 PRESETS = {
     "compat": RasterConfig.compat(**LIGHT),
     "accurate": RasterConfig.accurate(**LIGHT),

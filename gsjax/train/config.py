@@ -277,8 +277,15 @@ def _fast() -> TrainConfig:
         levels=(Level(0.0, 2), Level(0.25, 1)),
         sh_degree=1,
         sh_every=400,
+        # Edits set a run back for a while: few, and early enough to settle after.
         adaptive=AdaptiveSettings(
-            start=100, stop=800, every=50, reset_every=0, max_gaussians=50_000
+            start=100,
+            stop=800,
+            every=100,
+            reset_every=0,
+            max_gaussians=30_000,
+            initial_opacity=0.5,
+            initial_scale=0.5,
         ),
         mcmc=McmcSettings(
             start=100,

@@ -27,7 +27,10 @@ from gsjax.train.health import Health, check_photos, check_points
 from gsjax.train.step import Metrics, TrainState, init_state, make_train_step
 
 # Room beyond what is wanted now, so that it lasts for a while.
-_PAIR_MARGIN, _SLOT_MARGIN = 1.5, 1.3
+_SLOT_MARGIN = 1.3
+# Room for pairs that are not there costs a few ms a step, a new program ten seconds:
+# much while Gaussians are still added, little afterwards.
+_PAIR_MARGIN, _GROWING_MARGIN = 1.5, 2.5
 _MAX_PROBED_VIEWS = 6
 
 
@@ -224,7 +227,7 @@ class _Run:
             state, metrics = program(state, frames)
             metrics = jax.device_get(metrics)
             if metrics.overflowed:
-                pair_capacity = _roomy(int(metrics.pair_capacity), _PAIR_MARGIN)
+                pair_capacity = self.roomy(int(metrics.pair_capacity), step)
                 continue
             step = int(metrics.step)
             progress = self.progress(metrics, divisor, state)
@@ -267,7 +270,13 @@ class _Run:
             fitted = exact_config(state.gaussians, camera, config)
             most = max(most, fitted.pair_capacity or 1)
         self.compile_seconds += time.perf_counter() - begun
-        return _roomy(self.config.batch * most, _PAIR_MARGIN)
+        return self.roomy(self.config.batch * most, int(state.step))
+
+    def roomy(self, pairs: int, step: int) -> int:
+        """A pair capacity that holds so many, with room to spare where there is."""
+        growing = step < self.config.chosen.stop
+        margin = _GROWING_MARGIN if growing else _PAIR_MARGIN
+        return _roomy(pairs, margin)
 
     def program(self, state: TrainState, frames: Frames, raster: RasterConfig):
         """The compiled step for these sizes."""

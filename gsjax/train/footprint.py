@@ -20,7 +20,7 @@ from gsjax.train.config import TrainConfig
 from gsjax.train.step import TrainState
 
 # Empty slots cost next to nothing; growing costs a compilation.
-_LEAST_SLOTS = 16_384
+_LEAST_SLOTS = 32_768
 # Compiling a step for two CPU devices, most of which stays with the process; and each
 # further size of the pictures.
 _COMPILING, _COMPILING_MORE = 900_000_000, 150_000_000
