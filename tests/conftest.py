@@ -49,8 +49,22 @@ BACKGROUND = np.array([0.2, 0.5, 0.9])
 _MANY_MAPPINGS = 30_000
 
 
+class _Programs:
+    """How what this process keeps was compiled."""
+
+    quickly = False
+
+
+def _of_one_kind(quickly: bool) -> None:
+    """Two kinds of programs round differently, and would be compared."""
+    if quickly != _Programs.quickly:
+        jax.clear_caches()
+        _Programs.quickly = quickly
+
+
 @pytest.fixture(autouse=True, scope="module")
-def _room_for_programs():
+def _room_for_programs(request):
+    _of_one_kind("quick_compiles" in request.fixturenames)
     yield
     mappings = Path("/proc/self/maps")
     if mappings.exists() and mappings.read_bytes().count(b"\n") > _MANY_MAPPINGS:
@@ -63,9 +77,16 @@ def quick_compiles():
     """For a module whose programs are many and run once: XLA compiles them in half of
     the time where it optimises little. What is computed is the same, to rounding.
     """
+    _of_one_kind(True)
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
+
+
+def pytest_collection_modifyitems(items):
+    """Modules that compile quickly come first: what is kept changes kind once."""
+    quick = {item.path for item in items if "quick_compiles" in item.fixturenames}
+    items.sort(key=lambda item: item.path not in quick)
 
 
 needs_two_devices = pytest.mark.skipif(

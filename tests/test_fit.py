@@ -292,6 +292,13 @@ def test_a_photograph_for_each_view():
         fit(subset(scene(), []), [], CONFIG)
 
 
+def test_more_room_while_gaussians_are_added():
+    """Fewer programs then: each growth lasts longer."""
+    room = fit_module._Run(scene(), photos(), CONFIG, Hooks()).roomy
+    stop = CONFIG.chosen.stop
+    assert room(1000, stop - 1) > 2 * 1000 > room(1000, stop) > 1000
+
+
 def test_more_pairs_than_can_be_addressed():
     roomy = fit_module._roomy
     assert roomy(1000, 1.5) == 1536

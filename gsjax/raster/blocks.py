@@ -1,9 +1,8 @@
 """Work on one slot at a time, block by block; blocks that need none are skipped.
 
 What is paid then goes with the slots in use and not with the capacity. Made for what
-no derivative is taken of: the transposed loop copies more than it saves (on two cores,
-30 ms more for a gradient by 56 k Gaussians). Nor are the blocks shared by devices: on
-CPU the exchange of what comes out costs as much as is saved.
+no derivative is taken of: a transposed loop would copy more than it saves. Nor are the
+blocks shared by devices: on CPU the exchange of what comes out costs as much.
 """
 
 from collections.abc import Callable

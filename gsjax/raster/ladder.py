@@ -23,6 +23,8 @@ def on_ladder(
       wanted: [] count, int or float.
       full: the capacity, taken where nothing smaller is enough.
       rungs: number of sizes, at most; those below 256 are not worth their compilation.
+      run: what to do at a size.
+      step: ratio of one size to the next.
     """
     sizes = [full]
     while len(sizes) < rungs and sizes[-1] >= 1024:

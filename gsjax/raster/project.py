@@ -86,7 +86,8 @@ def depth_order(
         return _depths_in_view(active, means, log_scales, logits, camera, config)
 
     def none(active: Array, inputs) -> Array:
-        return jnp.full(active.shape, jnp.inf, inputs[0].dtype)
+        shape = jax.eval_shape(look, active, inputs)
+        return jnp.full(shape.shape, jnp.inf, shape.dtype)
 
     inputs = (params.means, params.log_scales, params.logit_opacities)
     z = by_blocks(look, none, gaussians.active, inputs)
@@ -175,7 +176,6 @@ def project(
     """
     room = order.shape[0]
     order = jnp.minimum(order, gaussians.capacity - 1)
-
     rows = jax.tree.map(lambda a: a[order], gaussians.params)
     colour_rows = rows.sh if features is None else features[order]
     components = _Components(
@@ -191,12 +191,11 @@ def project(
         live = lax.iota(jnp.int32, size) < count
         front = jax.tree.map(lambda a: a[:size], components)
         out = _project_components(front, camera, config, live, features is None)
-        beyond = _unseen(room - size, out.colors.shape[0], out.u.dtype)
+        beyond = _unseen(out, room - size)
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b], -1), out, beyond)
 
-    def none(components: _Components, *_) -> Projected:
-        colors = 3 if features is None else len(components.colors)
-        return _unseen(room, colors, components.logit_opacities.dtype)
+    def none(*operands) -> Projected:
+        return _unseen(jax.eval_shape(partial(some, room), *operands), room)
 
     def run(size: int) -> Projected:
         project_some = jax.checkpoint(partial(some, size))
@@ -223,24 +222,11 @@ class _Components(NamedTuple):
     shift: tuple[Array, ...] | None
 
 
-def _unseen(count: int, channels: int, dtype) -> Projected:
-    """Ranks of which nothing shows."""
-    zeros, ones = jnp.zeros(count, dtype), jnp.ones(count, dtype)
-    return Projected(
-        u=zeros,
-        v=zeros,
-        depth=zeros,
-        inv_sx=ones,
-        slope=zeros,
-        inv_sy=ones,
-        var_y=ones,
-        det=ones,
-        opacity=zeros,
-        reach=zeros,
-        colors=jnp.zeros((channels, count), dtype),
-        compensation=ones,
-        probe=None,
-    )
+def _unseen(like: Projected, count: int) -> Projected:
+    """Ranks of which nothing shows, of the types and channels of others."""
+    empty = jax.tree.map(lambda a: jnp.zeros((*a.shape[:-1], count), a.dtype), like)
+    ones = jnp.ones_like(empty.u)
+    return empty._replace(inv_sx=ones, inv_sy=ones, det=ones)
 
 
 def _project_components(

@@ -51,7 +51,8 @@ class RasterConfig:
       occlusion: leave out, before binning, what lies behind pixels that have all
         stopped. Bit-equal; pays where something opaque fills part of the view.
       rungs: how many sizes, each a quarter of the one before, sorting, binning and
-        compositing are compiled for; the smallest that fits is run.
+        compositing are compiled for; the smallest that fits is run. From two on there
+        is a small size of projecting too.
       devices: how many devices share the tiles; None means all local ones.
 
     Raises:
