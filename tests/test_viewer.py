@@ -239,17 +239,22 @@ def test_a_browser_shows_the_colours_of_the_scene(ply, tmp_path, capsys):
     out, shot = tmp_path / "a.html", tmp_path / "a.png"
     assert cli.main(["view", str(ply), "--html", str(out)]) == 0
     capsys.readouterr()
-    subprocess.run(
-        [CHROMIUM, "--headless", "--no-sandbox", "--use-angle=swiftshader",
-         "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
-         f"--user-data-dir={tmp_path}/profile", "--window-size=500,400",
-         "--virtual-time-budget=20000", f"--screenshot={shot}", out.as_uri()],
-        capture_output=True, timeout=120, check=True,
-    )  # fmt: skip
-    pixels = cv2.imread(str(shot))[..., ::-1].astype(float)
-    red, green, blue = np.moveaxis(pixels, -1, 0)
-    orange = (red > 60) & (red > 1.5 * green) & (green > 1.5 * blue)
-    assert orange.mean() > 0.02
+
+    def shown() -> float:
+        """Share of the page that is orange, as the scene is."""
+        subprocess.run(
+            [CHROMIUM, "--headless", "--no-sandbox", "--use-angle=swiftshader",
+             "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
+             f"--user-data-dir={tmp_path}/profile", "--window-size=500,400",
+             "--virtual-time-budget=20000", f"--screenshot={shot}", out.as_uri()],
+            capture_output=True, timeout=120, check=True,
+        )  # fmt: skip
+        pixels = cv2.imread(str(shot))[..., ::-1].astype(float)
+        red, green, blue = np.moveaxis(pixels, -1, 0)
+        return ((red > 60) & (red > 1.5 * green) & (green > 1.5 * blue)).mean()
+
+    # On a busy machine the page's own workers may not have sorted the splats in time.
+    assert any(shown() > 0.02 for _ in range(3))
 
 
 # --- live ---
