@@ -200,6 +200,8 @@ def reconstruct(
     pycolmap = colmap()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
+    # Sums of several threads depend on who comes first: the last digits would vary.
+    options.num_threads = 1
     options.mapper.random_seed = seed
     options.triangulation.random_seed = seed
     if start is not None:
