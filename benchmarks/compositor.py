@@ -28,7 +28,8 @@ from jax.sharding import Mesh, PartitionSpec  # noqa: E402
 
 from gsjax.raster import bins  # noqa: E402
 from gsjax.raster.composite import composite  # noqa: E402
-from gsjax.raster.project import conics_of, depth_order, project  # noqa: E402
+from gsjax.raster.order import depth_order  # noqa: E402
+from gsjax.raster.project import conics_of, project  # noqa: E402
 
 
 def stages(case: scenes.Case, config: gsjax.RasterConfig):

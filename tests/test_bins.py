@@ -8,7 +8,8 @@ from conftest import COUNT, HEIGHT, SCENES, WIDTH, scene_of
 
 from gsjax import RasterConfig
 from gsjax.raster import bins
-from gsjax.raster.project import depth_order, project
+from gsjax.raster.order import depth_order
+from gsjax.raster.project import project
 
 CAPACITY = 16384
 CONFIG = RasterConfig(rungs=1, devices=1)

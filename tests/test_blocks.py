@@ -8,7 +8,7 @@ from conftest import camera_of, gaussians_at, on_cpu
 
 import gsjax
 from gsjax.raster.blocks import BLOCK, by_blocks
-from gsjax.raster.project import depth_order
+from gsjax.raster.order import depth_order
 
 
 def square_and_count(needed, inputs):

@@ -17,7 +17,8 @@ from conftest import (
 
 from gsjax import RasterConfig
 from gsjax.raster.occlude import OPEN, _closed_from, _halve, hidden
-from gsjax.raster.project import depth_order, project
+from gsjax.raster.order import depth_order
+from gsjax.raster.project import project
 
 pytestmark = pytest.mark.usefixtures("quick_compiles")
 

@@ -10,7 +10,8 @@ import pytest
 from conftest import COMPAT, oracle_data
 
 import gsjax
-from gsjax.raster.project import conics_of, depth_order, project
+from gsjax.raster.order import depth_order
+from gsjax.raster.project import conics_of, project
 from gsjax.rotations import covariance
 from gsjax.sh import eval_sh, sh_basis
 

@@ -16,7 +16,8 @@ from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.memory import require
 from gsjax.numerics import safe_divide
 from gsjax.raster.footprint import render_estimate as render_estimate
-from gsjax.raster.project import COLOR_LIMIT, depth_order, project, radii_of
+from gsjax.raster.order import depth_order
+from gsjax.raster.project import COLOR_LIMIT, project, radii_of
 from gsjax.raster.rasterise import rasterise
 from gsjax.raster.types import Array, Demand, Projected, RasterConfig, Render
 
