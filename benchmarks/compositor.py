@@ -6,7 +6,8 @@ threads over the standard exact 16 × 16 lists of the same scene, without early
 termination; forward, and value and gradient. The C++ gradient comes in two forms: by
 Gaussian with the pixels vectorised (tuned), and by pixel, as GPU code has it (plain).
 
-With ``--queued`` JAX has the threads that queued calls need: the price of that.
+Folders of runs, as further arguments, are timed too, at one view each. With
+``--queued`` JAX has the threads that queued calls need: the price of that.
 """
 
 from __future__ import annotations
@@ -24,10 +25,17 @@ import measure  # noqa: E402
 import numpy as np  # noqa: E402
 import scenes  # noqa: E402
 import yardstick  # noqa: E402
+from jax import lax  # noqa: E402
 from jax.sharding import Mesh, PartitionSpec  # noqa: E402
 
 from gsjax.raster import bins  # noqa: E402
-from gsjax.raster.composite import composite  # noqa: E402
+from gsjax.raster.composite import (  # noqa: E402
+    _alphas,
+    _gather,
+    _pixel_rows,
+    _running_product,
+    composite,
+)
 from gsjax.raster.order import depth_order  # noqa: E402
 from gsjax.raster.project import conics_of, project  # noqa: E402
 
@@ -79,7 +87,30 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
         work = bins.make_work(lists, schedule, config.chunk_size, ranks, steps)
         return composite(projected, work, schedule, grid, device, config)
 
+    def count_local(device, projected, lists, schedule):
+        """[steps] each: evaluations made, and those of them that change the image."""
+        ranks = projected.u.shape[0]
+        work = bins.make_work(lists, schedule, config.chunk_size, ranks, steps)
+        chunks = _gather(projected, work, schedule.tiles, grid, device, config)
+        pixels = _pixel_rows(grid.tile, projected.u.dtype)
+
+        def step(carried, inputs):
+            first, live, chunk = inputs
+            carried = jnp.where(first, 1, carried)
+            go = live & jnp.any(carried > config.stop)
+            alpha = _alphas(chunk, pixels, config)
+            total, before = _running_product(alpha)
+            reached = carried[:, None] * before
+            if config.stop_rule == "before":
+                reached = reached * (1 - alpha)
+            blended = (alpha > 0) & (reached > config.stop)
+            return carried * total, (go * alpha.size, go * jnp.sum(blended))
+
+        open_ = jnp.ones((group, pixels.shape[1]), projected.u.dtype)
+        return lax.scan(step, open_, (work.first, work.live, chunks))[1]
+
     binning = jax.jit(spread(bin_local, False))
+    counting = jax.jit(spread(count_local, False, True, True))
     spread_composite = spread(composite_local, False, True, True)
     compositing = jax.jit(spread_composite)
     projected = projected_of(gaussians, camera)
@@ -100,8 +131,9 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
 
     weight = jax.random.normal(jax.random.key(1), (camera.height, camera.width, 3))
     training = jax.jit(jax.value_and_grad(render_loss))
-    evaluations = (
-        float(jnp.sum(schedule.steps)) * group * config.chunk_size * config.tile_size**2
+    evaluations, contributions = (
+        float(np.sum(number, dtype=np.float64))
+        for number in counting(projected, lists, schedule)
     )
     functions = {
         "project": lambda: projected_of(gaussians, camera),
@@ -111,7 +143,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
         "render": lambda: render(gaussians, camera, config=config),
         "render v+g": lambda: training(gaussians.params, camera, weight),
     }
-    return functions, projected, evaluations
+    return functions, projected, evaluations, contributions
 
 
 def reference(case: scenes.Case, projected, config: gsjax.RasterConfig):
@@ -147,9 +179,9 @@ def reference(case: scenes.Case, projected, config: gsjax.RasterConfig):
 def main() -> None:
     """Measure and save."""
     rows = []
-    for case in scenes.real_cases():
+    for case in scenes.real_cases(arg for arg in sys.argv[1:] if arg != "--queued"):
         config = gsjax.exact_config(case.gaussians, case.camera)
-        ours, projected, evaluations = stages(case, config)
+        ours, projected, evaluations, contributions = stages(case, config)
         theirs, their_evaluations = reference(case, projected, config)
         ms = measure.interleaved({**ours, **theirs})
         rows.append(
@@ -161,6 +193,7 @@ def main() -> None:
                 "v+g / C++ plain": ms["composite v+g"] / ms["C++ v+g plain"],
                 "render / composite": ms["render"] / ms["composite"],
                 "evaluations M": evaluations / 1e6,
+                "evaluations per contribution": evaluations / contributions,
                 "C++ evaluations M": their_evaluations / 1e6,
                 "ns C++": 1e6 * ms["C++"] / their_evaluations,
                 "ns C++ v+g tuned": 1e6 * ms["C++ v+g tuned"] / their_evaluations,

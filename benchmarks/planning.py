@@ -47,18 +47,10 @@ def around(case: scenes.Case, count: int, rng) -> list[gsjax.Camera]:
 
 def of_run(folder: Path, rng):
     """(Gaussians, cameras that took its photographs, random ones between them)."""
-    from gsjax.flights import path_entries
-    from gsjax.train.folder import load_data, load_scene, load_settings, run_files
-
-    settings = load_settings(folder)
-    data = load_data(settings)
-    gaussians = load_scene(run_files(folder).splat, data.scene)
-    size = settings.config.max_size
-    seen = [e.camera for e in path_entries(data, "train", max_size=size)]
-    between = path_entries(data, "interpolate", frames=400, max_size=size)
+    run = scenes.of_run(folder)
     unseen = []
     for index in rng.choice(400, UNSEEN, replace=False):
-        camera = between[index].camera
+        camera = run.between[index]
         shift = np.eye(4)
         shift[:3, 3] = 0.05 * rng.normal(size=3)
         unseen.append(
@@ -67,7 +59,7 @@ def of_run(folder: Path, rng):
                 width=camera.width, height=camera.height,
             )
         )  # fmt: skip
-    return gaussians, seen[: 2 * SEEN], unseen
+    return run.gaussians, run.seen[: 2 * SEEN], unseen
 
 
 def row(name: str, gaussians, seen, unseen) -> dict:

@@ -7,6 +7,7 @@ they are absent, only the synthetic scenes are there.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -105,8 +106,45 @@ def shell(count: int, width: int, height: int, seed: int = 0) -> Case:
     return Case(f"shell-{count}", gaussians, camera)
 
 
-def real_cases() -> list[Case]:
-    """guitar and garden where the data are there, else a synthetic stand-in."""
+class Run(NamedTuple):
+    """What a run's folder holds.
+
+    Attributes:
+      gaussians: its scene.
+      seen: the cameras of the photographs it was trained on.
+      between: 400 cameras on a smooth path through all of them.
+    """
+
+    gaussians: gsjax.Gaussians
+    seen: list[gsjax.Camera]
+    between: list[gsjax.Camera]
+
+
+def of_run(folder: Path) -> Run:
+    """The scene and the cameras of a run that ``gsjax train`` made."""
+    from gsjax.flights import path_entries
+    from gsjax.train.folder import load_data, load_scene, load_settings, run_files
+
+    settings = load_settings(folder)
+    data = load_data(settings)
+    size = settings.config.max_size
+    seen = path_entries(data, "train", max_size=size)
+    between = path_entries(data, "interpolate", frames=400, max_size=size)
+    return Run(
+        load_scene(run_files(folder).splat, data.scene),
+        [entry.camera for entry in seen],
+        [entry.camera for entry in between],
+    )
+
+
+def real_cases(runs: Iterable[str] = ()) -> list[Case]:
+    """guitar and garden where the data are there, else a synthetic stand-in; and one
+    view of each of the folders ``runs``.
+    """
+    cases = [shell(90_000, 800, 600)]
     if (DATA / "guitar").is_dir():
-        return [guitar(), garden()]
-    return [shell(90_000, 800, 600)]
+        cases = [guitar(), garden()]
+    for folder in runs:
+        run = of_run(Path(folder))
+        cases.append(Case(Path(folder).name, run.gaussians, run.between[0]))
+    return cases

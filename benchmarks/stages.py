@@ -1,12 +1,14 @@
 """Claim: most of a view's time goes into compositing, and little into finding what.
 
-``python benchmarks/stages.py`` times the stages of one view with the default settings,
-in turn, on the real scenes: projecting, binning with its sort, that sort alone (as many
-keys, two integers packed into one), compositing, its backward pass; and what a whole
-render and its gradient take.
+``python benchmarks/stages.py [RUN...]`` times the stages of one view with the default
+settings, in turn, on the real scenes and those of runs' folders: projecting, binning
+with its sort, that sort alone (as many keys, two integers packed into one),
+compositing, its backward pass; and what a whole render and its gradient take.
 """
 
 from __future__ import annotations
+
+import sys
 
 import gsjax
 
@@ -22,9 +24,9 @@ import scenes  # noqa: E402
 def main() -> None:
     """Measure and save."""
     rows = []
-    for case in scenes.real_cases():
+    for case in scenes.real_cases(sys.argv[1:]):
         config = gsjax.exact_config(case.gaussians, case.camera)
-        functions, _, _ = compositor.stages(case, config)
+        functions, *_ = compositor.stages(case, config)
         # Each device sorts its share at the same time.
         share = -(-config.pair_capacity // jax.local_device_count())
         keys = np.random.default_rng(0).integers(0, 2**32, share, np.uint32)
