@@ -130,7 +130,8 @@ def make_camera(
 
     Raises:
       InputError: on wrong shapes or sizes, an unknown model, values that are not
-        finite, a focal length of zero or below, or a last row other than 0 0 0 1.
+        finite, a focal length of zero or below, a rotation part that scales or shears
+        by more than a hundredth, or a last row other than 0 0 0 1.
     """
     if isinstance(model, str):
         if model not in CAMERA_MODELS:
@@ -138,10 +139,7 @@ def make_camera(
                 f"unknown camera model {model!r}; known: {sorted(CAMERA_MODELS)}"
             )
         model = CAMERA_MODELS[model]
-    if int(width) != width or int(height) != height or min(width, height) < 1:
-        raise InputError(
-            f"image size {width} × {height}: width and height must be whole and ≥ 1"
-        )
+    _check_size(width, height)
     dtype = jnp.result_type(float)
     viewmat, K = jnp.asarray(viewmat, dtype), jnp.asarray(K, dtype)
     near, far = jnp.asarray(near, dtype), jnp.asarray(far, dtype)
@@ -165,6 +163,13 @@ def make_camera(
     )
 
 
+def _check_size(width, height) -> None:
+    if int(width) != width or int(height) != height or min(width, height) < 1:
+        raise InputError(
+            f"image size {width} × {height}: width and height must be whole and ≥ 1"
+        )
+
+
 def _check_values(viewmat, K, near, far) -> None:
     """Host-side checks; tracers pass (their values are not known yet)."""
     values = {"viewmat": viewmat, "K": K, "near": near, "far": far}
@@ -185,6 +190,15 @@ def _check_values(viewmat, K, near, far) -> None:
             "the last row of viewmat must be 0 0 0 1 (is it transposed?): "
             f"{host['viewmat'][..., 3, :]}"
         )
+    rotation = host["viewmat"][..., :3, :3].astype(np.float64)
+    gram = rotation @ np.swapaxes(rotation, -1, -2)
+    if np.abs(gram - np.eye(3)).max() > 0.02:
+        lengths = np.sqrt(np.diagonal(gram, axis1=-2, axis2=-1))
+        raise InputError(
+            "the rotation part of viewmat is no rotation: its rows have lengths "
+            f"{lengths}; divide out a scale (from the translation too), or scale the "
+            "scene instead"
+        )
 
 
 def camera_centre(viewmat: Array) -> Array:
@@ -199,10 +213,15 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     Args:
       camera: one, or a batch.
       width, height: new image size in px; another aspect ratio stretches the image.
+
+    Raises:
+      InputError: if the size is not whole, or below 1.
     """
+    _check_size(width, height)
     sx, sy = width / camera.width, height / camera.height
     scale = jnp.asarray([[sx, 1, sx], [1, sy, sy], [1, 1, 1]], camera.K.dtype)
-    return replace(camera, K=camera.K * scale, width=width, height=height)
+    size = {"width": int(width), "height": int(height)}
+    return replace(camera, K=camera.K * scale, **size)
 
 
 def stack_cameras(cameras: list[Camera]) -> Camera:
@@ -230,10 +249,16 @@ def look_at(eye, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
       eye, target: [3] world positions; they must differ.
       up: [3] world direction that points to the top of the image, of any length; where
         it is along the view, any other is taken.
+
+    Raises:
+      InputError: if ``eye`` is ``target``, ``up`` is zero, or a value is not finite.
     """
     eye, target, up = (np.asarray(v, np.float64) for v in (eye, target, up))
     forward = target - eye
-    forward = forward / np.linalg.norm(forward)
+    for name, value in (("target − eye", forward), ("up", up)):
+        if not 0 < np.linalg.norm(value) < np.inf:
+            raise InputError(f"look_at: {name} is {value}: it gives no direction")
+    forward, up = forward / np.linalg.norm(forward), up / np.linalg.norm(up)
     right = np.cross(forward, up)
     if np.linalg.norm(right) < 1e-9:
         right = np.cross(forward, np.roll(up, 1) + (0.1, 0.2, 0.3))

@@ -207,7 +207,21 @@ def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
 
 
 def select(gaussians: Gaussians, keep: Array) -> Gaussians:
-    """The same slots with only those active that were and that ``keep`` [N] marks."""
+    """The same slots with only those active that were and that ``keep`` marks.
+
+    Args:
+      gaussians: N slots.
+      keep: [N] bool.
+
+    Raises:
+      InputError: if ``keep`` is of another shape or type.
+    """
+    keep = jnp.asarray(keep)
+    if keep.shape != gaussians.active.shape or keep.dtype != bool:
+        raise InputError(
+            f"keep is {keep.dtype} {keep.shape}; bool {gaussians.active.shape} is "
+            "wanted (one for each slot)"
+        )
     return gaussians.replace(active=gaussians.active & keep)  # pyright: ignore
 
 
@@ -239,7 +253,12 @@ def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     Args:
       gaussians: ``sh`` [N, K, 3].
       degree: 0 to 4; K is (degree + 1)² afterwards.
+
+    Raises:
+      InputError: if there is no such degree.
     """
+    if not 0 <= degree <= sh_lib.MAX_DEGREE:
+        raise InputError(f"SH degree {degree}: 0 to {sh_lib.MAX_DEGREE} is wanted")
     sh = gaussians.params.sh
     bases = sh_lib.num_bases(degree)
     extra = max(0, bases - sh.shape[1])

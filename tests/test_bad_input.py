@@ -94,6 +94,9 @@ def put(matrix, place, value):
         ({"viewmat": EYE.T + put(0 * EYE, (3, 0), 1)}, "transposed"),
         ({"viewmat": put(EYE, (0, 3), np.nan)}, "viewmat"),
         ({"viewmat": put(EYE, (0, 0), np.inf)}, "viewmat"),
+        ({"viewmat": 2 * EYE}, "transposed"),
+        ({"viewmat": np.diag([2, 2, 2, 1.0])}, r"lengths \[2. 2. 2.\]"),
+        ({"viewmat": put(EYE, (0, 1), 0.1)}, "no rotation"),
         ({"K": np.eye(4)}, "K"),
         ({"K": np.zeros((2, 3, 3))}, "K"),
         ({"K": put(K, (0, 2), np.nan)}, "K"),
@@ -112,6 +115,25 @@ def test_cameras(changes, named):
     gsjax.make_camera(**good)
     with pytest.raises(InputError, match=named):
         gsjax.make_camera(**{**good, **changes})
+
+
+def test_other_sizes_of_cameras():
+    camera = camera_of(16, 8)
+    for size in ((0, 8), (8, -1), (8.5, 8)):
+        with pytest.raises(InputError, match="whole and ≥ 1"):
+            gsjax.resize_camera(camera, *size)
+    assert type(gsjax.resize_camera(camera, 8.0, 4).width) is int
+
+
+def test_where_a_camera_looks():
+    wanted = gsjax.look_at((1, 2, 3), (0, 0, 0), (0, 1, 1))
+    for length in (1e-30, 1e30):
+        up = (0, length, length)
+        found = gsjax.look_at((1, 2, 3), (0, 0, 0), up)
+        np.testing.assert_allclose(found, wanted, atol=1e-12)
+    for bad in ({"target": (1, 2, 3)}, {"up": (0, 0, 0)}, {"target": (np.nan, 0, 0)}):
+        with pytest.raises(InputError, match="gives no direction"):
+            gsjax.look_at(**{"eye": (1, 2, 3), "target": (0, 0, 0), **bad})
 
 
 def test_a_batch_needs_one_size():
@@ -152,6 +174,9 @@ def test_settings(name, value):
     [
         ("features", {"features": jnp.zeros((COUNT + 1, 3))}),
         ("features", {"features": jnp.zeros(COUNT)}),
+        ("features", {"features": [1, 2, 3]}),
+        ("features", {"features": np.zeros((COUNT, 0))}),
+        ("1000 devices|devices = 1000", {"config": COMPAT.replace(devices=1000)}),
         ("probe", {"probe": jnp.zeros((COUNT, 3))}),
         ("probe", {"probe": jnp.zeros((1, COUNT, 2))}),
         ("abs_probe", {"abs_probe": jnp.zeros((COUNT, 2))}),  # without absgrad
@@ -169,6 +194,33 @@ def test_arguments_of_render(named, kwargs):
         jax.eval_shape(
             lambda g, c: gsjax.render(g, c, config, **kwargs), *scene_of("random")
         )
+
+
+def test_slots_and_bands():
+    gaussians, _ = scene_of("random")
+    for keep in (np.ones((COUNT, 1), bool), np.ones(1, bool), np.ones(COUNT, int)):
+        with pytest.raises(InputError, match="one for each slot"):
+            gsjax.select(gaussians, keep)
+    for degree in (-1, 5):
+        with pytest.raises(InputError, match="0 to 4"):
+            gsjax.with_sh_degree(gaussians, degree)
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_arrays_of_numpy(batched):
+    """Closed over by a jitted function they are as good as JAX's."""
+    gaussians, camera = cast(scene_of("random"), jnp.float32)
+    camera = gsjax.stack_cameras([camera, camera]) if batched else camera
+    given = {
+        "features": np.random.default_rng(0).random((COUNT, 2), np.float32),
+        "probe": np.zeros((*camera.viewmat.shape[:-2], COUNT, 2), np.float32),
+    }
+    host = jax.device_get(gaussians)
+    found = jax.jit(lambda c: gsjax.render(host, c, COMPAT, **given).rgb)(camera)
+    given = jax.tree.map(jnp.asarray, given)
+    wanted = jax.jit(lambda g, c: gsjax.render(g, c, COMPAT, **given).rgb)
+    assert np.std(found) > 0.01
+    np.testing.assert_allclose(found, wanted(gaussians, camera), atol=1e-5)
 
 
 def spoilt(gaussians, value):

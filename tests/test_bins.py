@@ -1,5 +1,7 @@
 """The lists hold every pair that matters, hardly any other, in the right order."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +31,45 @@ def lists_of(kind: str, tile: int, stride: int = 1, device: int = 0):
 
     projected, lists = run(*scene_of(kind))
     return grid, jax.tree.map(np.asarray, projected), jax.tree.map(np.asarray, lists)
+
+
+@pytest.mark.parametrize("kind", SCENES)
+def test_radii_are_of_what_a_pixel_may_show(kind):
+    """Positive exactly where the box around Q ≤ reach holds the centre of a pixel."""
+    grid, projected, _ = lists_of(kind, 8)
+    radii = np.asarray(bins.radii(jax.tree.map(jnp.asarray, projected), WIDTH, HEIGHT))
+    extent = np.sqrt(projected.reach[:, None] * np.stack(
+        [projected.inv_sx**-2.0, projected.var_y], -1))  # fmt: skip
+    centre = np.stack([projected.u, projected.v], -1)
+    size = np.array([WIDTH, HEIGHT])
+    first = np.clip(np.ceil(centre - extent - 0.5), 0, size)
+    last = np.clip(np.floor(centre + extent - 0.5), -1, size - 1)
+    holds = (projected.reach > 0) & (first <= last).all(-1)
+    np.testing.assert_allclose(radii[holds], extent.max(-1)[holds], rtol=1e-5)
+    # Room for rounding: a hundredth of a pixel.
+    clear = np.abs(np.stack([centre - extent, centre + extent]) % 1 - 0.5) > 0.02
+    clear = clear.all((0, -1))
+    assert not radii[~holds & clear].any()
+    assert radii[touched_pairs(grid, projected).any(0)].all()
+
+
+def test_a_view_that_scales_loses_nothing():
+    """[s R | s t] shows what [R | t] shows; one being optimised may pass through it."""
+    gaussians, camera = scene_of("random")
+    far = dataclasses.replace(camera, near=camera.near * 0, far=camera.far * 1e9)
+
+    @jax.jit
+    def count(gaussians, viewmat):
+        seen = dataclasses.replace(far, viewmat=viewmat)
+        order, front = depth_order(gaussians, seen, CONFIG)
+        projected = project(gaussians, seen, CONFIG, order, front)
+        return jnp.sum(bins.radii(projected, WIDTH, HEIGHT) > 0)
+
+    wanted = count(gaussians, camera.viewmat)
+    assert 10 < wanted < COUNT
+    for scale in (0.01, 10.0, 1000.0):
+        scaled = camera.viewmat.at[:3].multiply(scale)
+        assert count(gaussians, scaled) == wanted
 
 
 def listed_pairs(grid, lists) -> np.ndarray:

@@ -29,14 +29,14 @@ def test_capacity_of_exactly_the_need():
     exact = COMPAT.replace(pair_capacity=need, visible_capacity=visible)
     assert_same(images(gaussians, camera, exact), wanted)
     given = cast((gaussians, camera), jnp.float32)
-    for name, size in (("pair_capacity", need), ("visible_capacity", visible)):
-        out = render(*given, exact.replace(**{name: size - 1}), np.float32(BACKGROUND))
+    for size in (1, 64, need // 3, need - 1):
+        out = render(*given, exact.replace(pair_capacity=size), np.float32(BACKGROUND))
         assert out.overflowed
-        found = {
-            "pair_capacity": out.demand.capacity,
-            "visible_capacity": out.demand.visible,
-        }
-        assert found[name] == size
+        assert out.demand == wanted.demand
+    short = exact.replace(visible_capacity=visible - 1)
+    out = render(*given, short, np.float32(BACKGROUND))
+    assert out.overflowed
+    assert out.demand.visible == visible
 
 
 @needs_two_devices

@@ -75,14 +75,16 @@ class Lists(NamedTuple):
     Attributes:
       ranks: [P] ranks sorted by (tile, rank); what follows the last is never read.
       length: [T] entries of each tile.
-      items: [] (Gaussian, row) items wanted; pairs: [] pairs wanted. Where the items
-        did not fit, the pairs could not be counted, and are 0.
+      items: [] (Gaussian, row) items wanted; pairs: [] pairs wanted.
+      fit: [] bool, whether there was room; if not, ``ranks`` holds nothing of use, and
+        the counts are right all the same.
     """
 
     ranks: Array
     length: Array
     items: Array
     pairs: Array
+    fit: Array
 
 
 class Schedule(NamedTuple):
@@ -91,7 +93,7 @@ class Schedule(NamedTuple):
     Attributes:
       tiles: [blocks, G]; places past the last tile hold T, whose list is empty.
       levels: [blocks] steps of each block.
-      steps: [] their sum.
+      steps: [] their sum, saturating.
     """
 
     tiles: Array
@@ -131,20 +133,33 @@ def row_spans(projected: Projected, camera: Array, grid: Grid, device: Array) ->
       camera: [R] int32 index of the camera each rank belongs to.
       grid, device: the rows of this device are device, device + stride, ….
     """
-    var_x = 1 / (projected.inv_sx * projected.inv_sx)
-    left, right = _pixel_range(
-        projected.u, _extent(projected.reach * var_x), grid.width
-    )
-    top, bottom = _pixel_range(
-        projected.v, _extent(projected.reach * projected.var_y), grid.height
-    )
-    seen = (projected.reach > 0) & (left <= right) & (top <= bottom)
+    left, right, top, bottom, seen = _boxes(projected, grid.width, grid.height)
     # Global rows of tiles g0 … g1 hold the local rows j with g0 ≤ j·stride + d ≤ g1.
     first = -((device - top // grid.tile) // grid.stride)
     last = (bottom // grid.tile - device) // grid.stride
     rows = jnp.where(seen, jnp.maximum(last - first + 1, 0), 0)
     cols = right // grid.tile - left // grid.tile + 1
     return Spans(first=camera * grid.rows + first, rows=rows, cols=cols)
+
+
+def radii(projected: Projected, width: int, height: int) -> Array:
+    """Half the longer side [R] of the box around Q ≤ reach, in px; 0 where it holds no
+    pixel of the image.
+    """
+    var_x = 1 / jnp.square(projected.inv_sx)
+    radius = safe_sqrt(projected.reach * jnp.maximum(var_x, projected.var_y))
+    *_, seen = _boxes(projected, width, height)
+    return jnp.where(seen, radius, 0)
+
+
+def _boxes(projected: Projected, width: int, height: int) -> tuple[Array, ...]:
+    """First and last pixel across, then down, and whether there is any, [R] each."""
+    extent_x = _extent(projected.reach / jnp.square(projected.inv_sx))
+    extent_y = _extent(projected.reach * projected.var_y)
+    left, right = _pixel_range(projected.u, extent_x, width)
+    top, bottom = _pixel_range(projected.v, extent_y, height)
+    seen = (projected.reach > 0) & (left <= right) & (top <= bottom)
+    return left, right, top, bottom, seen
 
 
 def _extent(squared: Array) -> Array:
@@ -216,8 +231,7 @@ def make_lists(
 ) -> Lists:
     """Expand to items, to pairs, and sort; room for ``capacity`` of each.
 
-    If either does not fit the lists come out empty, and the counts say what was
-    wanted.
+    If either does not fit the lists come out empty; see `count_lists`.
     """
     ranks = projected.u.shape[0]
     items, safe = total_count(spans.rows)
@@ -240,7 +254,39 @@ def make_lists(
         length=jnp.zeros(grid.tiles, jnp.int32).at[tile].add(1, mode="drop"),
         items=items,
         pairs=pairs,
+        fit=(items <= capacity) & (pairs <= capacity),
     )
+
+
+def count_lists(
+    lists: Lists, projected: Projected, spans: Spans, grid: Grid, device: Array
+) -> Lists:
+    """``lists``, its ``length`` and ``pairs`` those wanted where they did not fit.
+
+    Without room for items or pairs, by as many items at a time as there are ranks:
+    each adds 1 where its tiles begin and takes it off where they end.
+    """
+    ranks = projected.u.shape[0]
+    countable = ~lists.fit & (lists.items < COUNT_LIMIT)
+    rounds = jnp.where(countable, -(-lists.items // ranks), 0)
+
+    def add(state):
+        index, change = state
+        rank, place = expand(spans.rows, ranks, index * ranks)
+        row = _take(spans.first, rank) + place
+        first, count = _column_spans(projected, rank, row, grid, device)
+        some = ((rank < ranks) & (count > 0)).astype(jnp.int32)
+        tile = row * grid.cols + first
+        change = change.at[tile].add(some, mode="drop")
+        return index + 1, change.at[tile + count].add(-some, mode="drop")
+
+    start = (jnp.int32(0), jnp.zeros(grid.tiles, jnp.int32))
+    _, change = lax.while_loop(lambda state: state[0] < rounds, add, start)
+    length = jnp.where(lists.fit, lists.length, running_total(change))
+    counted, _ = total_count(length)
+    pairs = jnp.where(countable, counted, jnp.maximum(lists.pairs, lists.items))
+    pairs = jnp.where(lists.fit, lists.pairs, pairs)
+    return lists._replace(length=length, pairs=pairs)
 
 
 def make_schedule(length: Array, grid: Grid, group: int, chunk: int) -> Schedule:
@@ -250,7 +296,7 @@ def make_schedule(length: Array, grid: Grid, group: int, chunk: int) -> Schedule
     padding = jnp.full(blocks * group - grid.tiles, grid.tiles, jnp.int32)
     tiles = jnp.concatenate([order, padding]).reshape(blocks, group)
     levels = -(-_take(length, tiles[:, 0]) // chunk)
-    return Schedule(tiles, levels, jnp.sum(levels, dtype=jnp.int32))
+    return Schedule(tiles, levels, total_count(levels)[0])
 
 
 def step_capacity(capacity: int, grid: Grid, group: int, chunk: int) -> int:
@@ -275,9 +321,11 @@ def pairs_for_steps(steps: Array, grid: Grid, group: int, chunk: int) -> Array:
 def make_work(
     lists: Lists, schedule: Schedule, chunk: int, ranks: int, room: int
 ) -> Work:
-    """Unroll the schedule into ``room`` steps; none are live if they do not fit."""
+    """Unroll the schedule into ``room`` steps; none are live if they do not fit, or
+    the lists did not.
+    """
     blocks = schedule.levels.shape[0]
-    fits = schedule.steps <= room
+    fits = lists.fit & (schedule.steps <= room)
     block, level = expand(jnp.where(fits, schedule.levels, 0), room)
     live = block < blocks
     start = running_total(lists.length) - lists.length

@@ -35,13 +35,15 @@ def running_total(counts: Array, levels: int = 3) -> Array:
     return (spread + lax.pad(both, zero, [(1, 0, 1)]))[:size]
 
 
-def expand(counts: Array, capacity: int) -> tuple[Array, Array]:
-    """Unroll ``counts`` [n] into ``capacity`` items: (owner, place within owner).
+def expand(counts: Array, capacity: int, start=0) -> tuple[Array, Array]:
+    """Unroll ``counts`` [n] into items: (owner, place within owner), [capacity] each.
 
-    Items past the total have owner n. The counts must sum to less than 2^31.
+    From item ``start`` on. Items past the total have owner n. The counts must sum to
+    less than 2^31.
     """
-    ends = running_total(counts)
-    passed = jnp.zeros(capacity, jnp.int32).at[ends].add(1, mode="drop")
+    ends = running_total(counts) - start
+    passed = jnp.zeros(capacity, jnp.int32)
+    passed = passed.at[jnp.maximum(ends, 0)].add(1, mode="drop")
     owner = running_total(passed)
     starts = (ends - counts).at[owner].get(mode="fill", fill_value=0)
     return owner, lax.iota(jnp.int32, capacity) - starts

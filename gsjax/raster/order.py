@@ -68,12 +68,16 @@ def _depths_in_view(
         live &= jnp.isfinite(value)
     point = (jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1))
     u, v = camera.model.project_point(camera.K, point)
+    # A view matrix that scales, as one being optimised may, enlarges what it shows.
+    rotation = camera.viewmat[:3, :3]
+    gram = jnp.sum(rotation[:, None] * rotation[None], axis=-1)
+    stretch = jnp.maximum(jnp.max(jnp.sum(jnp.abs(gram), axis=1)), 1)
     largest = exp_log_scale(jnp.max(jnp.where(live, log_scales, 0), axis=0))
     reach = reach_of(jax.nn.sigmoid(logits), config)
     for centre, row, size in zip(
         (u, v), ewa_jacobian(camera, point), (camera.width, camera.height)
     ):
-        gain = sum(j * j for j in row)
+        gain = stretch * sum(j * j for j in row)
         square = largest * largest * gain
         extent = jnp.sqrt(reach * (square + config.dilation))
         extent = extent * 1.001 + 0.01  # room for rounding

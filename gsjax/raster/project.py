@@ -16,7 +16,7 @@ from gsjax import rotations
 from gsjax import sh as sh_lib
 from gsjax.cameras import Camera, camera_centre
 from gsjax.gaussians import Gaussians
-from gsjax.numerics import exp_log_scale, safe_normalize, safe_sqrt
+from gsjax.numerics import exp_log_scale, safe_normalize
 from gsjax.raster.ladder import on_ladder
 from gsjax.raster.types import Array, Projected, RasterConfig
 
@@ -289,9 +289,3 @@ def conics_of(projected: Projected) -> Array:
     cov_xy = projected.slope * var_x
     entries = (projected.var_y, -cov_xy, var_x)
     return jnp.stack([entry / projected.det for entry in entries], -1)
-
-
-def radii_of(projected: Projected) -> Array:
-    """Half the longer side [R] of the box around Q ≤ reach, in px; 0 if unseen."""
-    var_x = 1 / (projected.inv_sx * projected.inv_sx)
-    return safe_sqrt(projected.reach * jnp.maximum(var_x, projected.var_y))

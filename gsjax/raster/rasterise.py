@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jax.sharding import Mesh, PartitionSpec
 
+from gsjax.errors import InputError
 from gsjax.gaussians import capacity_bucket
 from gsjax.raster import bins
 from gsjax.raster.composite import composite
@@ -41,7 +42,7 @@ def rasterise(
       Images before the background, {"sums": [B, H, W, C], "median": [B, H, W]};
       the demand (``visible`` is left at 0); whether the capacity was too small.
     """
-    devices = config.devices or jax.local_device_count()
+    devices = _device_count(config)
     grid = bins.make_grid(width, height, config.tile_size, cameras, devices)
     ranks = projected.u.shape[0]
     capacity = config.pair_capacity or default_pair_capacity(ranks, grid)
@@ -70,6 +71,17 @@ def rasterise(
     )
     demand = Demand(visible=jnp.int32(0), pairs=total, capacity=capacity_wanted)
     return images, demand, overflowed
+
+
+def _device_count(config: RasterConfig) -> int:
+    there = jax.local_device_count()
+    if config.devices is not None and config.devices > there:
+        raise InputError(
+            f"RasterConfig.devices = {config.devices}, and {there} "
+            f"{'is' if there == 1 else 'are'} there; None takes them all (on a CPU, "
+            "gsjax.use_all_cores() makes one of each core)"
+        )
+    return config.devices or there
 
 
 def _unhidden(
@@ -107,14 +119,15 @@ def _rasterise_local(
     group = bins.tiles_per_step(config, grid, jax.default_backend())
     camera = lax.iota(jnp.int32, ranks) // (ranks // grid.cameras)
     spans = bins.row_spans(geometry, camera, grid, device)
-    # The boxes bound the pairs from above, for no more than a sum.
-    bound = jnp.sum(spans.rows.astype(jnp.float32) * spans.cols)
+    # The boxes bound the pairs from above, for no more than a sum (and its rounding).
+    bound = jnp.sum(spans.rows.astype(jnp.float32) * spans.cols) * (1 + 1e-5)
 
     def sort(room):
         lists = bins.make_lists(geometry, spans, grid, device, room)
         return lists._replace(ranks=jnp.pad(lists.ranks, (0, capacity - room)))
 
     lists = on_ladder(bound, capacity, config.rungs, sort)
+    lists = bins.count_lists(lists, geometry, spans, grid, device)
     schedule = bins.make_schedule(lists.length, grid, group, config.chunk_size)
 
     def blend(room):

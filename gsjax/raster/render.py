@@ -15,9 +15,10 @@ from gsjax.errors import CapacityError, InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.memory import require
 from gsjax.numerics import safe_divide
+from gsjax.raster import bins
 from gsjax.raster.footprint import render_estimate as render_estimate
 from gsjax.raster.order import depth_order
-from gsjax.raster.project import COLOR_LIMIT, project, radii_of
+from gsjax.raster.project import COLOR_LIMIT, project
 from gsjax.raster.rasterise import rasterise
 from gsjax.raster.types import Array, Demand, Projected, RasterConfig, Render
 
@@ -58,6 +59,12 @@ def render(
     Raises:
       InputError: if a shape does not fit.
     """
+    # Tracers cannot index what is NumPy's.
+    gaussians = jax.tree.map(jnp.asarray, gaussians)
+    features, probe, abs_probe = (
+        None if value is None else jnp.asarray(value)
+        for value in (features, probe, abs_probe)
+    )
     cameras = camera if camera.batched else jax.tree.map(lambda a: a[None], camera)
     count = cameras.viewmat.shape[0]
     probe = _with_batch("probe", probe, gaussians, camera)
@@ -110,7 +117,7 @@ def _project_one(
     order, visible = depth_order(gaussians, camera, config)
     out = project(gaussians, camera, config, order, visible, features, probe, abs_probe)
     radii = jnp.zeros(gaussians.capacity, out.u.dtype)
-    seen = lax.stop_gradient(radii_of(out))
+    seen = bins.radii(lax.stop_gradient(out), camera.width, camera.height)
     return out, radii.at[order].set(seen, mode="drop"), visible
 
 
@@ -127,9 +134,10 @@ def _with_batch(name: str, probe, gaussians: Gaussians, camera: Camera):
 def _check_features(features, gaussians: Gaussians) -> None:
     if features is None:
         return
-    if features.ndim != 2 or features.shape[0] != gaussians.capacity:
+    shape = features.shape
+    if len(shape) != 2 or shape[0] != gaussians.capacity or shape[1] < 1:
         raise InputError(
-            f"features has shape {features.shape}; ({gaussians.capacity}, C) is wanted"
+            f"features has shape {shape}; ({gaussians.capacity}, C) is wanted, C ≥ 1"
         )
 
 

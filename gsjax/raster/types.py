@@ -53,7 +53,8 @@ class RasterConfig:
       rungs: how many sizes, each a quarter of the one before, sorting, binning and
         compositing are compiled for; the smallest that fits is run. From two on there
         is a small size of projecting too.
-      devices: how many devices share the tiles; None means all local ones.
+      devices: how many devices share the tiles; None means all local ones. Within a
+        `jax.shard_map` of your own: 1, and ``check_vma=False`` there.
 
     Raises:
       InputError: if a setting is out of its range.
@@ -172,10 +173,11 @@ class Demand(NamedTuple):
     """Counts wanted, int32; a count of 2³⁰ or more is reported as 2³¹ − 1.
 
     Attributes:
-      visible: Gaussians inside the view, of the camera that sees most; the
+      visible: Gaussians that may be in the view, of the camera that sees most; the
         ``visible_capacity`` that would have been enough.
       pairs: (tile, Gaussian) pairs, of all cameras.
-      capacity: the ``pair_capacity`` that would have been enough.
+      capacity: the ``pair_capacity`` that would have been enough. Where ``visible``
+        did not fit, this and ``pairs`` count only those that did.
     """
 
     visible: Array

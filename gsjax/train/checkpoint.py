@@ -82,7 +82,10 @@ def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Pa
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **{_META: encoded}, **arrays)
     path = folder / f"step_{step:09d}.npz"
-    write_file(path, buffer.getbuffer(), durable=True)
+    # Given up at once where writing fails: a view that lives on with the error keeps
+    # the buffer from being freed.
+    with buffer.getbuffer() as data:
+        write_file(path, data, durable=True)
     # Later ones, which a run that was taken up again could not read, do not count.
     upto = [old for old in _files(folder) if old.name <= path.name]
     for old in upto[:-_KEEP]:
