@@ -13,6 +13,7 @@ from gsjax.scene import colmap_binary, colmap_text
 from gsjax.scene.colmap import find_colmap, load_colmap, read_colmap
 from gsjax.scene.colmap_model import CAMERA_KINDS, quat_of, viewmat_of
 from gsjax.scene.colmap_writer import write_colmap
+from gsjax.scene.image_files import find_mask
 from gsjax.scene.types import Lens
 from gsjax.scene.undistort import distort
 
@@ -234,8 +235,34 @@ def test_masks(tmp_path):
     names = [view.name for view in scene.views]
     first = save_photo(tmp_path / "masks" / names[0])
     second = save_photo(tmp_path / "masks" / (names[1] + ".png"))
-    masks = [view.mask for view in load_colmap(tmp_path).views]
-    assert masks == [first, second, None, None, None]
+    third = save_photo(tmp_path / "masks" / "view_02.PNG")
+    wanted = (
+        r"masks: 2 of 5 photographs have no mask.*first: view_03\.png, view_04\.png"
+    )
+    with pytest.warns(UserWarning, match=wanted):
+        masks = [view.mask for view in load_colmap(tmp_path).views]
+    assert masks == [first, second, third, None, None]
+    for name in names[3:]:
+        save_photo(tmp_path / "masks" / name)
+    assert all(view.mask for view in load_colmap(tmp_path).views)
+
+
+@pytest.mark.parametrize("photo", ["a/1.JPG", "a/1.jpg", "a/1.v2.Jpg"])
+@pytest.mark.parametrize("appended", [True, False])
+@pytest.mark.parametrize("suffix", [".png", ".PNG", ".Png"])
+def test_suffixes_of_masks_are_of_either_case(tmp_path, photo, appended, suffix):
+    stem = photo if appended else photo[: -len(".jpg")]
+    for name in ("1.png", "b/1.png", "a/11.png", "a/1.png.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    assert find_mask(tmp_path, photo) is None
+    mask = tmp_path / (stem + suffix)
+    mask.touch()
+    for name in (photo, photo.lower(), photo[:-4] + ".JPG"):
+        assert mask.samefile(find_mask(tmp_path, name) or "")
+    exact = tmp_path / (stem + ".png")
+    exact.touch()
+    assert exact.samefile(find_mask(tmp_path, photo) or ""), "its very name goes first"
 
 
 def test_missing_photographs(tmp_path):

@@ -64,8 +64,21 @@ def test_smaller_copies(tmp_path):
     scene = load_dataset(tmp_path, factor=4)
     assert scene.views[0].name == "image000.png"
     assert (scene.views[0].width, scene.views[0].K[0, 0]) == (128, 160)
-    with pytest.raises(InputError, match="images_8: no such folder"):
+    with pytest.raises(InputError, match=r"images_8: no such folder.* factor=4 "):
         load_dataset(tmp_path, factor=8)
+
+
+def test_a_factor_that_is_there_is_offered(tmp_path):
+    dataset(tmp_path)
+    for name in ("images_16", "images_old", "images_8", "images_1"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "images").rename(tmp_path / "images_4")
+    wanted = (
+        r"images: no such folder.*pass factor=4 \(--factor 4\), as images_4 is there"
+    )
+    with pytest.raises(InputError, match=wanted):
+        load_dataset(tmp_path)
+    assert len(load_dataset(tmp_path, factor=4).views) == 4
 
 
 def test_number_of_photographs(tmp_path):

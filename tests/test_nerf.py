@@ -144,6 +144,15 @@ def test_nerf_synthetic(tmp_path):
     assert photo.alpha[0, 0] == 0
 
 
+def test_validation_views_stand_in_for_test_views(tmp_path):
+    synthetic(tmp_path)
+    (tmp_path / "transforms_test.json").unlink()
+    splits = {view.name: view.split for view in load_dataset(tmp_path).views}
+    assert splits == {f"train/r_{n}.png": "train" for n in range(3)} | {
+        "val/r_0.png": "test"
+    }
+
+
 def test_a_list_by_itself(tmp_path):
     synthetic(tmp_path)
     [view] = load_dataset(tmp_path / "transforms_val.json").views
@@ -187,7 +196,7 @@ def test_masks_and_smaller_copies(tmp_path):
     nerfstudio(tmp_path, frames=frames)
     views = load_dataset(tmp_path).views
     assert [view.mask for view in views] == [None, tmp_path / "masks/one.png"]
-    with pytest.raises(InputError, match="2 of 2 photographs are missing"):
+    with pytest.raises(InputError, match=r"images_2: no such folder.*the factor out"):
         load_dataset(tmp_path, factor=2)
     for index in range(2):
         save_photo(tmp_path / f"images_2/{index}.png", np.zeros((12, 16, 3), np.uint8))
@@ -197,6 +206,39 @@ def test_masks_and_smaller_copies(tmp_path):
     (tmp_path / "masks/one.png").unlink()
     with pytest.raises(InputError, match=r"frames\[1\]: mask_path 'masks/one\.png'"):
         load_dataset(tmp_path)
+
+
+def test_photographs_elsewhere(tmp_path):
+    folder, elsewhere = tmp_path / "data", tmp_path / "photos"
+    nerfstudio(folder)
+    (folder / "images").rename(elsewhere)
+    for images in (elsewhere, str(elsewhere), "../photos"):
+        for view, number in zip(load_dataset(folder, images=images).views, range(4)):
+            assert view.image.samefile(elsewhere / f"frame_{number}.png")
+            assert view.name == f"frame_{number}.png", "no way out of the dataset"
+    missing = tmp_path / "none"
+    with pytest.raises(InputError, match=f"{missing}: no such folder"):
+        load_dataset(folder, images=missing, skip_missing=True)
+    elsewhere.rename(folder / "moved")
+    views = load_dataset(folder, images=folder / "moved").views
+    assert views[0].name == "moved/frame_0.png"
+
+
+@pytest.mark.parametrize("more", [{"factor": 2}, {"images": "images_2"}])
+@pytest.mark.parametrize("place", ["{}/0.png", "images/{}/0.png"])
+def test_folders_within_folders(tmp_path, more, place):
+    """Views of the same number are told apart by their folders, whatever is asked."""
+    frames = frames_of(scene_of_views(3), "images/cam{}/0.png")
+    nerfstudio(tmp_path, frames=frames)
+    copies = [tmp_path / "images_2" / place.format(f"cam{n}") for n in range(3)]
+    for path in copies:
+        save_photo(path)
+    save_photo(tmp_path / "images_2/0.png")  # of nobody
+    assert [view.image for view in load_dataset(tmp_path, **more).views] == copies
+    for path in copies:
+        path.unlink()
+    with pytest.raises(InputError, match=r"0\.png' is listed more than once"):
+        load_dataset(tmp_path, **more)
 
 
 def test_missing_photographs(tmp_path):

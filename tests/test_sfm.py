@@ -213,7 +213,8 @@ def test_masks(room, tmp_path, capsys):
     args = ["sfm", str(room), "-o", str(out), "--masks", str(masks)]
     assert cli.main(args) == 0
     assert f"{COUNT - 1} of {COUNT} photos have a mask" in capsys.readouterr().err
-    views = views_of(out)
+    with pytest.warns(UserWarning, match=f"masks: 1 of {COUNT} photographs have no"):
+        views = views_of(out)
     assert [view.mask is not None for view in views] == [True] * (COUNT - 1) + [False]
     model = pycolmap.Reconstruction(out / "sparse" / "0")
     for view in views[:-1]:

@@ -136,6 +136,13 @@ def one_photo(folder: Path) -> list[str]:
     return [str(folder / "p")]
 
 
+def in_subfolders(folder: Path) -> list[str]:
+    for name in ("p/a", "p/b/c"):
+        (folder / name).mkdir(parents=True)
+        two_photos(folder / name)
+    return [str(folder / "p")]
+
+
 def junk_video(folder: Path) -> list[str]:
     (folder / "a.mp4").write_bytes(b"junk" * 99)
     return [str(folder / "a.mp4")]
@@ -160,6 +167,7 @@ def photos_and(*more: str):
 BAD = {
     "missing": (3, lambda f: [str(f / "none")], "no such folder"),
     "one photo": (3, one_photo, "1 photos"),
+    "subfolders": (3, in_subfolders, "subfolders are not searched, 4 photos lie there"),
     "damaged": (3, damaged, "half.jpg, none.png, text.jpg: cannot be read"),
     "heic": (3, with_file("IMG_1.HEIC"), ".HEIC photos are not read here; convert"),
     "same name": (3, same_name, "the same name"),

@@ -229,7 +229,7 @@ def test_the_statistic_is_the_slope_by_a_shift_of_the_projection(report):
     after, _ = run_plain(start, 1)
     # As the step derives it.
     key = jax.random.split(jax.random.fold_in(start.key, 0), 3)[0]
-    behind = background_of(PLAIN, key, jnp.float64)
+    behind = background_of(PLAIN, False, key, jnp.float64)
     target, _ = targets(batch, behind, jnp.float64)
     config = SMOOTH.replace(outputs=("rgb",))
 
@@ -397,14 +397,22 @@ def test_targets():
 
 
 def test_backgrounds():
+    def behind(name, transparent, key):
+        config = TUNED.replace(background=name)
+        return background_of(config, transparent, key, jnp.float32)
+
     key = jax.random.key(0)
     for name, value in (("black", 0.0), ("white", 1.0)):
-        found = background_of(TUNED.replace(background=name), key, jnp.float32)
-        assert found.tolist() == [value] * 3
-        assert found.dtype == jnp.float32
-    drawn = jax.vmap(lambda k: background_of(PLAIN, k, jnp.float32))(
-        jax.random.split(key, 500)
-    )
+        for transparent in (False, True):
+            found = behind(name, transparent, key)
+            assert found.tolist() == [value] * 3
+            assert found.dtype == jnp.float32
+    drawn = jax.vmap(lambda k: behind("random", False, k))(jax.random.split(key, 500))
+    assert drawn[0].tolist() != drawn[1].tolist()
+    # A photograph that can tell nothing from black is put over what cannot be learnt.
+    assert behind("auto", False, key).tolist() == [0] * 3
+    for name in ("auto", "random"):
+        assert behind(name, True, key).tolist() == behind("random", False, key).tolist()
     assert drawn.min() >= 0
     assert drawn.max() <= 1
     np.testing.assert_allclose(drawn.mean(0), 0.5, atol=0.06)

@@ -1,6 +1,6 @@
 """`gsjax train`: from photographs with known cameras to a scene."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -8,6 +8,17 @@ from tyro.conf import Positional, arg
 
 from gsjax.commands.common import HeavyCommand, UsageError, start_jax
 from gsjax.console import decibels, note, say
+
+# What does not change the run itself.
+_OF_A_SITTING = {
+    "dataset", "out", "resume", "overwrite", "viewer", "viewer_port", "debug",
+    "ignore_memory",
+}  # fmt: skip
+# The least that options may be.
+_LEAST = {
+    "steps": 1, "max_size": 8, "max_gaussians": 1, "seed": 0, "factor": 1,
+    "test_every": 0, "checkpoint_every": 0, "eval_every": 0,
+}  # fmt: skip
 
 
 @dataclass(kw_only=True)
@@ -30,8 +41,9 @@ class TrainCommand(HeavyCommand):
     """Never more than that."""
     sh_degree: Literal[0, 1, 2, 3, 4] | None = None
     """Degree of the spherical harmonics; 0 is one colour from all sides."""
-    background: Literal["black", "white", "random"] | None = None
-    """Behind the scene; random while training hides nothing in it."""
+    background: Literal["auto", "black", "white", "random"] | None = None
+    """Behind the scene; random while training hides nothing in it; auto: random where
+    photographs are transparent, else black."""
     initial: Literal["points", "random"] | None = None
     """Start from the dataset's points, or from anywhere in view."""
     antialias: bool = False
@@ -102,12 +114,15 @@ class TrainCommand(HeavyCommand):
 
         if self.resume and run_files(self.out).config.exists():
             settings = load_settings(self.out)
-            if settings.dataset != self.dataset.resolve():
+            self._refuse_other(settings)
+            moved = settings.dataset != self.dataset.resolve()
+            if moved and settings.dataset.exists():
                 raise UsageError(
                     f"{self.out} was trained on {settings.dataset}; --resume goes on "
                     "with that"
                 )
-            result = resume_run(self.out, watch=watch)
+            dataset = self.dataset.resolve() if moved else None
+            result = resume_run(self.out, dataset=dataset, watch=watch)
         else:
             result = start_run(
                 self._settings(), self.out, overwrite=self.overwrite, watch=watch
@@ -126,14 +141,36 @@ class TrainCommand(HeavyCommand):
         say(str(result.files.preview))
         return 0
 
+    def _refuse_other(self, settings) -> None:
+        """Refuse options of a run that is gone on with where they differ from its."""
+        given = [
+            f"--{field.name.replace('_', '-')}"
+            for field in fields(self)
+            if field.name not in _OF_A_SITTING
+            and getattr(self, field.name) != field.default
+        ]
+        same = {"dataset": None, "trained": (), "held_out": ()}
+        if given and replace(self._settings(), **same) != replace(settings, **same):
+            raise UsageError(
+                f"--resume goes on with the settings that {self.out} has, and they are "
+                f"others; leave out {', '.join(given)}"
+            )
+
+    def _check_ranges(self) -> None:
+        for name, least in _LEAST.items():
+            value = getattr(self, name)
+            if value is not None and not least <= value < 2**31 - 1:
+                raise UsageError(
+                    f"--{name.replace('_', '-')} {value}: {least} to {2**31 - 2:,}"
+                )
+
     def _settings(self):
         from gsjax.train.config import preset, scaled
         from gsjax.train.folder import RunSettings
 
+        self._check_ranges()
         config = preset(self.preset)
         if self.steps is not None:
-            if self.steps < 1:
-                raise UsageError("--steps from 1")
             config = scaled(config, self.steps)
         changes = {
             "strategy": self.strategy,
@@ -154,8 +191,6 @@ class TrainCommand(HeavyCommand):
             raster=config.raster.replace(antialias=self.antialias),
         )
         if self.max_gaussians is not None:
-            if self.max_gaussians < 1:
-                raise UsageError("--max-gaussians from 1")
             config = config.replace(
                 adaptive=replace(config.adaptive, max_gaussians=self.max_gaussians),
                 mcmc=replace(config.mcmc, max_gaussians=self.max_gaussians),

@@ -20,7 +20,7 @@ from gsjax.scene.colmap_model import (
     ColmapPoints,
     viewmat_of,
 )
-from gsjax.scene.image_files import find_files, find_mask, image_folder
+from gsjax.scene.image_files import find_files, find_masks, image_folder
 from gsjax.scene.types import Scene, View
 
 _PLACES = ("sparse/0", "sparse", ".")
@@ -108,6 +108,7 @@ def load_colmap(
     root = image_folder(folder, images, factor)
     names = [image.name for image in model.images]
     files = find_files(place, root, names, skip_missing=skip_missing)
+    masks = find_masks(folder / "masks", list(files))
     views = []
     for image in model.images:
         if image.name not in files:
@@ -121,7 +122,7 @@ def load_colmap(
             width=camera.width,
             height=camera.height,
             lens=camera.lens,
-            mask=find_mask(folder / "masks", image.name),
+            mask=masks.get(image.name),
         )
         views.append(view)
     points = model.points

@@ -28,8 +28,9 @@ def load_dataset(
     - a COLMAP model, .bin or .txt, in ``sparse/0``, ``sparse`` or the folder itself;
       photographs in ``images``, masks (0 is left out) in ``masks``;
     - ``transforms.json`` of nerfstudio or instant-ngp;
-    - ``transforms_train.json`` and ``transforms_test.json`` of NeRF's synthetic
-      scenes; another list (``transforms_val.json``) is read where ``path`` is the file;
+    - ``transforms_train.json`` and ``transforms_test.json``, in its absence
+      ``transforms_val.json``, of NeRF's synthetic scenes; another list is read where
+      ``path`` is the file;
     - ``poses_bounds.npy`` of LLFF.
 
     Photographs themselves are read by `gsjax.scene.photos`. A scene that lies far out
@@ -38,7 +39,8 @@ def load_dataset(
     Args:
       path: folder of the dataset, or its .json or .npy file.
       images: name of the folder of the photographs in the dataset, or a path; None for
-        ``images``, for a .json the folders in it.
+        ``images``, for a .json the folders in it. In another folder, or one of smaller
+        copies, the first folders of a .json's names may be left out.
       skip_missing: leave out photographs that are listed but not there, with a
         warning, instead of raising.
       factor: read the smaller copies in ``images_2``, ``images_4``, …

@@ -2,7 +2,8 @@
 
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
 from os import PathLike
 from pathlib import Path, PurePosixPath
 
@@ -11,6 +12,7 @@ from gsjax.errors import InputError
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _SHOWN = 5
 _MAX_NAME, _MAX_PART = 1024, 251  # bytes; masks have ".png" appended
+_ENDING = re.compile(f"({'|'.join(map(re.escape, SUFFIXES))})+$", re.IGNORECASE)
 
 
 def image_folder(
@@ -22,20 +24,39 @@ def image_folder(
       folder: of the dataset.
       images: its name in the dataset, or a path of its own; None for "images".
       factor: by how much the photographs were made smaller; None or 1 for not.
+
+    Raises:
+      InputError: if there is no such folder; the message offers a factor that is there.
     """
     check_factor(factor)
     suffix = f"_{factor}" if factor is not None and factor > 1 else ""
-    found = folder / f"{Path('images' if images is None else images)}{suffix}"
+    whole = folder / ("images" if images is None else images)
+    found = Path(f"{whole}{suffix}")
     if found.is_dir():
         return found
     names = sorted(entry.name for entry in folder.iterdir() if entry.is_dir())
     remedy = "pass images=, the folder of the photographs (--images)"
     if suffix:
         remedy = "leave the factor out (photographs are scaled on load), or make it"
+    factors = _factors(whole)
+    if factors:
+        copies, least = f"{whole.name}_{factors[0]}", factors[0]
+        remedy = (
+            f"pass factor={least} (--factor {least}), as {copies} is there; or {remedy}"
+        )
     raise InputError(
         f"{found}: no such folder; {folder} has the folders "
         f"{', '.join(names[:12]) or '(none)'}; {remedy}"
     )
+
+
+def _factors(whole: Path) -> list[int]:
+    """By how much the copies beside a folder of photographs are smaller: its _2, _4."""
+    beside = whole.parent.iterdir() if whole.parent.is_dir() else ()
+    names = [entry.name for entry in beside if entry.is_dir()]
+    form = re.escape(whole.name) + "_([2-9]|[1-9][0-9]{1,3})"
+    found = [re.fullmatch(form, name) for name in names]
+    return sorted(int(match[1]) for match in found if match)
 
 
 def check_factor(factor: int | None) -> None:
@@ -66,7 +87,12 @@ def inside(where: str, name: str) -> PurePosixPath:
 
 
 def find_files(
-    source: Path, root: Path, names: Iterable[str], *, skip_missing: bool = False
+    source: Path,
+    root: Path,
+    names: Iterable[str],
+    *,
+    skip_missing: bool = False,
+    elsewhere: bool = False,
 ) -> dict[str, Path]:
     """Files of photographs, by name; a name with no file is missing.
 
@@ -78,6 +104,9 @@ def find_files(
       root: the folder that they are relative to.
       names: as listed.
       skip_missing: leave out names without a file, with a warning.
+      elsewhere: ``root`` is not the folder that the names are of. Then the longest end
+        of a name that has a file there counts: of ``images/left/1.png`` all, then
+        ``left/1.png``, then ``1.png``.
 
     Raises:
       InputError: on missing files, unless ``skip_missing``; on all files missing; on
@@ -85,12 +114,12 @@ def find_files(
     """
     found: dict[str, Path] = {}
     missing: list[str] = []
-    folders: dict[Path, dict[str, Path]] = {}
+    stems = cache(_stems)
     for name in names:
-        path = root / inside(str(source), name)
-        if not path.is_file():
-            stems = folders.setdefault(path.parent, _stems(path.parent))
-            path = stems.get(path.name) or stems.get(path.stem)
+        parts = inside(str(source), name).parts
+        ends = [parts[start:] for start in range(len(parts) if elsewhere else 1)]
+        files = (_file_at(root.joinpath(*end), stems) for end in ends)
+        path = next(filter(None, files), None)
         if path is None:
             missing.append(name)
         else:
@@ -109,6 +138,13 @@ def find_files(
     return found
 
 
+def _file_at(path: Path, stems: Callable[[Path], dict[str, Path]]) -> Path | None:
+    """The file there, or the photograph that is called so but for its suffix."""
+    if path.is_file():
+        return path
+    return stems(path.parent).get(path.name) or stems(path.parent).get(path.stem)
+
+
 def _stems(folder: Path) -> dict[str, Path]:
     """Photographs of a folder by their names without suffix."""
     files = [p for p in folder.iterdir() if p.is_file()] if folder.is_dir() else []
@@ -118,16 +154,58 @@ def _stems(folder: Path) -> dict[str, Path]:
     return {p.stem: p for p in files}
 
 
-def find_mask(folder: Path, name: str) -> Path | None:
+def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """The masks of photographs, by name, as `find_mask` knows them.
+
+    Photographs without one are warned of, unless there is no such folder.
+    """
+    if not folder.is_dir():
+        return {}
+    listing = cache(_by_suffix_of_either_case)
+    masks = {name: find_mask(folder, name, listing) for name in names}
+    found = {name: mask for name, mask in masks.items() if mask is not None}
+    lacking = [name for name in masks if name not in found]
+    if lacking:
+        warnings.warn(
+            f"{folder}: {len(lacking)} of {len(masks)} photographs have no mask there, "
+            f"the first: {', '.join(lacking[:_SHOWN])}; nothing of them is left out (a "
+            f"mask would be {PurePosixPath(lacking[0]).with_suffix('.png')})",
+            UserWarning,
+            stacklevel=3,
+        )
+    return found
+
+
+def _lowered(name: str) -> str:
+    """A name with the suffixes of photographs that it ends with in lower case."""
+    return _ENDING.sub(lambda ending: ending[0].lower(), name)
+
+
+def _by_suffix_of_either_case(folder: Path) -> dict[str, Path]:
+    """What is in a folder, which need not exist, by `_lowered` names."""
+    entries = sorted(folder.iterdir()) if folder.is_dir() else ()
+    return {_lowered(entry.name): entry for entry in entries}
+
+
+def find_mask(
+    folder: Path,
+    name: str,
+    listing: Callable[[Path], dict[str, Path]] = _by_suffix_of_either_case,
+) -> Path | None:
     """The mask of a photograph, if there is one.
 
     Args:
       folder: of the masks; it need not exist.
       name: of the photograph: masks are called the same, or have ``.png`` appended
-        (COLMAP) or in place of the suffix.
+        (COLMAP) or in place of the suffix. Suffixes may be of either case.
+      listing: what is in a folder, by `_lowered` names.
     """
-    if not folder.is_dir():
-        return None
     path = folder / inside(str(folder), name)
-    candidates = (path, path.with_name(path.name + ".png"), path.with_suffix(".png"))
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    called = (path.name, path.name + ".png", path.stem + ".png")
+    exact = [path.with_name(mask) for mask in called]
+    found = next((mask for mask in exact if mask.is_file()), None)
+    if found is None:
+        files = listing(path.parent)
+        loose = [files[_lowered(mask)] for mask in called if _lowered(mask) in files]
+        found = next((mask for mask in loose if mask.is_file()), None)
+    return found

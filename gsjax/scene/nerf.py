@@ -4,14 +4,15 @@
 poses and points already, so that both are in one frame as they stand.
 """
 
+import os
 from os import PathLike
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.io.point_cloud import read_point_cloud
-from gsjax.scene.image_files import check_factor, find_files, inside
+from gsjax.scene.image_files import check_factor, find_files, image_folder, inside
 from gsjax.scene.image_header import image_size
 from gsjax.scene.transforms_fields import (
     Frame,
@@ -36,11 +37,18 @@ _SPLITS = {"transforms_train": "train", "transforms_test": "test"}
 
 
 def find_transforms(folder: Path) -> list[Path]:
-    """The camera lists of a folder: one for all, or NeRF's train and test lists."""
+    """The camera lists of a folder: one for all, or NeRF's train and test lists.
+
+    As with nerfstudio's names, validation views stand in for test views where there
+    are none.
+    """
     if (folder / "transforms.json").exists():
         return [folder / "transforms.json"]
-    paths = [folder / f"{stem}.json" for stem in _SPLITS]
-    return [path for path in paths if path.exists()]
+    train, test, val = (
+        folder / f"transforms_{s}.json" for s in ("train", "test", "val")
+    )
+    held_out = val if train.exists() and not test.exists() else test
+    return [path for path in (train, held_out) if path.exists()]
 
 
 def load_nerf(
@@ -52,13 +60,21 @@ def load_nerf(
 ) -> Scene:
     """The scene of camera lists in one folder; see `load_dataset`."""
     check_factor(factor)
-    folder = paths[0].parent
+    folder = root = paths[0].parent
+    elsewhere = images is not None or (factor is not None and factor > 1)
+    if elsewhere:
+        # As nerfstudio: smaller copies lie in a folder of their own, images_4.
+        root = image_folder(folder, images, factor)
     views: list[View] = []
     lists = [read_frames(path) for path in paths]
     for path, frames in zip(paths, lists):
-        names = [_file_path(frame, images, factor) for frame in frames]
-        files = find_files(path, folder, names, skip_missing=skip_missing)
-        splits = _splits(path, frames)
+        names = [_file_path(frame) for frame in frames]
+        files = find_files(
+            path, root, names, skip_missing=skip_missing, elsewhere=elsewhere
+        )
+        # A second list is of what is held out, transforms_val.json too.
+        default = _SPLITS.get(path.stem) if path == paths[0] else "test"
+        splits = _splits(path, frames, default)
         scaled: list[tuple[int, float]] = []
         for index, (frame, name) in enumerate(zip(frames, names)):
             if name not in files or splits[index] == _UNUSED:
@@ -66,31 +82,32 @@ def load_nerf(
             viewmat, scale = pose_of(frame)
             if scale != 1:
                 scaled.append((index, scale))
-            views.append(_view(frame, files[name], folder, viewmat, splits[index]))
+            file = files[name]
+            called = _name(file, folder, root)
+            views.append(_view(frame, file, called, folder, viewmat, splits[index]))
         warn_of_scaled(path, scaled)
     points, colors = _points(lists[0][0], folder)
     source = paths[0] if len(paths) == 1 else folder
     return Scene(source, "transforms", tuple(views), points, colors)
 
 
-def _file_path(
-    frame: Frame, images: str | PathLike[str] | None, factor: int | None
-) -> str:
-    """Where the photograph of a frame lies in the folder, by its list or as asked."""
+def _file_path(frame: Frame) -> str:
+    """Where the photograph of a frame lies in the folder, by its list."""
     name = text_of(frame, "file_path")
     if not name:
         raise InputError(f"{frame.where}: file_path is {shown(name)}; text is wanted")
-    path = inside(frame.where, name)
-    if images is not None or (factor is not None and factor > 1):
-        # As nerfstudio: smaller copies lie in a folder of their own, images_4.
-        first = "images" if images is None else str(images)
-        suffix = f"_{factor}" if factor is not None and factor > 1 else ""
-        path = PurePosixPath(first + suffix, path.name)
-    return str(path)
+    return str(inside(frame.where, name))
 
 
-def _splits(path: Path, frames: list[Frame]) -> list[str | None]:
-    """The split of each frame: by nerfstudio's lists of names, or by NeRF's files."""
+def _name(file: Path, folder: Path, root: Path) -> str:
+    """Of a photograph: its path in the dataset, or in ``root`` if that is outside."""
+    path, dataset = Path(os.path.abspath(file)), Path(os.path.abspath(folder))
+    within = path.is_relative_to(dataset)
+    return (path.relative_to(dataset) if within else file.relative_to(root)).as_posix()
+
+
+def _splits(path: Path, frames: list[Frame], default: str | None) -> list[str | None]:
+    """The split of each frame: by nerfstudio's lists of names, or that of the file."""
     named: dict[str, str] = {}
     top = frames[0].sources[1]
     # Validation views stand in for test views where there are none, else are unused.
@@ -100,12 +117,16 @@ def _splits(path: Path, frames: list[Frame]) -> list[str | None]:
         if names is not None and not isinstance(names, list):
             raise InputError(f"{path}: {key}_filenames is {shown(names)}; a list")
         named |= {str(name): split for name in names or ()}
-    other = _SPLITS.get(path.stem)
-    return [named.get(str(text_of(frame, "file_path")), other) for frame in frames]
+    return [named.get(str(text_of(frame, "file_path")), default) for frame in frames]
 
 
 def _view(
-    frame: Frame, file: Path, folder: Path, viewmat: np.ndarray, split: str | None
+    frame: Frame,
+    file: Path,
+    name: str,
+    folder: Path,
+    viewmat: np.ndarray,
+    split: str | None,
 ) -> View:
     lens = _lens(frame)
     # The size of the file is that of the camera unless the list says otherwise.
@@ -118,7 +139,7 @@ def _view(
     if mask is not None and not (folder / inside(frame.where, mask)).is_file():
         raise InputError(f"{frame.where}: mask_path {mask!r}: no such file in {folder}")
     return View(
-        name=file.relative_to(folder).as_posix(),
+        name=name,
         image=file,
         viewmat=viewmat,
         K=np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64),

@@ -85,6 +85,7 @@ def find_photos(folder: Path) -> list[Path]:
         raise InputError(
             f"{folder}: {len(found)} photos ({', '.join(READ)}) in it; at least two "
             "are wanted, rather twenty (a video is given by its own name)"
+            + _told_of_subfolders(folder)
         )
     names = [dataset_name(path) for path in found]
     double = [p for p, name in zip(found, names) if names.count(name) > 1]
@@ -93,6 +94,13 @@ def find_photos(folder: Path) -> list[Path]:
             f"{_some(double)}: would have the same name in the dataset; rename one"
         )
     return found
+
+
+def _told_of_subfolders(folder: Path) -> str:
+    below = [p for p in folder.rglob("*") if p.parent != folder and p.name[0] != "."]
+    count = sum(path.suffix.lower() in READ for path in below)
+    told = f"; subfolders are not searched, {count} photos lie there: move them up"
+    return told if count else ""
 
 
 def dataset_name(path: Path) -> str:

@@ -16,7 +16,7 @@ from gsjax.optim import Rates
 from gsjax.raster.types import RasterConfig
 
 STRATEGIES = ("adaptive", "mcmc")
-BACKGROUNDS = ("black", "white", "random")
+BACKGROUNDS = ("auto", "black", "white", "random")
 _MAX_WHOLE = 1 << 63
 
 
@@ -46,7 +46,9 @@ class TrainConfig:
       sh_degree: of the scene; bands join one by one, every ``sh_every`` steps.
       ssim_weight: share of 1 − SSIM in the loss.
       background: behind the scene while training; "random" is a new colour at each
-        step, so that nothing hides in it. Views and files have it black then.
+        step, so that nothing hides in it. "auto" is random where photographs are
+        transparent, which tells what is nothing, else black. But for "white", views
+        and files have it black.
       initial: "points" of the dataset, or "random" where it has too few.
       initial_count: how many random ones.
       max_initial: of more points than that, that many are drawn.
@@ -73,7 +75,7 @@ class TrainConfig:
     sh_degree: int = 3
     sh_every: int = 1000
     ssim_weight: float = 0.2
-    background: str = "black"
+    background: str = "auto"
     initial: str = "points"
     initial_count: int = 100_000
     max_initial: int = 1_000_000
@@ -92,7 +94,8 @@ class TrainConfig:
 
     def __post_init__(self):
         checks = {
-            "steps": self.steps >= 1,
+            "steps": 1 <= self.steps < 2**31 - 1,
+            "seed": 0 <= self.seed < 2**31,
             "batch": self.batch >= 1,
             "strategy": self.strategy in STRATEGIES,
             "max_size": self.max_size is None or self.max_size >= 8,

@@ -13,7 +13,7 @@ RUN/curves.png        PSNR by step
 """
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -44,6 +44,8 @@ class RunSettings:
       images, factor, skip_missing: as for `load_dataset`.
       every: hold out every so many-th view; 0 for none.
       test_images: hold out these instead.
+      trained, held_out: names of the views, once they were split; what a dataset holds
+        later is held against them.
     """
 
     dataset: Path
@@ -53,6 +55,8 @@ class RunSettings:
     skip_missing: bool = False
     every: int = 8
     test_images: tuple[str, ...] = ()
+    trained: tuple[str, ...] = ()
+    held_out: tuple[str, ...] = ()
 
 
 class RunFiles(NamedTuple):
@@ -103,15 +107,52 @@ def load_data(settings: RunSettings) -> Data:
     """The dataset of a run as it was given, and which views are for what.
 
     Raises:
-      InputError: as `load_dataset` and `split_views`.
+      InputError: as `load_dataset` and `split_views`; if the dataset is not where it
+        was, or holds other views than those that the run was made from.
     """
+    if settings.trained and not settings.dataset.exists():
+        raise InputError(
+            f"{settings.dataset}: does not exist, and the run was made from it; if it "
+            "was moved, tell the run once: gsjax train NEW_PLACE -o RUN --resume"
+        )
     scene = load_dataset(
         settings.dataset,
         images=settings.images,
         skip_missing=settings.skip_missing,
         factor=settings.factor,
     )
-    return Data(scene, *split_views(scene.views, settings.every, settings.test_images))
+    data = Data(scene, *split_views(scene.views, settings.every, settings.test_images))
+    if settings.trained:
+        _check_same(settings, with_views(settings, data))
+    return data
+
+
+def with_views(settings: RunSettings, data: Data) -> RunSettings:
+    """The same, with the names of the views and what they are for."""
+    trained, held_out = (
+        tuple(data.scene.views[index].name for index in some)
+        for some in (data.train, data.test)
+    )
+    return replace(settings, trained=trained, held_out=held_out)
+
+
+def _check_same(then: RunSettings, now: RunSettings) -> None:
+    """See that a run's views are what they were."""
+    names = {"trained on": (then.trained, now.trained),
+             "held out": (then.held_out, now.held_out)}  # fmt: skip
+    told = []
+    for what, (old, new) in names.items():
+        changes = [f"+{name}" for name in sorted(set(new) - set(old))]
+        changes += [f"-{name}" for name in sorted(set(old) - set(new))]
+        if changes:
+            few = changes[:5] + ["…"] * (len(changes) > 5)
+            told.append(f"{' '.join(few)} ({what})")
+    if told or then != now:
+        raise InputError(
+            f"{then.dataset}: no longer the views that the run was made from: "
+            f"{', '.join(told) or 'their order is another'}; put it back as it was, or "
+            "train again"
+        )
 
 
 def refined_data(data: Data, files: RunFiles) -> Data:
@@ -148,7 +189,8 @@ def load_settings(folder: Path) -> RunSettings:
         rest = {k: v for k, v in data.items() if k not in ("format", "train")}
         check_kinds(RunSettings, rest)
         rest["dataset"] = Path(rest["dataset"])
-        rest["test_images"] = tuple(rest["test_images"])
+        for name in ("test_images", "trained", "held_out"):
+            rest[name] = tuple(rest.get(name, ()))
         config = from_json(json.dumps(data["train"]))
         return RunSettings(config=config, **rest)
     except KeyError as error:

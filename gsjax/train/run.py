@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from gsjax.train.fit import (
     empty_state,
     extent_of,
     fit,
+    initial_state,
     subset,
 )
 from gsjax.train.folder import (
@@ -34,6 +36,7 @@ from gsjax.train.folder import (
     run_files,
     save_scene,
     save_settings,
+    with_views,
 )
 from gsjax.train.footprint import check_memory
 from gsjax.train.health import is_seen
@@ -144,12 +147,12 @@ def start_run(
     Args:
       settings: of the run.
       folder: where it is kept; created if missing.
-      overwrite: whether a run in it may be replaced.
+      overwrite: whether a run in it may be replaced; it is once the new one can begin.
       watch: gives `Hooks.state`.
 
     Raises:
-      InputError: if the folder holds a run and ``overwrite`` is not set, or what is
-        read or written fails.
+      InputError: if the folder holds a run and ``overwrite`` is not set, or files that
+        are not a run's, or what is read or written fails.
       DivergedError: as `fit`; the last checkpoint is kept.
     """
     files = run_files(folder)
@@ -159,26 +162,48 @@ def start_run(
             f"{ours[0]}: exists; pass --resume to go on, --overwrite to start again, "
             "or another folder with -o"
         )
+    if ours:
+        load_settings(folder)  # refuses what is no run
     data = load_data(settings)
+    settings = with_views(settings, data)
+    sitting = _Sitting(settings.config, data, files, _Start())
+    photos = _photographs(sitting)
+    state = initial_state(sitting.scene, settings.config)
     for path in ours:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     make_folder(folder)
     save_settings(folder, settings)
-    return _train(_Sitting(settings.config, data, files, _Start()), watch)
+    return _train(sitting, photos, state, watch)
 
 
-def resume_run(folder: Path, *, watch: Watch | None = None) -> RunResult:
+def resume_run(
+    folder: Path, *, dataset: Path | None = None, watch: Watch | None = None
+) -> RunResult:
     """Go on where a run stopped, bit for bit as if it had not; see `start_run`.
 
+    Args:
+      folder: of the run.
+      dataset: where its dataset is now, if that was moved.
+      watch: gives `Hooks.state`.
+
     Raises:
-      InputError: if there is no run, or its files are damaged.
+      InputError: if there is no run, its files are damaged, or the dataset holds other
+        views than it did.
     """
     settings, files = load_settings(folder), run_files(folder)
+    if dataset is not None:
+        settings = replace(settings, dataset=dataset)
     data, start = load_data(settings), _Start()
+    if dataset is not None:
+        save_settings(folder, settings)
+        note(f"the run's dataset is now {dataset}")
     if any(files.checkpoints.glob("*.npz")):
         start = _last_checkpoint(files, settings.config, subset(data.scene, data.train))
         note(f"going on from step {start.step}")
-    return _train(_Sitting(settings.config, data, files, start), watch)
+    sitting = _Sitting(settings.config, data, files, start)
+    photos = _photographs(sitting)
+    state = start.state or initial_state(sitting.scene, settings.config)
+    return _train(sitting, photos, state, watch)
 
 
 def _last_checkpoint(files: RunFiles, config: TrainConfig, scene: Scene) -> _Start:
@@ -193,15 +218,22 @@ def _last_checkpoint(files: RunFiles, config: TrainConfig, scene: Scene) -> _Sta
     )
 
 
-def _train(sitting: _Sitting, watch: Watch | None) -> RunResult:
-    config, data, files = sitting.config, sitting.data, sitting.files
-    start, scene = sitting.start, sitting.scene
+def _photographs(sitting: _Sitting) -> list[Photo]:
+    """Those that are trained on, if there is memory enough for the training."""
+    data, config = sitting.data, sitting.config
     note(
         f"{len(data.scene.views)} views ({len(data.test)} held out), "
         f"{len(data.scene.points):,} points; loading the photographs"
     )
-    check_memory(scene, config, start.state)
-    photos = load_photos(scene.views, config.max_size)
+    check_memory(sitting.scene, config, sitting.start.state)
+    return load_photos(sitting.scene.views, config.max_size)
+
+
+def _train(
+    sitting: _Sitting, photos: list[Photo], state: TrainState, watch: Watch | None
+) -> RunResult:
+    config, files, scene = sitting.config, sitting.files, sitting.scene
+    start = sitting.start
     for path in (files.metrics, files.held_out):
         keep_steps(path, start.step)
     with _hooks(sitting) as hooks:
@@ -211,7 +243,7 @@ def _train(sitting: _Sitting, watch: Watch | None) -> RunResult:
             scene,
             photos,
             config,
-            state=start.state,
+            state=state,
             pair_capacity=start.pair_capacity,
             hooks=hooks,
         )

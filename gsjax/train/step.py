@@ -167,7 +167,8 @@ def make_train_step(
         by_background, by_noise, by_plan = jax.random.split(key, 3)
         params = state.gaussians.params
         dtype = params.means.dtype
-        background = background_of(config, by_background, dtype)
+        transparent = batch.pixels.shape[-1] == 4
+        background = background_of(config, transparent, by_background, dtype)
         count = batch.view.shape[0]
         probe = jnp.zeros((count, state.gaussians.capacity, 2), dtype)
         (loss, (quality, radii, demand, overflowed)), grads = differentiate(
@@ -212,9 +213,9 @@ def make_train_step(
     return train_step
 
 
-def background_of(config: TrainConfig, key: Array, dtype) -> Array:
-    """[3] colour behind the scene."""
-    if config.background == "random":
+def background_of(config: TrainConfig, transparent: bool, key: Array, dtype) -> Array:
+    """[3] colour behind the scene, and behind photographs that are ``transparent``."""
+    if config.background == "random" or (config.background == "auto" and transparent):
         return jax.random.uniform(key, (3,), dtype)
     return jnp.full(3, 1.0 if config.background == "white" else 0.0, dtype)
 

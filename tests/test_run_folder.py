@@ -1,0 +1,179 @@
+"""The folder of a run: replaced only where it is one, and true to its dataset."""
+
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from hostile import HOSTILE, harmless, write_hostile
+
+from gsjax import cli
+from gsjax.densify.mcmc import McmcSettings
+from gsjax.errors import InputError
+from gsjax.raster.types import RasterConfig
+from gsjax.train.config import TrainConfig
+from gsjax.train.folder import RunSettings, load_settings
+from gsjax.train.held_out import evaluate_run
+from gsjax.train.run import resume_run, start_run
+
+pytestmark = pytest.mark.usefixtures("quick_compiles", "float32")
+
+CONFIG = TrainConfig(
+    steps=3,
+    sh_degree=0,
+    strategy="mcmc",
+    mcmc=McmcSettings(start=0, stop=0, max_gaussians=60),
+    raster=RasterConfig(rungs=1, devices=1, chunk_size=4, occlusion=False),
+)
+
+
+@pytest.fixture(scope="module")
+def float32():
+    """As users have it."""
+    jax.config.update("jax_enable_x64", False)
+    yield
+    jax.config.update("jax_enable_x64", True)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """A folder with a dataset and a run that came to its end: never written to."""
+    folder = tmp_path_factory.mktemp("whole")
+    data = write_hostile(folder / "data", harmless())
+    assert start_run(RunSettings(data, CONFIG), folder / "run").finished
+    return folder
+
+
+@pytest.fixture
+def made(whole, tmp_path) -> Path:
+    """A copy of it in another place, which its run knows."""
+    folder = tmp_path / "made"
+    shutil.copytree(whole, folder)
+    change(folder / "run" / "config.json", dataset=str(folder / "data"))
+    return folder
+
+
+def change(path: Path, **changes) -> None:
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {p: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+# --- replaced ---
+
+
+@pytest.mark.parametrize("config", ['{"my": "app"}', None])
+def test_only_a_run_is_replaced(whole, tmp_path, config):
+    folder = tmp_path / "mine"
+    (folder / "renders" / "precious").mkdir(parents=True)
+    (folder / "renders" / "precious" / "a.blend").write_text("mine")
+    if config is not None:
+        (folder / "config.json").write_text(config)
+    before = contents(folder)
+    with pytest.raises(InputError, match=r"config\.json|no run is here"):
+        start_run(RunSettings(whole / "data", CONFIG), folder, overwrite=True)
+    assert contents(folder) == before
+
+
+def test_a_run_is_replaced_once_the_next_can_begin(made, tmp_path):
+    bad = write_hostile(tmp_path / "bad", HOSTILE["no points"]())
+    before = contents(made / "run")
+    with pytest.raises(InputError, match="no points to start from"):
+        start_run(RunSettings(bad, CONFIG), made / "run", overwrite=True)
+    assert contents(made / "run") == before
+    other = RunSettings(made / "data", CONFIG.replace(seed=1))
+    assert start_run(other, made / "run", overwrite=True).finished
+    assert load_settings(made / "run").config.seed == 1
+    splat = made / "run" / "splat.ply"
+    assert contents(made / "run")[splat] != before[splat]
+
+
+def test_a_start_that_fails_leaves_nothing(tmp_path):
+    bad = write_hostile(tmp_path / "bad", HOSTILE["no points"]())
+    run = tmp_path / "run"
+    with pytest.raises(InputError, match="--initial random"):
+        start_run(RunSettings(bad, CONFIG), run)
+    assert not run.exists()
+
+
+# --- true to its dataset ---
+
+
+def test_a_dataset_with_other_views_is_refused(made):
+    settings = load_settings(made / "run")
+    assert (settings.held_out, settings.trained) == (("0.png",), ("1.png", "2.png"))
+    evaluate_run(made / "run")
+    # As if the run had been made before the last one came, and another was held out.
+    change(made / "run" / "config.json", held_out=["1.png"], trained=["0.png"])
+    before = contents(made / "run")
+    for go_on in (evaluate_run, resume_run):
+        with pytest.raises(InputError, match="no longer the views") as caught:
+            go_on(made / "run")
+        for told in ("+1.png +2.png -0.png (trained on)", "+0.png -1.png (held out)"):
+            assert told in str(caught.value)
+    assert contents(made / "run") == before
+
+
+def test_a_dataset_that_was_moved(made, capsys):
+    run, there = made / "run", made / "elsewhere"
+    (made / "data").rename(there)
+    with pytest.raises(InputError, match="train NEW_PLACE -o RUN --resume"):
+        evaluate_run(run)
+    before = contents(run)
+    assert cli.main(["train", str(there), "-o", str(run), "--resume"]) == 0
+    assert f"dataset is now {there}" in capsys.readouterr().err
+    assert load_settings(run).dataset == there
+    assert before[run / "splat.ply"] == contents(run)[run / "splat.ply"]
+    evaluate_run(run)
+    # Where the old one is still there, a new one is another.
+    shutil.copytree(there, made / "data")
+    code = cli.main(["train", str(made / "data"), "-o", str(run), "--resume"])
+    assert code == 2
+    assert "was trained on" in capsys.readouterr().err
+
+
+# --- the command line ---
+
+
+def test_going_on_with_other_settings_is_refused(made, capsys):
+    data, run = str(made / "data"), str(made / "run")
+    before = contents(made / "run")
+    for options in (["--steps", "400"], ["--seed", "3"], ["--initial", "random"]):
+        assert cli.main(["train", data, "-o", run, "--resume", *options]) == 2
+        assert f"leave out {options[0]}" in capsys.readouterr().err
+    assert contents(made / "run") == before
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        ("--seed", "-1"), ("--seed", str(10**20)), ("--steps", "0"),
+        ("--steps", str(2**31)), ("--max-size", "0"), ("--max-gaussians", "0"),
+        ("--factor", "0"), ("--test-every", "-1"), ("--checkpoint-every", "-1"),
+        ("--eval-every", "-1"),
+    ],
+    ids=" ".join,
+)  # fmt: skip
+def test_an_option_out_of_its_range(option, whole, tmp_path, capsys):
+    run = tmp_path / "run"
+    args = ["train", str(whole / "data"), "-o", str(run), *option]
+    assert cli.main(args) == 2
+    assert f"{option[0]} {option[1]}: " in capsys.readouterr().err
+    assert not run.exists()
+
+
+def test_the_same_options_again_go_on(made, capsys):
+    """They are the run's own: what the shell's history holds, and --resume."""
+    data, run = str(made / "data"), str(made / "again")
+    args = ["train", data, "-o", run, "--preset", "fast", "--steps", "2"]
+    args += ["--sh-degree", "0", "--max-gaussians", "40", "--test-every", "0"]
+    assert cli.main(args) == 0
+    before = np.frombuffer((made / "again" / "splat.ply").read_bytes(), np.uint8)
+    capsys.readouterr()
+    assert cli.main([*args, "--resume"]) == 0
+    after = np.frombuffer((made / "again" / "splat.ply").read_bytes(), np.uint8)
+    np.testing.assert_array_equal(after, before)
