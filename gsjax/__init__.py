@@ -1,46 +1,31 @@
-"""3D Gaussian splatting in pure JAX: exact, differentiable, tiled."""
+"""3D Gaussian splatting in pure JAX: exact, differentiable, tiled.
 
-from gsjax import notebook as notebook
-from gsjax.cameras import Camera as Camera
-from gsjax.cameras import CameraModel as CameraModel
-from gsjax.cameras import look_at as look_at
-from gsjax.cameras import make_camera as make_camera
-from gsjax.cameras import resize_camera as resize_camera
-from gsjax.cameras import stack_cameras as stack_cameras
-from gsjax.devices import use_all_cores as use_all_cores
-from gsjax.errors import CapacityError as CapacityError
-from gsjax.errors import DivergedError as DivergedError
-from gsjax.errors import GsjaxError as GsjaxError
-from gsjax.errors import InputError as InputError
-from gsjax.evaluation import evaluate as evaluate
-from gsjax.evaluation import summarise as summarise
-from gsjax.gaussians import GaussianParams as GaussianParams
-from gsjax.gaussians import Gaussians as Gaussians
-from gsjax.gaussians import capacity_bucket as capacity_bucket
-from gsjax.gaussians import compact as compact
-from gsjax.gaussians import concatenate as concatenate
-from gsjax.gaussians import grow as grow
-from gsjax.gaussians import make_gaussians as make_gaussians
-from gsjax.gaussians import num_active as num_active
-from gsjax.gaussians import select as select
-from gsjax.gaussians import with_sh_degree as with_sh_degree
-from gsjax.io import load as load
-from gsjax.io import save as save
-from gsjax.planning.plan import plan as plan
-from gsjax.planning.types import Plan as Plan
-from gsjax.raster.reference import reference_render as reference_render
-from gsjax.raster.render import exact_config as exact_config
-from gsjax.raster.render import render as render
-from gsjax.raster.render import render_exact as render_exact
-from gsjax.raster.types import RasterConfig as RasterConfig
-from gsjax.raster.types import Render as Render
-from gsjax.scene.dataset import load_dataset as load_dataset
-from gsjax.scene.initialise import init_gaussians as init_gaussians
-from gsjax.scene.photos import load_photos as load_photos
-from gsjax.scene.splits import split_views as split_views
-from gsjax.train.config import TrainConfig as TrainConfig
-from gsjax.train.fit import Hooks as Hooks
-from gsjax.train.fit import fit as fit
-from gsjax.train.fit import subset as subset
-from gsjax.train.step import init_state as init_state
-from gsjax.train.step import make_train_step as make_train_step
+The names are those of `gsjax.public`, each loaded when it is first asked for. So
+importing a module of gsjax does not import JAX, and the command line has begun, and
+answers to Ctrl-C, before that does.
+"""
+
+import typing
+
+if typing.TYPE_CHECKING:
+    from gsjax.public import *  # noqa: F403
+else:
+
+    def __getattr__(name: str):
+        from importlib import import_module
+        from importlib.util import find_spec
+
+        if name == "__all__":
+            public = import_module("gsjax.public")
+            return [each for each in vars(public) if not each.startswith("_")]
+        if not name.startswith("_"):
+            # A module first: what imports it may be half imported itself.
+            if find_spec(f"gsjax.{name}"):
+                return import_module(f"gsjax.{name}")
+            public = import_module("gsjax.public")
+            if hasattr(public, name):
+                return globals().setdefault(name, getattr(public, name))
+        raise AttributeError(f"module 'gsjax' has no attribute {name!r}")
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__getattr__("__all__")})

@@ -1,52 +1,26 @@
 """The command line: `gsjax demo`, `sfm`, `train`, `eval`, `render`, `export`, …
 
 Exit codes: 0 done, 1 not well, 2 usage, 3 bad or missing input, 4 structure from
-motion failed, 5 training diverged, 6 a package is missing, 130 interrupted. Results
-go to stdout, all else to stderr; an error is one line, unless --debug asks for the
-traceback.
+motion failed, 5 training diverged, 6 a package is missing, 130 interrupted, 141 nobody
+reads the results any more. Results go to stdout, all else to stderr; an error is one
+line, unless --debug asks for the traceback.
 """
 
 import contextlib
 import io
 import os
 import re
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Iterator, Sequence
+from importlib import import_module
+from typing import Annotated, Any
 
-import tyro
-from tyro.conf import FlagCreatePairsOff, subcommand
-
-from gsjax.commands.bench import BenchCommand
-from gsjax.commands.common import UsageError
-from gsjax.commands.demo import DemoCommand
-from gsjax.commands.doctor import DoctorCommand
-from gsjax.commands.evaluate import EvalCommand
-from gsjax.commands.export import ExportCommand
-from gsjax.commands.info import InfoCommand
-from gsjax.commands.render import RenderCommand
-from gsjax.commands.sfm import SfmCommand
-from gsjax.commands.stress import StressCommand
-from gsjax.commands.train import TrainCommand
-from gsjax.commands.view import ViewCommand
 from gsjax.console import one_line, warnings_as_lines
 from gsjax.errors import CapacityError, GsjaxError, InputError
 from gsjax.memory import unlimited
-
-_COMMANDS = (
-    Annotated[DemoCommand, subcommand("demo")]
-    | Annotated[SfmCommand, subcommand("sfm")]
-    | Annotated[TrainCommand, subcommand("train")]
-    | Annotated[EvalCommand, subcommand("eval")]
-    | Annotated[RenderCommand, subcommand("render")]
-    | Annotated[ViewCommand, subcommand("view")]
-    | Annotated[ExportCommand, subcommand("export")]
-    | Annotated[InfoCommand, subcommand("info")]
-    | Annotated[BenchCommand, subcommand("bench")]
-    | Annotated[DoctorCommand, subcommand("doctor")]
-    | Annotated[StressCommand, subcommand("stress")]
-)
 
 _EXHAUSTED = "RESOURCE_EXHAUSTED"  # as XLA tells it
 
@@ -54,23 +28,15 @@ _EXHAUSTED = "RESOURCE_EXHAUSTED"  # as XLA tells it
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     argv = list(sys.argv[1:] if argv is None else argv)
-    if argv == ["--version"]:
-        from gsjax.doctor import version
-
-        print(f"gsjax {version('gsjax')}")
-        return 0
     debug = "--debug" in argv
-    # OpenCV tells of bad photographs on its own, on top of our one line.
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     try:
-        with warnings_as_lines():
-            command = _parse(argv)
-            with unlimited(getattr(command, "ignore_memory", False)):
-                return command.run()
+        return _run(argv)
     except KeyboardInterrupt:
         return _report("interrupted", 130, debug)
     except GsjaxError as error:
         return _report(one_line(error), error.exit_code, debug)
+    except BrokenPipeError:
+        return _hung_up()
     except OSError as error:
         return _report(one_line(error), InputError.exit_code, debug)
     except Exception as error:
@@ -81,8 +47,65 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Not foreseen: still one line, which says how to see more.
         text = f"{type(error).__name__}: {one_line(error)[:300]}"
         return _report(f"{text} (--debug shows where)", 1, debug)
+
+
+def _run(argv: list[str]) -> int:
+    # OpenCV tells of bad photographs on its own, on top of our one line.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    # Where there is no ∞, a ?; stderr has a way of its own, and so may stdout.
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="replace")
+    try:
+        with warnings_as_lines():
+            code = _result(argv)
     except SystemExit as exit_:  # --help, or a usage error told already
-        return exit_.code if isinstance(exit_.code, int) else 1
+        code = exit_.code if isinstance(exit_.code, int) else 1
+    print(end="", flush=True)  # not at the very end, where an error is a traceback
+    return code
+
+
+def _result(argv: list[str]) -> int:
+    with _leaving_on_ctrl_c():
+        if argv == ["--version"]:
+            from gsjax.doctor import version
+
+            print(f"gsjax {version('gsjax')}")
+            return 0
+        command = _parse(argv)
+        import_module("gsjax.public")  # and so JAX
+    with unlimited(getattr(command, "ignore_memory", False)):
+        return command.run()
+
+
+def _leave(*_) -> None:
+    os.write(2, b"gsjax: error: interrupted\n")  # sys.stderr may be any by now
+    os._exit(130)
+
+
+@contextlib.contextmanager
+def _leaving_on_ctrl_c() -> Iterator[None]:
+    """Within, Ctrl-C ends the process on the spot: nothing has begun.
+
+    Where JAX is being imported, `KeyboardInterrupt` is lost, or crashes it. What has
+    JAX already, or another way with Ctrl-C, keeps that.
+    """
+    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    mine = threading.current_thread() is threading.main_thread()
+    if "jax" in sys.modules or not usual or not mine:
+        yield
+        return
+    signal.signal(signal.SIGINT, _leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _hung_up() -> int:
+    """Who read our lines has gone, as `head` does: nothing is left to be said."""
+    with contextlib.suppress(OSError):  # not a stream of the system
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 141  # as a shell calls the death by SIGPIPE
 
 
 def _report(message: str, code: int, debug: bool) -> int:
@@ -92,6 +115,37 @@ def _report(message: str, code: int, debug: bool) -> int:
     return code
 
 
+def _commands() -> Any:
+    """The type that tyro reads; not imported before Ctrl-C is told in one line."""
+    from tyro.conf import subcommand
+
+    from gsjax.commands.bench import BenchCommand
+    from gsjax.commands.demo import DemoCommand
+    from gsjax.commands.doctor import DoctorCommand
+    from gsjax.commands.evaluate import EvalCommand
+    from gsjax.commands.export import ExportCommand
+    from gsjax.commands.info import InfoCommand
+    from gsjax.commands.render import RenderCommand
+    from gsjax.commands.sfm import SfmCommand
+    from gsjax.commands.stress import StressCommand
+    from gsjax.commands.train import TrainCommand
+    from gsjax.commands.view import ViewCommand
+
+    return (
+        Annotated[DemoCommand, subcommand("demo")]
+        | Annotated[SfmCommand, subcommand("sfm")]
+        | Annotated[TrainCommand, subcommand("train")]
+        | Annotated[EvalCommand, subcommand("eval")]
+        | Annotated[RenderCommand, subcommand("render")]
+        | Annotated[ViewCommand, subcommand("view")]
+        | Annotated[ExportCommand, subcommand("export")]
+        | Annotated[InfoCommand, subcommand("info")]
+        | Annotated[BenchCommand, subcommand("bench")]
+        | Annotated[DoctorCommand, subcommand("doctor")]
+        | Annotated[StressCommand, subcommand("stress")]
+    )
+
+
 def _parse(argv: list[str]):
     """The command of a line.
 
@@ -99,16 +153,20 @@ def _parse(argv: list[str]):
       UsageError: with tyro's box of explanations made one line.
       SystemExit: after --help.
     """
+    import tyro
+
+    from gsjax.commands.common import UsageError
+
     told = io.StringIO()
     try:
         with contextlib.redirect_stderr(told):
             return tyro.cli(
-                _COMMANDS,
+                _commands(),
                 prog="gsjax",
                 description="3D Gaussian splatting in pure JAX. "
                 "gsjax --version prints the version.",
                 args=argv or ["--help"],
-                config=(FlagCreatePairsOff,),
+                config=(tyro.conf.FlagCreatePairsOff,),
             )
     except SystemExit as exit_:
         if exit_.code in (0, None):
@@ -124,7 +182,17 @@ def _unboxed(text: str) -> str:
     parts = [one_line(part) for part in "\n".join(lines).split("\n\n")]
     advice = ("For full helptext", "Argument helptext")
     parts = [part for part in parts if part and not part.startswith(advice)]
-    return f"{'; '.join(parts) or 'wrong usage'}; see gsjax --help"
+    return f"{_shortened('; '.join(parts)) or 'wrong usage'}; see gsjax --help"
+
+
+def _shortened(text: str) -> str:
+    """Of a value that is no number, only what it is and which kind is wanted."""
+    why = r"(?:literal for (int)\(\) with base 10|convert string to (float)): (.+)"
+    found = re.search(rf"Error parsing (\S+): .*{why}", text)
+    if found is None:
+        return text
+    option, whole, _, value = found.groups()
+    return f"{option} {value}: a {'whole ' if whole else ''}number is wanted"
 
 
 if __name__ == "__main__":

@@ -90,12 +90,25 @@ def test_the_rasteriser_has_one_door():
 
 
 def test_importing_is_light():
-    heavy = ("cv2", "pycolmap", "tyro", "scipy.spatial", "matplotlib", "viser")
+    heavy = ("jax", "cv2", "pycolmap", "tyro", "scipy.spatial", "matplotlib", "viser")
     code = f"import gsjax, sys; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_public_names_come_when_asked_for():
+    names = [name for name in vars(gsjax.public) if not name.startswith("_")]
+    assert set(names) <= set(dir(gsjax))
+    starred: dict[str, object] = {}
+    exec("from gsjax import *", starred)
+    for name in names:
+        assert starred[name] is getattr(gsjax, name) is getattr(gsjax.public, name)
+    assert gsjax.__all__ == names
+    assert gsjax.scene.splits.split_views is gsjax.split_views
+    with pytest.raises(AttributeError, match="module 'gsjax' has no attribute 'rend'"):
+        _ = gsjax.rend
 
 
 def program(degree: int, outputs) -> str:

@@ -187,6 +187,7 @@ def test_refusals_of_the_command(tmp_path, capsys):
         (["bench", "--repeats", "0"], 2, "--repeats"),
         (["bench", "--budget", "x"], 2, "--budget"),
         (["bench", "--plot", str(plot)], 3, "a.png"),
+        (["bench", "--plot", str(plot.with_suffix(".jpg"))], 2, "in .png is wanted"),
     ):
         assert cli.main(args) == code
         assert text in capsys.readouterr().err

@@ -1,6 +1,8 @@
 """The command line: files, results, exit codes and one-line errors."""
 
+import io
 import json
+import os
 import re
 import subprocess
 import sys
@@ -187,7 +189,29 @@ BAD = {
     "size": (2, lambda s, t: render_args(s, t, "--size", "0x3"), "--size '0x3'"),
     "what": (2, lambda s, t: render_args(s, t, "--what", "rgb,x"), "--what"),
     "colour": (2, lambda s, t: render_args(s, t, "--background", "1,2"), "R,G,B"),
+    "glare": (2, lambda s, t: render_args(s, t, "--background", "1e99,1,1"), "0 to 1"),
+    "below black": (2, lambda s, t: render_args(s, t, "--background=0,0,-1"), "0 to 1"),
     "steps": (2, lambda _s, _t: ["demo", "--steps", "0"], "--steps"),
+    "int32": (
+        2,
+        lambda _s, t: ["demo", "-o", str(t), "--steps", "2147483647"],
+        "to 2147483646",
+    ),
+    "count": (
+        2,
+        lambda _s, _t: ["train", "a", "-o", "b", "--steps", "nan"],
+        "error: --steps 'nan': a whole number is wanted; see gsjax --help",
+    ),
+    "whole": (
+        2,
+        lambda _s, _t: ["demo", "--seed", "1.5"],
+        "error: --seed '1.5': a whole number is wanted; see gsjax --help",
+    ),
+    "number": (
+        2,
+        lambda s, t: render_args(s, t, "--fps", "fast"),
+        "error: --fps 'fast': a number is wanted; see gsjax --help",
+    ),
 }
 
 
@@ -249,6 +273,60 @@ def test_process_has_the_code_and_no_traceback(tmp_path):
     assert done.stdout == ""
     assert done.stderr.startswith("gsjax: error: ")
     assert done.stderr.count("\n") == 1
+
+
+PROGRAMS = {
+    "module": ["-m", "gsjax.cli"],
+    "script": ["-c", "import sys; from gsjax.cli import main; sys.exit(main())"],
+}
+
+
+def started(program: str, *args: str, path: str = "", **more) -> subprocess.Popen:
+    """The command line as a process of its own, with ``path`` before ours."""
+    places = [path, str(Path(gsjax.__file__).parents[1])]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(places), **more}
+    command = [sys.executable, *PROGRAMS[program], *args]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=env)
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+@pytest.mark.parametrize("module", ["tyro", "jax"])
+def test_ctrl_c_while_importing_is_one_line(module, program, scene, tmp_path):
+    """Even in a module that makes something else of it, as JAX's extensions do."""
+    (tmp_path / f"{module}.py").write_text(
+        "import os, signal, time\n"
+        "try:\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    time.sleep(9)\n"
+        "except BaseException:\n"
+        "    raise ImportError('the extension') from None\n"
+    )
+    process = started(program, "info", str(scene / "scene.ply"), path=str(tmp_path))
+    assert process.communicate() == ("", "gsjax: error: interrupted\n")
+    assert process.returncode == 130
+
+
+@pytest.mark.parametrize("args", [["info"], ["--help"]], ids=lambda args: args[-1])
+def test_who_reads_no_further_is_told_nothing(args, scene):
+    """As `gsjax info … | head` does."""
+    files = [str(scene / "scene.ply")] * (args == ["info"])
+    process = started("module", *args, *files)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    with process.stderr as stderr:
+        assert stderr.read() == ""
+    assert process.wait() == 141
+
+
+def test_what_the_terminal_lacks_is_replaced(scene, tmp_path, monkeypatch):
+    path = tmp_path / "größe.ply"
+    path.write_bytes((scene / "scene.ply").read_bytes())
+    raw = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="ascii"))
+    assert cli.main(["info", str(path)]) == 0
+    assert b"gr??e.ply" in raw.getvalue()
 
 
 def test_import_is_light():

@@ -169,6 +169,36 @@ def test_a_run_with_cameras_is_its_file_with_cameras(demo, tmp_path, capsys):
         assert (first / name).read_bytes() == (second / name).read_bytes()
 
 
+# --- eval ---
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.long
+def test_training_views_are_measured_beside_the_others(demo, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(demo / "run", run)
+    before = contents(run)
+    assert cli.main(["eval", str(run), "--views", "train"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(run / "preview_train.png")
+    after = contents(run)
+    assert {path: after[path] for path in before} == before
+    told = json.loads((run / "eval_train.json").read_text())
+    assert (told["which"], told["views"]) == ("train", PHOTOS - len(HELD_OUT))
+    wanted = [f"{Path(view['name']).stem}.png" for view in told["each"]]
+    assert names(run / "renders_train" / "images") == wanted
+
+
+def test_every_render_has_a_name_of_its_own():
+    from gsjax.train.held_out import _names
+
+    assert _names(["a/1.jpg", "b/1.jpg"]) == ["a/1", "b/1"]
+    for photos in (["1.jpg", "1.png"], ["1.jpg", "1.PNG", "1.jpg.png"], ["A.x", "a.y"]):
+        assert len({name.casefold() for name in _names(photos)}) == len(photos)
+
+
 # --- export, info ---
 
 

@@ -1,10 +1,12 @@
 """The viewer: the browser's numbers, our picture for its camera, pages, live runs."""
 
 import base64
+import contextlib
 import itertools
 import json
 import re
 import shutil
+import socket
 import struct
 import subprocess
 import sys
@@ -22,6 +24,7 @@ from conftest import LIGHT, frustum_points, gaussians_at
 
 import gsjax
 from gsjax import cli
+from gsjax.errors import InputError
 from gsjax.rotations import covariance, quaternion_to_matrix
 from gsjax.scene.types import Photo
 from gsjax.train.config import TrainConfig
@@ -37,7 +40,14 @@ from gsjax.viewer.splats import (
     pack,
     within,
 )
-from gsjax.viewer.stage import UPS, eye_of_cameras, eye_of_gaussians, frusta_of
+from gsjax.viewer.stage import (
+    UPS,
+    eye_of_cameras,
+    eye_of_gaussians,
+    frusta_of,
+    open_server,
+    stop_server,
+)
 
 pytestmark = pytest.mark.usefixtures("quick_compiles")
 
@@ -384,6 +394,24 @@ def test_a_session_cuts_renders_and_moves(window):
     )
     browser.close()
     wait_for(lambda: not window.watched)
+
+
+@pytest.mark.timeout(60)  # viser would wait for ever
+def test_where_nothing_can_be_listened_on():
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    for host in ("192.0.2.1", "no-such-host.invalid", "a..b"):
+        with pytest.raises(InputError, match=f"{host}:8390: cannot be listened on"):
+            open_server(host, 8390)
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # taken by somebody else
+            stack.enter_context(socket.create_server(("127.0.0.1", 65535)))
+        stack.enter_context(pytest.raises(InputError, match="no port from 65535 on"))
+        open_server("127.0.0.1", 65535)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        server = open_server("127.0.0.1", port)
+    assert server.get_port() > port
+    stop_server(server)
 
 
 def test_a_training_is_shown_by_copies_of_its_own():

@@ -46,6 +46,8 @@ class BenchCommand(Command):
         size = None if self.size is None else parse_size(self.size)
         if not 1 <= self.repeats <= 1000:
             raise UsageError(f"--repeats {self.repeats}: from 1 to 1000 is wanted")
+        if self.plot is not None and self.plot.suffix.lower() != ".png":
+            raise UsageError(f"--plot {self.plot}: a name in .png is wanted")
         start_jax()
         from gsjax import files, images
         from gsjax.bench.pareto import front, pareto, points, stages

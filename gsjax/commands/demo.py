@@ -31,8 +31,10 @@ class DemoCommand(Command):
         width, height = parse_size(self.size)
         if min(width, height) < 16:
             raise UsageError(f"--size {self.size}: from 16x16")
-        if self.steps < 1 or not 2 <= self.photos <= 1000:
-            raise UsageError("--steps from 1, --photos from 2 to 1000")
+        if not 1 <= self.steps < 2**31 - 1:
+            raise UsageError(f"--steps {self.steps}: from 1 to {2**31 - 2} is wanted")
+        if not 2 <= self.photos <= 1000:
+            raise UsageError(f"--photos {self.photos}: from 2 to 1000 is wanted")
         if not 0 <= self.seed < 2**31:
             raise UsageError(f"--seed {self.seed}: from 0 to {2**31 - 1} is wanted")
         start_jax()

@@ -28,7 +28,7 @@ class EvalCommand(HeavyCommand):
         from gsjax.train.held_out import evaluate_run
 
         summary = evaluate_run(self.folder, which=self.views)
-        files = run_files(self.folder)
+        files = run_files(self.folder, self.views)
         told = json.loads(files.eval.read_text(encoding="utf-8"))
         if self.json:
             say(json.dumps(told, indent=2))

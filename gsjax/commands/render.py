@@ -51,8 +51,8 @@ class RenderCommand(HeavyCommand):
     """rgb, alpha or depth, or for images several with commas; the first is NAME.png, a
     further one e.g. NAME.depth.png."""
     background: Annotated[str | None, arg(metavar="R,G,B")] = None
-    """Colour behind the scene, each usually 0 to 1; default: that of the run, of a
-    .ply black."""
+    """Colour behind the scene, each from 0 to 1; default: that of the run, of a .ply
+    black."""
     overwrite: bool = False
     """Replace what exists."""
 
@@ -62,6 +62,8 @@ class RenderCommand(HeavyCommand):
         background = None
         if self.background is not None:
             background = parse_background(self.background)
+            if not all(0 <= value <= 1 for value in background):
+                raise UsageError(f"--background {self.background}: each from 0 to 1")
         budget = self._budget()
         movie = self._is_movie(kinds)
         path = self._path()

@@ -10,6 +10,9 @@ RUN/held_out.jsonl    the same by step, where that was asked for
 RUN/renders/          those views
 RUN/preview.png       photograph, render, error and depth of some of them
 RUN/curves.png        PSNR by step
+
+and eval_train.json, renders_train/ and preview_train.png, where the training views were
+measured too.
 """
 
 import json
@@ -87,18 +90,19 @@ class Data(NamedTuple):
     test: list[int]
 
 
-def run_files(folder: Path) -> RunFiles:
-    """Names inside ``folder``."""
+def run_files(folder: Path, which: str = "test") -> RunFiles:
+    """Names inside ``folder``, of the held-out views or those that were trained on."""
+    of_views = "" if which == "test" else f"_{which}"
     return RunFiles(
         config=folder / "config.json",
         metrics=folder / "metrics.jsonl",
         checkpoints=folder / "checkpoints",
         splat=folder / "splat.ply",
         cameras=folder / "cameras.json",
-        eval=folder / "eval.json",
+        eval=folder / f"eval{of_views}.json",
         held_out=folder / "held_out.jsonl",
-        renders=folder / "renders",
-        preview=folder / "preview.png",
+        renders=folder / f"renders{of_views}",
+        preview=folder / f"preview{of_views}.png",
         curves=folder / "curves.png",
     )
 

@@ -31,16 +31,16 @@ _PREVIEWED = 4
 
 
 def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
-    """Evaluate a run anew from its `splat.ply`, and write what `RunFiles` lists.
+    """Evaluate a run anew from its `splat.ply`, and write what `run_files` names.
 
     Args:
       folder: of the run.
-      which: "test", or "train" where nothing was held out.
+      which: "test", or "train", which is kept beside it.
 
     Raises:
       InputError: if there is no run or no such view, or they are masked altogether.
     """
-    settings, files = load_settings(folder), run_files(folder)
+    settings, files = load_settings(folder), run_files(folder, which)
     given = load_data(settings)
     data = refined_data(given, files)
     chosen = data.test if which == "test" else data.train
@@ -90,8 +90,9 @@ def write_evaluation(
     """
     make_folder(files.renders)
     begun, results = time.perf_counter(), []
-    for result in results_of(gaussians, scene, photos, config):
-        path = files.renders / f"{Path(result.name).with_suffix('')}.png"
+    names = _names([view.name for view in scene.views])
+    for name, result in zip(names, results_of(gaussians, scene, photos, config)):
+        path = files.renders / f"{name}.png"
         make_folder(path.parent)
         write_file(path, images.encode_png(images.to_8_bit(result.render)))
         results.append(result)
@@ -108,6 +109,13 @@ def write_evaluation(
     write_json(files.eval, told)
     _write_preview(files, results)
     return summary
+
+
+def _names(photos: list[str]) -> list[str]:
+    """Of the renders: without suffixes, unless two photographs then had one name."""
+    short = [str(Path(name).with_suffix("")) for name in photos]
+    clear = len({name.casefold() for name in short}) == len(short)
+    return short if clear else photos
 
 
 def _told(result: ViewResult) -> dict:

@@ -156,7 +156,8 @@ def start_run(
       DivergedError: as `fit`; the last checkpoint is kept.
     """
     files = run_files(folder)
-    ours = [path for path in files if path.exists()]
+    names = dict.fromkeys((*files, *run_files(folder, "train")))
+    ours = [path for path in names if path.exists()]
     if ours and not overwrite:
         raise InputError(
             f"{ours[0]}: exists; pass --resume to go on, --overwrite to start again, "

@@ -4,6 +4,8 @@ Cameras have OpenCV axes, in gsjax as in viser; fields of view are vertical, rad
 """
 
 import contextlib
+import errno
+import socket
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -93,14 +95,39 @@ def open_server(host: str, port: int) -> Any:
 
     Raises:
       MissingExtraError: as `require_viser`.
-      InputError: if there is no such host, or no free port.
+      InputError: if the host is not this machine, or no port is free.
     """
     viser = require_viser()
     try:
+        free = _free_port(host, port)
         with quiet():
-            return viser.ViserServer(host=host, port=port, label="gsjax", verbose=False)
-    except (OSError, OverflowError) as error:
-        raise InputError(f"{host}:{port}: cannot be listened on: {error}") from error
+            return viser.ViserServer(host=host, port=free, label="gsjax", verbose=False)
+    except (OSError, UnicodeError) as error:
+        raise InputError(
+            f"{host}:{port}: cannot be listened on: {error}; 127.0.0.1 is this machine "
+            "for itself, 0.0.0.0 for others too"
+        ) from error
+
+
+def _free_port(host: str, port: int) -> int:
+    """The first from ``port`` on that can be listened on.
+
+    viser looks for it too; but where there is none, it waits for ever.
+
+    Raises:
+      OSError, UnicodeError: if there is none, or no such host.
+    """
+    flags = socket.AI_PASSIVE
+    found = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=flags)
+    family, (address, *_) = found[0][0], found[0][4]
+    for free in range(port, 2**16):
+        try:
+            with socket.create_server((address, free), family=family):
+                return free
+        except OSError as error:
+            if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+                raise
+    raise OSError(f"no port from {port} on is free")
 
 
 @contextlib.contextmanager
