@@ -274,12 +274,12 @@ def preset(name: str) -> TrainConfig:
 
 def _fast() -> TrainConfig:
     return TrainConfig(
-        steps=1200,
+        steps=1600,
         strategy="mcmc",
         max_size=400,
         levels=(Level(0.0, 2), Level(0.25, 1)),
         sh_degree=1,
-        sh_every=400,
+        sh_every=500,
         # Edits set a run back for a while: few, and early enough to settle after.
         adaptive=AdaptiveSettings(
             start=100,
@@ -292,8 +292,8 @@ def _fast() -> TrainConfig:
         ),
         mcmc=McmcSettings(
             start=100,
-            stop=1000,
-            every=50,
+            stop=1300,
+            every=65,
             growth=1.2,
             max_gaussians=30_000,
             initial_scale=0.5,
