@@ -29,7 +29,7 @@ def test_capacity_of_exactly_the_need():
     exact = COMPAT.replace(pair_capacity=need, visible_capacity=visible)
     assert_same(images(gaussians, camera, exact), wanted)
     given = cast((gaussians, camera), jnp.float32)
-    for size in (1, 64, need // 3, need - 1):
+    for size in (1, need - 1):  # too few for the items, and for the pairs
         out = render(*given, exact.replace(pair_capacity=size), np.float32(BACKGROUND))
         assert out.overflowed
         assert out.demand == wanted.demand

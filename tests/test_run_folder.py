@@ -5,18 +5,25 @@ import shutil
 from pathlib import Path
 
 import jax
-import numpy as np
 import pytest
 from hostile import HOSTILE, harmless, write_hostile
 
+import gsjax.train.run as run_module
 from gsjax import cli
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import InputError
 from gsjax.raster.types import RasterConfig
 from gsjax.train.config import TrainConfig
-from gsjax.train.folder import RunSettings, load_settings
+from gsjax.train.folder import (
+    RunSettings,
+    load_data,
+    load_settings,
+    run_files,
+    save_settings,
+    with_views,
+)
 from gsjax.train.held_out import evaluate_run
-from gsjax.train.run import resume_run, start_run
+from gsjax.train.run import RunResult, resume_run, start_run
 
 pytestmark = pytest.mark.usefixtures("quick_compiles", "float32")
 
@@ -166,14 +173,28 @@ def test_an_option_out_of_its_range(option, whole, tmp_path, capsys):
     assert not run.exists()
 
 
-def test_the_same_options_again_go_on(made, capsys):
+def test_the_same_options_again_go_on(made, monkeypatch):
     """They are the run's own: what the shell's history holds, and --resume."""
-    data, run = str(made / "data"), str(made / "again")
-    args = ["train", data, "-o", run, "--preset", "fast", "--steps", "2"]
-    args += ["--sh-degree", "0", "--max-gaussians", "40", "--test-every", "0"]
-    assert cli.main(args) == 0
-    before = np.frombuffer((made / "again" / "splat.ply").read_bytes(), np.uint8)
-    capsys.readouterr()
-    assert cli.main([*args, "--resume"]) == 0
-    after = np.frombuffer((made / "again" / "splat.ply").read_bytes(), np.uint8)
-    np.testing.assert_array_equal(after, before)
+    data, run = made / "data", made / "again"
+    options = ["--preset", "fast", "--steps", "2", "--max-gaussians", "40"]
+    options += ["--absgrad", "--test-images", "0.png"]
+    trained = []
+
+    def train(settings, folder, **_):
+        trained.append("started")
+        save_settings(folder, with_views(settings, load_data(settings)))
+        return RunResult(run_files(folder), False, 0, 0.0, 0, None)
+
+    def go_on(folder, **_):
+        trained.append("gone on with")
+        return RunResult(run_files(folder), False, 0, 0.0, 0, None)
+
+    monkeypatch.setattr(run_module, "start_run", train)
+    monkeypatch.setattr(run_module, "resume_run", go_on)
+    run.mkdir()
+    args = ["train", str(data), "-o", str(run), *options]
+    assert cli.main(args) == 130
+    assert cli.main([*args, "--resume"]) == 130
+    assert cli.main(["train", str(data), "-o", str(run), "--resume"]) == 130
+    assert trained == ["started", "gone on with", "gone on with"]
+    assert cli.main([*args, "--seed", "1", "--resume"]) == 2
