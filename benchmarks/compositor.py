@@ -30,11 +30,12 @@ from jax.sharding import Mesh, PartitionSpec  # noqa: E402
 
 from gsjax.raster import bins  # noqa: E402
 from gsjax.raster.composite import (  # noqa: E402
-    _alphas,
-    _gather,
-    _pixel_rows,
-    _running_product,
+    alphas,
     composite,
+    gather_chunks,
+    pixel_centres,
+    running_product,
+    splats_of,
 )
 from gsjax.raster.order import depth_order  # noqa: E402
 from gsjax.raster.project import conics_of, project  # noqa: E402
@@ -91,15 +92,15 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
         """[steps] each: evaluations made, and those of them that change the image."""
         ranks = projected.u.shape[0]
         work = bins.make_work(lists, schedule, config.chunk_size, ranks, steps)
-        chunks = _gather(projected, work, schedule.tiles, grid, device, config)
-        pixels = _pixel_rows(grid.tile, projected.u.dtype)
+        chunks = gather_chunks(projected, work, schedule.tiles, grid, device, config)
+        pixels = pixel_centres(grid.tile, projected.u.dtype)
 
         def step(carried, inputs):
             first, live, chunk = inputs
             carried = jnp.where(first, 1, carried)
             go = live & jnp.any(carried > config.stop)
-            alpha = _alphas(chunk, pixels, config)
-            total, before = _running_product(alpha)
+            alpha = alphas(splats_of(chunk), pixels, config)
+            total, before = running_product(alpha)
             reached = carried[:, None] * before
             if config.stop_rule == "before":
                 reached = reached * (1 - alpha)
@@ -132,7 +133,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     weight = jax.random.normal(jax.random.key(1), (camera.height, camera.width, 3))
     training = jax.jit(jax.value_and_grad(render_loss))
     evaluations, contributions = (
-        float(np.sum(number, dtype=np.float64))
+        float(np.sum(np.asarray(number), dtype=np.float64))
         for number in counting(projected, lists, schedule)
     )
     functions = {

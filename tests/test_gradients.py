@@ -21,7 +21,7 @@ from conftest import (
 )
 
 import gsjax
-from gsjax.raster.composite import _running_product, transmittance
+from gsjax.raster.composite import running_product, transmittance
 from gsjax.raster.reference import reference_colors, reference_project
 
 pytestmark = pytest.mark.usefixtures("quick_compiles")
@@ -303,7 +303,7 @@ def test_rule_of_transmittance_is_plain_differentiation(order, report):
             forward = jax.grad(forward)
         return forward(alpha), reverse(alpha)
 
-    for found, wanted in zip(slopes(transmittance), slopes(_running_product)):
+    for found, wanted in zip(slopes(transmittance), slopes(running_product)):
         error = np.linalg.norm(found - wanted) / np.linalg.norm(wanted)
         report(f"transmittance, order {order}", error, 1e-12)
         assert error <= 1e-12

@@ -121,7 +121,7 @@ def tiles_per_step(config: RasterConfig, grid: Grid, platform: str) -> int:
     """G: small keeps a CPU's caches, large keeps launches on accelerators rare."""
     chosen = config.tiles_per_step
     if chosen is None:
-        chosen = 8 if platform == "cpu" else 2048
+        chosen = 16 if platform == "cpu" else 2048
     return max(1, min(chosen, grid.tiles))
 
 

@@ -5,15 +5,17 @@
 Axis legend: S steps, G tiles of a step, K Gaussians of a chunk, P pixels of a tile,
 C channels (colour, then depth where asked for, then ones, whose sum is alpha).
 
-How it is laid out, and why (measured on two cores): the exponent Q = y1² + y2² has
-y1, y2 linear in the pixel. Forward they are part of one elementwise kernel with α;
-backward they are the transpose of a matrix product [P, 3] × [3, K], as is the sum over
-colours both ways. What is left is the running product. Chunks are recomputed in the
-backward pass instead of kept. A chunk behind pixels that have all stopped is skipped,
-in both directions, by `lax.cond`.
+How it is laid out, and why (measured on two cores): α is one elementwise kernel
+forward. Its derivative is α times that of log α, a quadratic polynomial of the pixel:
+so what comes back from the pixels to a Gaussian is six moments, one matrix product
+[G K, P] × [P, 6]. The sums over colours are matrix products both ways, each with its
+operands as XLA wants them. What is left is the running product. Chunks are recomputed
+in the backward pass instead of kept. A chunk behind pixels that have all stopped is
+skipped, in both directions, by `lax.cond`.
 """
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +23,15 @@ import numpy as np
 from jax import lax
 
 from gsjax.raster.bins import Grid, Schedule, Work, tile_origins
-from gsjax.raster.counts import running_total
 from gsjax.raster.types import Array, Projected, RasterConfig
+
+# Columns of a Gaussian's row, in `Chunk.splats`.
+_U, _V, _INV_SX, _SLOPE, _INV_SY, _OPACITY = range(6)
 
 _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
 
-def _running_product(alpha: Array) -> tuple[Array, Array]:
+def running_product(alpha: Array) -> tuple[Array, Array]:
     """(Π over all K, Π over those before k [G, K, P]) of 1 − alpha [G, K, P]."""
     product, before = jnp.ones_like(alpha[:, :1]), []
     for part in _parts(alpha):
@@ -54,13 +58,13 @@ def _parts(values: Array) -> list[Array]:
 
 @jax.custom_jvp
 def transmittance(alpha: Array) -> tuple[Array, Array]:
-    """As `_running_product`, for alpha < 1, with its derivative as a running *sum*.
+    """As `running_product`, for alpha < 1, with its derivative as a running *sum*.
 
     dT_k = −T_k Σ_{j<k} dα_j / (1 − α_j). The transpose of a sum costs half of what
     that of a product does; tested against plain differentiation. The division is
     safe because α is capped below 1.
     """
-    return _running_product(alpha)
+    return running_product(alpha)
 
 
 @transmittance.defjvp
@@ -71,77 +75,188 @@ def _transmittance_jvp(primals, tangents):
     return (total, before), (-total * summed, -before * sums)
 
 
+class Chunk(NamedTuple):
+    """What is blended in a step; all steps together have a leading axis S.
+
+    Attributes:
+      splats: [G, K, 6] rows of u, v, inv_sx, slope, inv_sy, opacity; see `Projected`.
+      channels: [G, K, C] rows of what is summed.
+      corner: [G, 2] upper left corners of the tiles, px.
+      depth: [G, K, 1], or None where no median is asked for.
+      probe: [G, K, 2] zeros that collect the absolute gradient, or None.
+    """
+
+    splats: Array
+    channels: Array
+    corner: Array
+    depth: Array | None
+    probe: Array | None
+
+
+def gather_chunks(
+    projected: Projected, work: Work, tiles: Array, grid: Grid, device: Array, config
+) -> Chunk:
+    """The chunks of all steps, ahead of the loop.
+
+    So that the transpose is one scatter-add and not one a step; and by rows, so that a
+    Gaussian is in one place of memory. Null ranks read zeros, and so have opacity 0.
+    """
+
+    def take(columns):
+        table = jnp.pad(jnp.stack(columns, -1), ((0, 1), (0, 0)))
+        return _take_rows(table, work.ranks)
+
+    outputs = config.outputs
+    channels = list(projected.colors) if "rgb" in outputs else []
+    channels += [projected.depth] if "depth" in outputs else []
+    corner = tile_origins(grid, tiles[work.block], device)
+    return Chunk(
+        splats=take(
+            [
+                projected.u,
+                projected.v,
+                projected.inv_sx,
+                projected.slope,
+                projected.inv_sy,
+                projected.opacity,
+            ]
+        ),
+        channels=take([*channels, jnp.ones_like(projected.u)]),
+        corner=jnp.stack(corner, -1).astype(projected.u.dtype),
+        depth=take([projected.depth]) if "median_depth" in outputs else None,
+        probe=None if projected.probe is None else take(projected.probe),
+    )
+
+
+def splats_of(chunk: Chunk) -> tuple[Array, ...]:
+    """[G, K] each: inv_sx, slope, inv_sy, opacity, and the mean's x, y relative to the
+    corner of the tile.
+
+    Behind a barrier: else every kernel would pick the columns from the rows by itself.
+    """
+    columns = lax.optimization_barrier(jnp.moveaxis(chunk.splats, -1, 0))
+    x = columns[_U] - chunk.corner[:, None, 0]
+    y = columns[_V] - chunk.corner[:, None, 1]
+    kept = (_INV_SX, _SLOPE, _INV_SY, _OPACITY)
+    return *(columns[index] for index in kept), x, y
+
+
+def _offsets(splats: tuple[Array, ...], pixels: np.ndarray) -> tuple[Array, Array]:
+    """y1, y2 [G, K, P] of Gaussians at the pixels [2, P], x and y."""
+    inv_sx, slope, inv_sy, _, x, y = (value[..., None] for value in splats)
+    dx, dy = pixels[0] - x, pixels[1] - y
+    return inv_sx * dx, inv_sy * (dy - slope * dx)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1, 2))
+def alphas(
+    splats: tuple[Array, ...], pixels: np.ndarray, config: RasterConfig
+) -> Array:
+    """α [G, K, P] of Gaussians at the pixels of their tiles.
+
+    Args:
+      splats: [G, K] each: inv_sx, slope, inv_sy, opacity, and the mean's x, y relative
+        to the corner of the tile.
+      pixels: [2, P] x and y, relative to the corner as well.
+      config: its cap and its cut.
+    """
+    y1, y2 = _offsets(splats, pixels)
+    raw = splats[3][..., None] * jnp.exp(-0.5 * (y1 * y1 + y2 * y2))
+    capped = jnp.where(raw < config.alpha_cap, raw, config.alpha_cap)
+    return jnp.where(capped >= config.alpha_cut, capped, 0)
+
+
+def _log_coefficients(half: float, *splats: Array) -> Array:
+    """[G, K, 6]: log α as a polynomial of `_monomials`."""
+    inv_sx, slope, inv_sy, opacity, x, y = splats
+    x, y = x - half, y - half
+    # y1 = a · (x, 1) and y2 = b · (x, y, 1).
+    ax, a1 = inv_sx, -inv_sx * x
+    bx, by, b1 = -inv_sy * slope, inv_sy, -inv_sy * (y - slope * x)
+    log_opacity = jnp.log(jnp.where(opacity > 0, opacity, 1))
+    coefficients = (
+        -0.5 * (ax * ax + bx * bx),
+        -bx * by,
+        -0.5 * by * by,
+        -(ax * a1 + bx * b1),
+        -by * b1,
+        log_opacity - 0.5 * (a1 * a1 + b1 * b1),
+    )
+    return jnp.stack(coefficients, -1)
+
+
+def _monomials(half: float, pixels: np.ndarray) -> np.ndarray:
+    """[6, P]: x², xy, y², x, y, 1 of the pixels, from the middle of the tile: there
+    the terms of a sum cancel least.
+    """
+    x, y = pixels - half
+    return np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)])
+
+
+@alphas.defjvp
+def _alphas_jvp(pixels, config, primals, tangents):
+    """dα = α d(log α); at the cap, and at the tie with it, and below the cut, zero."""
+    alpha = alphas(primals[0], pixels, config)
+    half = config.tile_size / 2
+    polynomial = partial(_log_coefficients, half)
+    _, rate = jax.jvp(polynomial, primals[0], tangents[0])
+    rate = _einsum("gkm,mp->gkp", rate, _monomials(half, pixels))
+    return alpha, jnp.where(alpha < config.alpha_cap, alpha, 0) * rate
+
+
 @jax.custom_vjp
-def _collect_absolute(y1, y2, factors, probe):
-    """(y1, y2) unchanged; ``probe`` receives Σ over pixels of |∂L/∂mean|."""
-    del factors, probe
-    return y1, y2
+def _collect_absolute(alpha: Array, slopes: tuple[Array, Array], probe: Array) -> Array:
+    """α unchanged; ``probe`` [G, K, 2] receives Σ over pixels of |∂L/∂mean|.
+
+    ``slopes`` are those of α by the mean's x and y.
+    """
+    del slopes, probe
+    return alpha
 
 
-def _collect_forward(y1, y2, factors, probe):
-    return (y1, y2), (factors, probe)
+def _collect_forward(alpha, slopes, probe):
+    del probe
+    return alpha, slopes
 
 
-def _collect_backward(residuals, cotangents):
-    (inv_sx, slope, inv_sy), _ = residuals
-    ct1, ct2 = cotangents
-    wide = [f[..., None] for f in (inv_sx, slope, inv_sy)]
-    by_u = -wide[0] * ct1 + wide[2] * wide[1] * ct2
-    by_v = -wide[2] * ct2
-    absolute = jnp.stack([jnp.sum(jnp.abs(g), -1) for g in (by_u, by_v)])
-    zeros = tuple(jnp.zeros_like(f) for f in (inv_sx, slope, inv_sy))
-    return ct1, ct2, zeros, absolute
+def _collect_backward(slopes, cotangent):
+    sums = [jnp.sum(jnp.abs(slope * cotangent), -1) for slope in slopes]
+    return cotangent, jax.tree.map(jnp.zeros_like, slopes), jnp.stack(sums, -1)
 
 
 _collect_absolute.defvjp(_collect_forward, _collect_backward)
 
 
+def _slopes_by_mean(alpha, splats, pixels, config) -> tuple[Array, Array]:
+    """∂α/∂x and ∂α/∂y [G, K, P], the mean's x and y."""
+    inv_sx, slope, inv_sy, *_ = (value[..., None] for value in splats)
+    y1, y2 = _offsets(splats, pixels)
+    free = jnp.where(alpha < config.alpha_cap, alpha, 0)
+    return free * (inv_sx * y1 - inv_sy * slope * y2), free * inv_sy * y2
+
+
 @jax.custom_jvp
-def _offsets(ellipse: tuple[Array, ...], pixels: np.ndarray) -> tuple[Array, Array]:
-    """y1, y2 [G, K, P] of Gaussians at the pixels [3, P], x, y and 1.
+def _channel_sums(weight: Array, channels: Array) -> Array:
+    """Σ_k weight [G, K, P] · channels [G, K, C], as [G, C, P].
 
-    Args:
-      ellipse: [G, K] each: inv_sx, inv_sy, slope, and the mean x, y relative to the
-        tile's corner.
+    The rule is the plain one but for the order of axes: XLA's products are three times
+    as fast where the rows of the left operand are what is summed over, here
+    channels [G, C, K], and [G, K, C] in the transpose.
     """
-    inv_sx, inv_sy, slope, x, y = (value[..., None] for value in ellipse)
-    dx, dy = pixels[0] - x, pixels[1] - y
-    return inv_sx * dx, inv_sy * (dy - slope * dx)
+    columns = lax.optimization_barrier(jnp.swapaxes(channels, 1, 2))
+    return _einsum("gck,gkp->gcp", columns, weight)
 
 
-def _linear_forms(*ellipse: Array) -> tuple[Array, Array]:
-    """[G, 3, K] each, whose products with the pixels are y1 and y2."""
-    inv_sx, inv_sy, slope, x, y = ellipse
-    return (
-        jnp.stack([inv_sx, jnp.zeros_like(x), -inv_sx * x], -2),
-        jnp.stack([-inv_sy * slope, inv_sy, -inv_sy * (y - slope * x)], -2),
-    )
+@_channel_sums.defjvp
+def _channel_sums_jvp(primals, tangents):
+    (weight, channels), (d_weight, d_channels) = primals, tangents
+    by_weight = _einsum("gkp,gkc->gcp", d_weight, channels)
+    by_channels = _einsum("gkp,gkc->gcp", weight, d_channels)
+    return _channel_sums(weight, channels), by_weight + by_channels
 
 
-@_offsets.defjvp
-def _offsets_jvp(primals, tangents):
-    """By matrix products: their transposes sum over the pixels. Those do not vary."""
-    ellipse, pixels = primals
-    _, forms = jax.jvp(_linear_forms, ellipse, tangents[0])
-    by1, by2 = (_einsum("fp,gfk->gkp", pixels, form) for form in forms)
-    return _offsets(ellipse, pixels), (by1, by2)
-
-
-def _alphas(chunk: dict[str, Array], pixels: np.ndarray, config: RasterConfig) -> Array:
-    """α [G, K, P] of a chunk of Gaussians at the pixels [3, P], x, y and 1."""
-    ellipse = tuple(chunk[name] for name in ("inv_sx", "inv_sy", "slope", "x", "y"))
-    y1, y2 = _offsets(ellipse, pixels)
-    if config.absgrad and "probe" in chunk:
-        factors = (chunk["inv_sx"], chunk["slope"], chunk["inv_sy"])
-        y1, y2 = _collect_absolute(y1, y2, factors, chunk["probe"])
-    raw = chunk["opacity"][..., None] * jnp.exp(-0.5 * (y1 * y1 + y2 * y2))
-    # At the tie, and above, the derivative is that of the cap: zero.
-    capped = jnp.where(raw < config.alpha_cap, raw, config.alpha_cap)
-    return jnp.where(capped >= config.alpha_cut, capped, 0)
-
-
-def _composite_chunk(
-    carried: Array, chunk: dict[str, Array], pixels: np.ndarray, config: RasterConfig
+def _blend(
+    carried: Array, chunk: Chunk, pixels: np.ndarray, config: RasterConfig
 ) -> tuple[Array, dict[str, Array]]:
     """Blend one chunk behind the transmittance ``carried`` [G, P].
 
@@ -150,64 +265,24 @@ def _composite_chunk(
       the limit never rises again, so it still tells who has stopped), and the sums
       to add: "sums" [G, C, P], "median" [G, P] where asked for.
     """
-    alpha = _alphas(chunk, pixels, config)
+    splats = splats_of(chunk)
+    alpha = alphas(splats, pixels, config)
+    if chunk.probe is not None:
+        slopes = _slopes_by_mean(*lax.stop_gradient((alpha, splats)), pixels, config)
+        alpha = _collect_absolute(alpha, slopes, chunk.probe)
     # A cap of 1 needs the rule that does not divide.
-    product = transmittance if config.alpha_cap < 1 else _running_product
+    product = transmittance if config.alpha_cap < 1 else running_product
     total, before = product(alpha)
-    reached = carried[:, None] * before
-    if config.stop_rule == "before":
-        blended = lax.stop_gradient(reached * (1 - alpha)) > config.stop
-    else:
-        blended = lax.stop_gradient(reached) > config.stop
-    weight = jnp.where(blended, alpha * reached, 0)
-    out = {"sums": _einsum("gkp,cgk->gcp", weight, chunk["channels"])}
-    if "median_depth" in config.outputs:
-        half = lax.stop_gradient(
-            (reached > 0.5) & (reached * (1 - alpha) <= 0.5) & blended
-        )
-        out["median"] = jnp.sum(jnp.where(half, chunk["depth"][..., None], 0), axis=1)
+    reached = lax.stop_gradient(carried[:, None] * before)
+    behind = lax.stop_gradient(reached * (1 - alpha))
+    blended = (behind if config.stop_rule == "before" else reached) > config.stop
+    # What is carried stands outside: its derivative then needs no sum over Gaussians.
+    sums = _channel_sums(jnp.where(blended, alpha * before, 0), chunk.channels)
+    out = {"sums": carried[:, None] * sums}
+    if chunk.depth is not None:
+        half = (reached > 0.5) & (behind <= 0.5) & blended
+        out["median"] = jnp.sum(jnp.where(half, chunk.depth, 0), axis=1)
     return carried * total, out
-
-
-def _gather(
-    projected: Projected, work: Work, tiles: Array, grid: Grid, device: Array, config
-) -> dict[str, Array]:
-    """Parameters of every chunk, [S, G, K] each, ahead of the loop.
-
-    So that the transpose is one scatter-add and not one a step. Null ranks read
-    zeros: opacity 0, and a position at their tile's corner.
-    """
-
-    def take(values):
-        return values.at[work.ranks].get(mode="fill", fill_value=0)
-
-    corner_x, corner_y = tile_origins(grid, tiles[work.block], device)
-    real = work.ranks < projected.u.shape[0]
-    dtype = projected.u.dtype
-
-    def relative(values, corner):
-        return jnp.where(real, take(values) - corner.astype(dtype)[..., None], 0)
-
-    chunks = {
-        "x": relative(projected.u, corner_x),
-        "y": relative(projected.v, corner_y),
-        "inv_sx": take(projected.inv_sx),
-        "slope": take(projected.slope),
-        "inv_sy": take(projected.inv_sy),
-        "opacity": take(projected.opacity),
-    }
-    channels = [take(c) for c in projected.colors] if "rgb" in config.outputs else []
-    if {"depth", "median_depth"} & set(config.outputs):
-        depth = take(projected.depth)
-        if "depth" in config.outputs:
-            channels.append(depth)
-        if "median_depth" in config.outputs:
-            chunks["depth"] = depth
-    channels.append(jnp.ones_like(chunks["opacity"]))
-    chunks["channels"] = jnp.stack(channels, 1)
-    if projected.probe is not None:
-        chunks["probe"] = jnp.stack([take(p) for p in projected.probe], 1)
-    return chunks
 
 
 def composite(
@@ -224,68 +299,69 @@ def composite(
       "sums" [T, C, P]: colour, depth where asked for, alpha; "median" [T, P] where
       asked for. T in the grid's order.
     """
-    group = schedule.tiles.shape[1]
+    blocks, group = schedule.tiles.shape
     dtype = projected.u.dtype
-    pixels = _pixel_rows(grid.tile, dtype)
+    pixels = pixel_centres(grid.tile, dtype)
     count = pixels.shape[1]
-    chunks = _gather(projected, work, schedule.tiles, grid, device, config)
+    chunks = gather_chunks(projected, work, schedule.tiles, grid, device, config)
 
-    fresh = {"sums": jnp.zeros((group, chunks["channels"].shape[1], count), dtype)}
-    if "median_depth" in config.outputs:
-        fresh["median"] = jnp.zeros((group, count), dtype)
+    nothing = {"sums": jnp.zeros((group, chunks.channels.shape[-1], count), dtype)}
+    if chunks.depth is not None:
+        nothing["median"] = jnp.zeros((group, count), dtype)
 
     # In the branch as well: what the backward pass recomputes there is compiled
     # together with what uses it, and nothing but the inputs crosses the `cond`.
-    blend = jax.checkpoint(partial(_composite_chunk, pixels=pixels, config=config))
+    blend = jax.checkpoint(partial(_blend, pixels=pixels, config=config))
 
     def skip(carried, _):
-        return carried, jax.tree.map(jnp.zeros_like, fresh)
+        return carried, nothing
 
     @jax.checkpoint
     def advance(go, carried, chunk):
         return lax.cond(go, blend, skip, carried, chunk)
 
-    # Every step hands out what its block has summed so far, and the last one of the
-    # block is picked afterwards. An image carried along and updated in place would
-    # be copied at every step of the backward pass.
+    # The image is added to, never overwritten: its cotangent then passes through the
+    # steps of the backward pass unchanged, and is not copied there.
     def step(carry, inputs):
-        carried, summed = carry
-        first, live, chunk = inputs
+        carried, image = carry
+        first, live, block, chunk = inputs
         carried = jnp.where(first, 1, carried)
         go = live & jnp.any(lax.stop_gradient(carried) > config.stop)
         carried, added = advance(go, carried, chunk)
-        summed = jax.tree.map(lambda s, a: jnp.where(first, a, s + a), summed, added)
-        return (carried, summed), summed
 
-    init = (jnp.ones((group, count), dtype), fresh)
-    _, summed = lax.scan(step, init, (work.first, work.live, chunks))
-    step_rows = _last_rows(schedule, grid, work.live.shape[0])
-    return {name: _take_rows(value, step_rows) for name, value in summed.items()}
+        def add(image, more):
+            return image.at[block].add(more, mode="promise_in_bounds")
+
+        return (carried, jax.tree.map(add, image, added)), None
+
+    # One block more than there is: steps that are not live name it.
+    image = {k: jnp.zeros((blocks + 1, *v.shape), dtype) for k, v in nothing.items()}
+    init = (jnp.ones((group, count), dtype), image)
+    steps = (work.first, work.live, work.block, chunks)
+    (_, image), _ = lax.scan(step, init, steps)
+    places = _places(schedule, grid)
+    return {
+        name: _take_rows(value.reshape(-1, *value.shape[2:]), places)
+        for name, value in image.items()
+    }
 
 
-def _last_rows(schedule: Schedule, grid: Grid, steps: int) -> Array:
-    """[T] where the sums of each tile are complete, as a row of [S · G]; past the end
-    for a tile that nothing covers.
-    """
-    group = schedule.tiles.shape[1]
-    last = running_total(schedule.levels) - 1
-    last = jnp.where(schedule.levels > 0, last, steps)
-    rows = last[:, None] * group + lax.iota(jnp.int32, group)
+def _take_rows(table: Array, rows: Array) -> Array:
+    return table.at[rows].get(mode="promise_in_bounds")
+
+
+def _places(schedule: Schedule, grid: Grid) -> Array:
+    """[T] where the blocks hold each tile, as a row of [blocks · G]."""
+    rows = lax.iota(jnp.int32, schedule.tiles.size)
     none = jnp.zeros(grid.tiles, jnp.int32)
-    return none.at[schedule.tiles].set(rows, mode="drop")
+    return none.at[schedule.tiles.ravel()].set(rows, mode="drop")
 
 
-def _take_rows(values: Array, rows: Array) -> Array:
-    """[T, …] of values [S, G, …]; zeros where there is no such row."""
-    flat = values.reshape(-1, *values.shape[2:])
-    return flat.at[rows].get(mode="fill", fill_value=0)
-
-
-def _pixel_rows(tile: int, dtype) -> np.ndarray:
-    """[3, P] rows x, y, 1: pixel centres relative to the tile's corner.
+def pixel_centres(tile: int, dtype) -> np.ndarray:
+    """[2, P] x and y of the pixels of a tile, from its upper left corner.
 
     A constant, each row contiguous: as part of the kernels it costs nothing.
     """
     centre = np.arange(tile) + 0.5
     y, x = np.meshgrid(centre, centre, indexing="ij")
-    return np.stack([x.ravel(), y.ravel(), np.ones(tile * tile)]).astype(dtype)
+    return np.stack([x.ravel(), y.ravel()]).astype(dtype)

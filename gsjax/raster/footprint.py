@@ -18,8 +18,9 @@ from gsjax.raster.types import RasterConfig
 _PAIRS = "for (tile, Gaussian) pairs"
 _GAUSSIANS, _PICTURES = "for projected Gaussians", "for pictures"
 
-# Numbers of a Gaussian in a chunk beside its channels: rank, place, ellipse, opacity.
-_IN_CHUNK = 7
+# Numbers of a Gaussian in a chunk beside its channels: rank, place, ellipse, opacity,
+# and what is made on the way to them.
+_IN_CHUNK = 12
 _IN_LISTS = 4  # of a pair, while it is sorted
 _PROJECTED = 53  # of a Gaussian beside its own numbers, as all stages come to
 # Bytes of a pixel: images and their tiles; with gradients also what SSIM blurs.
@@ -57,10 +58,10 @@ def render_estimate(
     share = -(-capacity // devices)
     rows = group * bins.step_capacity(share, grid, group, config.chunk_size)
     channels = 1 + 3 * ("rgb" in config.outputs) + ("depth" in config.outputs)
-    in_chunk, sums = _IN_CHUNK + channels, channels
-    if gradients:  # with the probe, forward and backward; and what is carried along
-        in_chunk, sums = 2 * (in_chunk + 2), 2 * channels + 1
-    pairs = width * rows * (config.chunk_size * in_chunk + sums * config.tile_size**2)
+    in_chunk, carried = _IN_CHUNK + channels, 0
+    if gradients:  # forward and backward; and the transmittance kept of each step
+        in_chunk, carried = 2 * in_chunk - 2, config.tile_size**2
+    pairs = width * rows * (config.chunk_size * in_chunk + carried)
     numbers = 11 + 3 * bases
     gaussians = seen * (_PROJECTED + numbers * (3 if gradients else 1))
     pixels = size[0] * size[1] * cameras
