@@ -79,3 +79,36 @@ def exp_log_scale(log_scale: Array) -> Array:
     low, high = LOG_SCALE_RANGE
     inside = (log_scale >= low) & (log_scale <= high)
     return jnp.exp(jnp.where(inside, log_scale, jnp.clip(log_scale, low, high)))
+
+
+# 2^f for |f| ≤ 1/2 is 1 + f (c1 + f (c2 + …)), relative error 1e-7: fitted to the
+# smallest largest error, by reweighted least squares.
+_EXP2 = (0.0013264726, 0.009671513, 0.055507336, 0.24022242, 0.693147)
+# Added to a float32 that is an integer below 2^22, it leaves that in the low bits.
+_INTEGER = 1.5 * 2.0**23
+
+
+@jax.custom_jvp
+def exp_negative(x: Array) -> Array:
+    """``exp(x)`` for x ≤ 0, to 1e-6 down to −12 and 4e-6 to −87; 1e-38 below.
+
+    In float32 on a CPU in two thirds of the operations of `jnp.exp`: nothing has to be
+    guarded above, and one term less is enough. Elsewhere it is `jnp.exp`.
+    """
+    if x.dtype != jnp.float32 or jax.default_backend() != "cpu":
+        return jnp.exp(x)
+    power = jnp.maximum(x * np.float32(np.log2(np.e)), -126)
+    whole = jax.lax.round(power, jax.lax.RoundingMethod.TO_NEAREST_EVEN)
+    part = power - whole
+    value = jnp.float32(_EXP2[0])
+    for coefficient in (*_EXP2[1:], 1.0):
+        value = value * part + coefficient
+    exponent = jax.lax.bitcast_convert_type(whole + _INTEGER, jnp.int32) << 23
+    bits = jax.lax.bitcast_convert_type(value, jnp.int32) + exponent
+    return jax.lax.bitcast_convert_type(bits, jnp.float32)
+
+
+@exp_negative.defjvp
+def _exp_negative_jvp(primals, tangents):
+    value = exp_negative(*primals)
+    return value, value * tangents[0]

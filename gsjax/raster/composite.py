@@ -22,11 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from gsjax.numerics import exp_negative
 from gsjax.raster.bins import Grid, Schedule, Work, tile_origins
 from gsjax.raster.types import Array, Projected, RasterConfig
-
-# Columns of a Gaussian's row, in `Chunk.splats`.
-_U, _V, _INV_SX, _SLOPE, _INV_SY, _OPACITY = range(6)
 
 _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
@@ -135,10 +133,9 @@ def splats_of(chunk: Chunk) -> tuple[Array, ...]:
     Behind a barrier: else every kernel would pick the columns from the rows by itself.
     """
     columns = lax.optimization_barrier(jnp.moveaxis(chunk.splats, -1, 0))
-    x = columns[_U] - chunk.corner[:, None, 0]
-    y = columns[_V] - chunk.corner[:, None, 1]
-    kept = (_INV_SX, _SLOPE, _INV_SY, _OPACITY)
-    return *(columns[index] for index in kept), x, y
+    u, v, *kept = (part[0] for part in lax.split(columns, [1] * 6))
+    x, y = u - chunk.corner[:, None, 0], v - chunk.corner[:, None, 1]
+    return *kept, x, y
 
 
 def _offsets(splats: tuple[Array, ...], pixels: np.ndarray) -> tuple[Array, Array]:
@@ -161,7 +158,7 @@ def alphas(
       config: its cap and its cut.
     """
     y1, y2 = _offsets(splats, pixels)
-    raw = splats[3][..., None] * jnp.exp(-0.5 * (y1 * y1 + y2 * y2))
+    raw = splats[3][..., None] * exp_negative(-0.5 * (y1 * y1 + y2 * y2))
     capped = jnp.where(raw < config.alpha_cap, raw, config.alpha_cap)
     return jnp.where(capped >= config.alpha_cut, capped, 0)
 
