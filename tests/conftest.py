@@ -83,6 +83,14 @@ def quick_compiles():
     jax.config.update("jax_disable_most_optimizations", False)
 
 
+@pytest.fixture(scope="module")
+def float32():
+    """As users have it: the tests compute in float64 otherwise."""
+    jax.config.update("jax_enable_x64", False)
+    yield
+    jax.config.update("jax_enable_x64", True)
+
+
 def pytest_collection_modifyitems(items):
     """Modules that compile quickly come first: what is kept changes kind once."""
     quick = {item.path for item in items if "quick_compiles" in item.fixturenames}

@@ -20,6 +20,7 @@ from hostile import HOSTILE, harmless, write_hostile
 import gsjax
 import gsjax.train.fit as fit_module
 import gsjax.train.run as run_module
+import gsjax.train.sitting as sitting_module
 from gsjax import cli, memory
 from gsjax.commands.train import TrainCommand
 from gsjax.densify.adaptive import AdaptiveSettings
@@ -56,14 +57,6 @@ REFUSED = {
     "all behind the cameras": "all 5,000 points lie behind all 2 cameras",
     "all masked": "all 2 photographs are masked altogether",
 }
-
-
-@pytest.fixture(scope="module")
-def float32():
-    """As users have it."""
-    jax.config.update("jax_enable_x64", False)
-    yield
-    jax.config.update("jax_enable_x64", True)
 
 
 @pytest.fixture(scope="module")
@@ -344,7 +337,7 @@ def interrupt(monkeypatch, where, times):
     elif phase == "at the end":
         before(os, "replace", lambda _, to: to.name == "splat.ply")
     else:
-        before(run_module, "write_evaluation")
+        before(sitting_module, "write_evaluation")
 
 
 @pytest.mark.parametrize("where", INTERRUPTED)

@@ -21,7 +21,13 @@ from conftest import (
 )
 
 import gsjax
-from gsjax.raster.composite import running_product, transmittance
+from gsjax.raster.composite import (
+    alphas,
+    channel_sums,
+    pixel_centres,
+    running_product,
+    transmittance,
+)
 from gsjax.raster.reference import reference_colors, reference_project
 
 pytestmark = pytest.mark.usefixtures("quick_compiles")
@@ -282,6 +288,31 @@ def test_gradients_of_a_batch_are_the_sum(report):
             assert error <= 1e-12, (way, name)
 
 
+def slopes_both_ways(function, point, direction, order):
+    """Of a scalar function: derivatives of the order along the direction, forward, and
+    gradients of one order less of it, reverse; flat."""
+
+    def along(function):
+        return lambda point: jax.jvp(function, (point,), (direction,))[1]
+
+    def dot(tree):
+        products = jax.tree.map(lambda a, b: jnp.sum(a * b), tree, direction)
+        return sum(jax.tree.leaves(products))
+
+    forward, reverse = along(function), jax.grad(function)
+    for _ in range(order - 1):
+        forward = along(forward)
+        reverse = jax.grad(lambda point, f=reverse: dot(f(point)))
+    return [jnp.ravel(a) for a in (forward(point), *jax.tree.leaves(reverse(point)))]
+
+
+def assert_same_slopes(name, found, wanted, report, limit=1e-12):
+    for ours, plain in zip(found, wanted, strict=True):
+        error = np.linalg.norm(ours - plain) / np.linalg.norm(plain)
+        report(name, error, limit)
+        assert error <= limit, name
+
+
 @pytest.mark.parametrize("order", [1, 2])
 def test_rule_of_transmittance_is_plain_differentiation(order, report):
     rng = np.random.default_rng(0)
@@ -294,19 +325,66 @@ def test_rule_of_transmittance_is_plain_differentiation(order, report):
             whole, before = product(alpha)
             return jnp.sum(before**2 * weights) + jnp.sum(whole**2 * weights[:, 0])
 
-        def forward(alpha):
-            return jax.jvp(total, (alpha,), (direction,))[1]
+        return slopes_both_ways(total, alpha, direction, order)
 
-        reverse = jax.grad(total)
-        for _ in range(order - 1):
-            reverse = jax.grad(lambda a, f=reverse: jnp.sum(f(a) * direction))
-            forward = jax.grad(forward)
-        return forward(alpha), reverse(alpha)
+    name = f"transmittance, order {order}"
+    found, wanted = slopes(transmittance), slopes(running_product)
+    assert_same_slopes(name, found, wanted, report)
 
-    for found, wanted in zip(slopes(transmittance), slopes(running_product)):
-        error = np.linalg.norm(found - wanted) / np.linalg.norm(wanted)
-        report(f"transmittance, order {order}", error, 1e-12)
-        assert error <= 1e-12
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("tile", [8, 16])
+def test_rule_of_alpha_is_plain_differentiation(tile, order, report):
+    """Of round splats and needles, near and far; at the cap, and cut somewhere."""
+    rng = np.random.default_rng(order)
+    shape, count = (2, 300), 600
+    angle, long = rng.uniform(0, np.pi, count), 10 ** rng.uniform(0, 3, count)
+    short = rng.uniform(0.6, 4, count)
+    along = np.stack([np.cos(angle), np.sin(angle)])
+    place = rng.uniform(0, tile, (2, count)) + along * long * rng.normal(0, 1, count)
+    across = np.stack([-along[1], along[0]])
+    (a, b), (_, c) = np.einsum("s,is,js->ijs", long**2, along, along) + np.einsum(
+        "s,is,js->ijs", short**2, across, across
+    )
+    opacity = rng.uniform(0.1, 1, count)
+    values = (1 / np.sqrt(a), b / a, np.sqrt(a / (a * c - b * b)), opacity, *place)
+    splats = tuple(jnp.asarray(value.reshape(shape)) for value in values)
+    direction = tuple(v * rng.normal(size=shape) for v in splats)
+    pixels = pixel_centres(tile, np.float64)
+    config = COMPAT.replace(tile_size=tile, alpha_cap=0.8)
+    weights = rng.normal(size=(*shape, tile * tile))
+
+    def slopes(function):
+        return slopes_both_ways(
+            lambda splats: jnp.sum(weights * function(splats, pixels, config) ** 2),
+            splats,
+            direction,
+            order,
+        )
+
+    alpha = np.asarray(alphas(splats, pixels, config))
+    assert 0.05 < np.mean(alpha == 0) < 0.95
+    assert np.sum(alpha == config.alpha_cap) > 5
+    name, limit = f"alpha, tile {tile}, order {order}", 1e-11
+    assert_same_slopes(name, slopes(alphas), slopes(alphas.fun), report, limit)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_rule_of_sums_is_plain_differentiation(order, report):
+    rng = np.random.default_rng(0)
+    point = (rng.normal(size=(3, 9, 7)), rng.normal(size=(3, 9, 4)))
+    direction = tuple(rng.normal(size=a.shape) for a in point)
+    weights = rng.normal(size=(3, 4, 7))
+
+    def slopes(sums):
+        def total(point):
+            return jnp.sum(weights * sums(*point) ** 2)
+
+        return slopes_both_ways(total, point, direction, order)
+
+    found = slopes(channel_sums)
+    wanted = slopes(lambda w, c: jnp.einsum("gkp,gkc->gcp", w, c))
+    assert_same_slopes(f"sums, order {order}", found, wanted, report)
 
 
 def test_probe_is_the_gradient_of_the_means_on_screen(report):

@@ -4,7 +4,6 @@ import json
 import shutil
 from pathlib import Path
 
-import jax
 import pytest
 from hostile import HOSTILE, harmless, write_hostile
 
@@ -34,14 +33,6 @@ CONFIG = TrainConfig(
     mcmc=McmcSettings(start=0, stop=0, max_gaussians=60),
     raster=RasterConfig(rungs=1, devices=1, chunk_size=4, occlusion=False),
 )
-
-
-@pytest.fixture(scope="module")
-def float32():
-    """As users have it."""
-    jax.config.update("jax_enable_x64", False)
-    yield
-    jax.config.update("jax_enable_x64", True)
 
 
 @pytest.fixture(scope="module")

@@ -91,7 +91,7 @@ class TrainCommand(HeavyCommand):
             return self._watched() if self.viewer else self._train(None)
         except KeyboardInterrupt:
             from gsjax.train.folder import run_files
-            from gsjax.train.run import saved_text
+            from gsjax.train.sitting import saved_text
 
             note(saved_text(run_files(self.out)))
             raise

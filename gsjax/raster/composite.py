@@ -233,7 +233,7 @@ def _slopes_by_mean(alpha, splats, pixels, config) -> tuple[Array, Array]:
 
 
 @jax.custom_jvp
-def _channel_sums(weight: Array, channels: Array) -> Array:
+def channel_sums(weight: Array, channels: Array) -> Array:
     """Σ_k weight [G, K, P] · channels [G, K, C], as [G, C, P].
 
     The rule is the plain one but for the order of axes: XLA's products are three times
@@ -244,12 +244,12 @@ def _channel_sums(weight: Array, channels: Array) -> Array:
     return _einsum("gck,gkp->gcp", columns, weight)
 
 
-@_channel_sums.defjvp
+@channel_sums.defjvp
 def _channel_sums_jvp(primals, tangents):
     (weight, channels), (d_weight, d_channels) = primals, tangents
     by_weight = _einsum("gkp,gkc->gcp", d_weight, channels)
     by_channels = _einsum("gkp,gkc->gcp", weight, d_channels)
-    return _channel_sums(weight, channels), by_weight + by_channels
+    return channel_sums(weight, channels), by_weight + by_channels
 
 
 def _blend(
@@ -274,7 +274,7 @@ def _blend(
     behind = lax.stop_gradient(reached * (1 - alpha))
     blended = (behind if config.stop_rule == "before" else reached) > config.stop
     # What is carried stands outside: its derivative then needs no sum over Gaussians.
-    sums = _channel_sums(jnp.where(blended, alpha * before, 0), chunk.channels)
+    sums = channel_sums(jnp.where(blended, alpha * before, 0), chunk.channels)
     out = {"sums": carried[:, None] * sums}
     if chunk.depth is not None:
         half = (reached > 0.5) & (behind <= 0.5) & blended

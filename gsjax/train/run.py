@@ -1,25 +1,22 @@
 """A training run from a dataset to its folder: started, gone on with, saved."""
 
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from gsjax.console import decibels, note, stopping_on_ctrl_c
+from gsjax.console import note
 from gsjax.errors import InputError
-from gsjax.evaluation import Summary, summarise
+from gsjax.evaluation import Summary
 from gsjax.files import make_folder
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
-from gsjax.train.checkpoint import load_latest, restore, save_checkpoint
+from gsjax.train.checkpoint import load_latest, restore
 from gsjax.train.config import TrainConfig
 from gsjax.train.fit import (
-    FitResult,
-    Hooks,
     Progress,
     empty_state,
     extent_of,
@@ -28,22 +25,17 @@ from gsjax.train.fit import (
     subset,
 )
 from gsjax.train.folder import (
-    Data,
     RunFiles,
     RunSettings,
     load_data,
     load_settings,
     run_files,
-    save_scene,
     save_settings,
     with_views,
 )
 from gsjax.train.footprint import check_memory
-from gsjax.train.health import is_seen
-from gsjax.train.held_out import results_of, write_evaluation, write_preview
-from gsjax.train.history import Journal, keep_steps, read_metrics, write_curves
-from gsjax.train.refined import refined_photos, refined_scene, save_cameras
-from gsjax.train.report import Reporter
+from gsjax.train.history import keep_steps, read_metrics, write_curves
+from gsjax.train.sitting import Sitting, Start, evaluate, hooks_of, save_result
 from gsjax.train.step import TrainState
 
 
@@ -65,68 +57,6 @@ class RunResult(NamedTuple):
     seconds: float
     gaussians: int
     summary: Summary | None
-
-
-class _Start(NamedTuple):
-    """Where a sitting takes the run up: the beginning, or its last checkpoint."""
-
-    state: TrainState | None = None
-    pair_capacity: int | None = None
-    step: int = 0
-    seconds: float = 0.0
-
-
-class _Sitting:
-    """One sitting of a run: its data, and what is written as it goes.
-
-    Photographs of the held-out views are loaded when they are first measured with.
-    """
-
-    def __init__(self, config: TrainConfig, data: Data, files: RunFiles, start: _Start):
-        self.config, self.data, self.files, self.start = config, data, files, start
-        self.scene = subset(data.scene, data.train)
-        self.metrics, self.measured = Journal(files.metrics), Journal(files.held_out)
-        self._held_out: list[Photo] | None = None
-
-    def seconds(self, progress: Progress | None) -> float:
-        """Of training, all sittings together."""
-        return self.start.seconds + (progress.seconds if progress else 0.0)
-
-    def save(
-        self, state: TrainState, pair_capacity: int, progress: Progress | None
-    ) -> None:
-        """A checkpoint, and before it what was logged: a run that is taken up there
-        logs no step before it again.
-        """
-        self.metrics.write()
-        self.measured.write()
-        meta = {"pair_capacity": pair_capacity, "seconds": self.seconds(progress)}
-        save_checkpoint(self.files.checkpoints, state, meta)
-
-    def cameras(self, state: TrainState) -> Scene:
-        """All views, with their cameras as they are by now."""
-        data, tuning = self.data, state.tuning
-        if tuning.turns is None and tuning.intrinsics is None:
-            return data.scene
-        return refined_scene(data.scene, data.train, tuning, extent_of(self.scene))
-
-    def held_out(self, cameras: Scene) -> tuple[Scene, list[Photo]]:
-        """The held-out views, with these cameras, and their photographs."""
-        given, scene = (subset(s, self.data.test) for s in (self.data.scene, cameras))
-        if self._held_out is None:
-            self._held_out = load_photos(given.views, self.config.max_size)
-        return scene, refined_photos(self._held_out, given.views, scene.views)
-
-    def log_held_out(self, state: TrainState, summary: Summary, seconds: float) -> None:
-        """A line of how well the held-out views are shown."""
-        record = {
-            "step": int(state.step),
-            "seconds": round(seconds, 3),
-            "psnr": summary.psnr,
-            "ssim": summary.ssim,
-            "gaussians": int(np.sum(state.gaussians.active)),
-        }
-        self.measured.add(record)
 
 
 # Given what a training begins with, what is to be done after each step.
@@ -167,7 +97,7 @@ def start_run(
         load_settings(folder)  # refuses what is no run
     data = load_data(settings)
     settings = with_views(settings, data)
-    sitting = _Sitting(settings.config, data, files, _Start())
+    sitting = Sitting(settings.config, data, files, Start())
     photos = _photographs(sitting)
     state = initial_state(sitting.scene, settings.config)
     for path in ours:
@@ -194,24 +124,24 @@ def resume_run(
     settings, files = load_settings(folder), run_files(folder)
     if dataset is not None:
         settings = replace(settings, dataset=dataset)
-    data, start = load_data(settings), _Start()
+    data, start = load_data(settings), Start()
     if dataset is not None:
         save_settings(folder, settings)
         note(f"the run's dataset is now {dataset}")
     if any(files.checkpoints.glob("*.npz")):
         start = _last_checkpoint(files, settings.config, subset(data.scene, data.train))
         note(f"going on from step {start.step}")
-    sitting = _Sitting(settings.config, data, files, start)
+    sitting = Sitting(settings.config, data, files, start)
     photos = _photographs(sitting)
     state = start.state or initial_state(sitting.scene, settings.config)
     return _train(sitting, photos, state, watch)
 
 
-def _last_checkpoint(files: RunFiles, config: TrainConfig, scene: Scene) -> _Start:
+def _last_checkpoint(files: RunFiles, config: TrainConfig, scene: Scene) -> Start:
     found = load_latest(files.checkpoints)
     capacity = int(found.meta["capacity"])
     template = empty_state(config, extent_of(scene), len(scene.views), capacity)
-    return _Start(
+    return Start(
         restore(found, template),
         int(found.meta["pair_capacity"]),
         found.step,
@@ -219,7 +149,7 @@ def _last_checkpoint(files: RunFiles, config: TrainConfig, scene: Scene) -> _Sta
     )
 
 
-def _photographs(sitting: _Sitting) -> list[Photo]:
+def _photographs(sitting: Sitting) -> list[Photo]:
     """Those that are trained on, if there is memory enough for the training."""
     data, config = sitting.data, sitting.config
     note(
@@ -231,13 +161,13 @@ def _photographs(sitting: _Sitting) -> list[Photo]:
 
 
 def _train(
-    sitting: _Sitting, photos: list[Photo], state: TrainState, watch: Watch | None
+    sitting: Sitting, photos: list[Photo], state: TrainState, watch: Watch | None
 ) -> RunResult:
     config, files, scene = sitting.config, sitting.files, sitting.scene
     start = sitting.start
     for path in (files.metrics, files.held_out):
         keep_steps(path, start.step)
-    with _hooks(sitting) as hooks:
+    with hooks_of(sitting) as hooks:
         if watch is not None:
             hooks.state = watch(scene, photos, config)
         result = fit(
@@ -249,9 +179,9 @@ def _train(
             hooks=hooks,
         )
         # Within, so that Ctrl-C does not cut it in two either.
-        _save(sitting, result)
+        save_result(sitting, result)
         finished = int(result.state.step) >= config.steps and not hooks.stop()
-    summary = _evaluate(sitting, result, photos) if finished else None
+    summary = evaluate(sitting, result, photos) if finished else None
     sitting.measured.write()
     metrics, held_out = (read_metrics(p) for p in (files.metrics, files.held_out))
     write_curves(files.curves, metrics, len(photos), held_out)
@@ -263,100 +193,3 @@ def _train(
         gaussians=int(np.sum(result.gaussians.active)),
         summary=summary,
     )
-
-
-@contextmanager
-def _hooks(sitting: _Sitting) -> Iterator[Hooks]:
-    """What is told and written while a run goes on."""
-    config = sitting.config
-    reporter = Reporter(config.steps, sitting.start.step)
-
-    def step(progress: Progress) -> None:
-        reporter.step(progress)
-        record = progress.record()
-        record["seconds"] = round(sitting.seconds(progress), 3)
-        sitting.metrics.add(record)
-
-    def checkpoint(state: TrainState, pair_capacity: int, progress: Progress) -> None:
-        try:
-            sitting.save(state, pair_capacity, progress)
-        except InputError as error:
-            # A full disk costs the checkpoint, not the run; the older ones are kept.
-            note(f"warning: {error}; going on without this checkpoint")
-
-    def measure(state: TrainState, progress: Progress) -> None:
-        scene, photos = sitting.held_out(sitting.cameras(state))
-        if any(map(is_seen, photos)):
-            found = results_of(state.gaussians, scene, photos, config)
-            summary = summarise(list(found))
-            sitting.log_held_out(state, summary, sitting.seconds(progress))
-            note(
-                f"step {int(state.step)}: {len(photos)} held-out views: PSNR "
-                f"{decibels(summary.psnr)}, SSIM {summary.ssim:.4f}"
-            )
-
-    try:
-        with stopping_on_ctrl_c() as stopped:
-            yield Hooks(
-                step=step,
-                phase=reporter.phase,
-                checkpoint=checkpoint,
-                measure=measure,
-                stop=stopped,
-            )
-    finally:
-        reporter.close()
-        with suppress(InputError):  # told of by whatever is to be saved next
-            sitting.metrics.write()
-
-
-def _save(sitting: _Sitting, result: FitResult) -> None:
-    """What a run leaves behind whether or not it came to its end."""
-    files, scene = sitting.files, sitting.data.scene
-    try:
-        sitting.save(result.state, result.pair_capacity, result.progress)
-        save_scene(files.splat, result.gaussians, scene, overwrite=True)
-        cameras = sitting.cameras(result.state)
-        if cameras is not scene:
-            save_cameras(files.cameras, cameras)
-    except InputError as error:
-        raise InputError(f"{error}: {saved_text(files)}") from error
-
-
-def saved_text(files: RunFiles) -> str:
-    """From where a run that was cut short can be gone on with."""
-    kept = sorted(files.checkpoints.glob("step_*.npz"))
-    if kept:
-        step = int(kept[-1].stem.removeprefix("step_"))
-        return f"step {step} is saved; go on with --resume"
-    if files.config.exists():
-        return "no step is saved yet; --resume starts from the beginning"
-    return "nothing is saved yet"
-
-
-def _any_to_measure(sitting: _Sitting) -> bool:
-    if not sitting.data.test:
-        return False
-    _, photos = sitting.held_out(sitting.data.scene)
-    if any(map(is_seen, photos)):
-        return True
-    note("warning: all held-out views are masked altogether: nothing is measured")
-    return False
-
-
-def _evaluate(
-    sitting: _Sitting, result: FitResult, photos: list[Photo]
-) -> Summary | None:
-    """Of the held-out views; where there are none, only the preview is written."""
-    config, data, files = sitting.config, sitting.data, sitting.files
-    cameras = sitting.cameras(result.state)
-    if not _any_to_measure(sitting):
-        scene = subset(cameras, data.train)
-        photos = refined_photos(photos, sitting.scene.views, scene.views)
-        write_preview(files, config, result.gaussians, scene, photos)
-        return None
-    scene, held_out = sitting.held_out(cameras)
-    summary = write_evaluation(files, config, result.gaussians, scene, held_out, "test")
-    if config.every_eval:
-        sitting.log_held_out(result.state, summary, sitting.seconds(result.progress))
-    return summary

@@ -1,0 +1,182 @@
+"""One sitting of a run: its data, and what is told and written as it goes."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import NamedTuple
+
+import numpy as np
+
+from gsjax.console import decibels, note, stopping_on_ctrl_c
+from gsjax.errors import InputError
+from gsjax.evaluation import Summary, summarise
+from gsjax.scene.photos import load_photos
+from gsjax.scene.types import Photo, Scene
+from gsjax.train.checkpoint import save_checkpoint
+from gsjax.train.config import TrainConfig
+from gsjax.train.fit import FitResult, Hooks, Progress, extent_of, subset
+from gsjax.train.folder import Data, RunFiles, save_scene
+from gsjax.train.health import is_seen
+from gsjax.train.held_out import results_of, write_evaluation, write_preview
+from gsjax.train.history import Journal
+from gsjax.train.refined import refined_photos, refined_scene, save_cameras
+from gsjax.train.report import Reporter
+from gsjax.train.step import TrainState
+
+
+class Start(NamedTuple):
+    """Where a sitting takes the run up: the beginning, or its last checkpoint."""
+
+    state: TrainState | None = None
+    pair_capacity: int | None = None
+    step: int = 0
+    seconds: float = 0.0
+
+
+class Sitting:
+    """One sitting of a run: its data, and what is written as it goes.
+
+    Photographs of the held-out views are loaded when they are first measured with.
+    """
+
+    def __init__(self, config: TrainConfig, data: Data, files: RunFiles, start: Start):
+        self.config, self.data, self.files, self.start = config, data, files, start
+        self.scene = subset(data.scene, data.train)
+        self.metrics, self.measured = Journal(files.metrics), Journal(files.held_out)
+        self._held_out: list[Photo] | None = None
+
+    def seconds(self, progress: Progress | None) -> float:
+        """Of training, all sittings together."""
+        return self.start.seconds + (progress.seconds if progress else 0.0)
+
+    def save(
+        self, state: TrainState, pair_capacity: int, progress: Progress | None
+    ) -> None:
+        """A checkpoint, and before it what was logged: a run that is taken up there
+        logs no step before it again.
+        """
+        self.metrics.write()
+        self.measured.write()
+        meta = {"pair_capacity": pair_capacity, "seconds": self.seconds(progress)}
+        save_checkpoint(self.files.checkpoints, state, meta)
+
+    def cameras(self, state: TrainState) -> Scene:
+        """All views, with their cameras as they are by now."""
+        data, tuning = self.data, state.tuning
+        if tuning.turns is None and tuning.intrinsics is None:
+            return data.scene
+        return refined_scene(data.scene, data.train, tuning, extent_of(self.scene))
+
+    def held_out(self, cameras: Scene) -> tuple[Scene, list[Photo]]:
+        """The held-out views, with these cameras, and their photographs."""
+        given, scene = (subset(s, self.data.test) for s in (self.data.scene, cameras))
+        if self._held_out is None:
+            self._held_out = load_photos(given.views, self.config.max_size)
+        return scene, refined_photos(self._held_out, given.views, scene.views)
+
+    def log_held_out(self, state: TrainState, summary: Summary, seconds: float) -> None:
+        """A line of how well the held-out views are shown."""
+        record = {
+            "step": int(state.step),
+            "seconds": round(seconds, 3),
+            "psnr": summary.psnr,
+            "ssim": summary.ssim,
+            "gaussians": int(np.sum(state.gaussians.active)),
+        }
+        self.measured.add(record)
+
+
+@contextmanager
+def hooks_of(sitting: Sitting) -> Iterator[Hooks]:
+    """What is told and written while a run goes on."""
+    config = sitting.config
+    reporter = Reporter(config.steps, sitting.start.step)
+
+    def step(progress: Progress) -> None:
+        reporter.step(progress)
+        record = progress.record()
+        record["seconds"] = round(sitting.seconds(progress), 3)
+        sitting.metrics.add(record)
+
+    def checkpoint(state: TrainState, pair_capacity: int, progress: Progress) -> None:
+        try:
+            sitting.save(state, pair_capacity, progress)
+        except InputError as error:
+            # A full disk costs the checkpoint, not the run; the older ones are kept.
+            note(f"warning: {error}; going on without this checkpoint")
+
+    def measure(state: TrainState, progress: Progress) -> None:
+        scene, photos = sitting.held_out(sitting.cameras(state))
+        if any(map(is_seen, photos)):
+            found = results_of(state.gaussians, scene, photos, config)
+            summary = summarise(list(found))
+            sitting.log_held_out(state, summary, sitting.seconds(progress))
+            note(
+                f"step {int(state.step)}: {len(photos)} held-out views: PSNR "
+                f"{decibels(summary.psnr)}, SSIM {summary.ssim:.4f}"
+            )
+
+    try:
+        with stopping_on_ctrl_c() as stopped:
+            yield Hooks(
+                step=step,
+                phase=reporter.phase,
+                checkpoint=checkpoint,
+                measure=measure,
+                stop=stopped,
+            )
+    finally:
+        reporter.close()
+        with suppress(InputError):  # told of by whatever is to be saved next
+            sitting.metrics.write()
+
+
+def save_result(sitting: Sitting, result: FitResult) -> None:
+    """What a run leaves behind whether or not it came to its end."""
+    files, scene = sitting.files, sitting.data.scene
+    try:
+        sitting.save(result.state, result.pair_capacity, result.progress)
+        save_scene(files.splat, result.gaussians, scene, overwrite=True)
+        cameras = sitting.cameras(result.state)
+        if cameras is not scene:
+            save_cameras(files.cameras, cameras)
+    except InputError as error:
+        raise InputError(f"{error}: {saved_text(files)}") from error
+
+
+def _any_to_measure(sitting: Sitting) -> bool:
+    if not sitting.data.test:
+        return False
+    _, photos = sitting.held_out(sitting.data.scene)
+    if any(map(is_seen, photos)):
+        return True
+    note("warning: all held-out views are masked altogether: nothing is measured")
+    return False
+
+
+def evaluate(
+    sitting: Sitting, result: FitResult, photos: list[Photo]
+) -> Summary | None:
+    """Of the held-out views; where there are none, only the preview is written."""
+    config, data, files = sitting.config, sitting.data, sitting.files
+    cameras = sitting.cameras(result.state)
+    if not _any_to_measure(sitting):
+        scene = subset(cameras, data.train)
+        photos = refined_photos(photos, sitting.scene.views, scene.views)
+        write_preview(files, config, result.gaussians, scene, photos)
+        return None
+    scene, held_out = sitting.held_out(cameras)
+    summary = write_evaluation(files, config, result.gaussians, scene, held_out, "test")
+    if config.every_eval:
+        sitting.log_held_out(result.state, summary, sitting.seconds(result.progress))
+    return summary
+
+
+def saved_text(files: RunFiles) -> str:
+    """From where a run that was cut short can be gone on with."""
+    kept = sorted(files.checkpoints.glob("step_*.npz"))
+    if kept:
+        step = int(kept[-1].stem.removeprefix("step_"))
+        return f"step {step} is saved; go on with --resume"
+    if files.config.exists():
+        return "no step is saved yet; --resume starts from the beginning"
+    return "nothing is saved yet"
