@@ -92,8 +92,8 @@ _INTEGER = 1.5 * 2.0**23
 def exp_negative(x: Array) -> Array:
     """``exp(x)`` for x ≤ 0, to 1e-6 down to −12 and 4e-6 to −87; 1e-38 below.
 
-    In float32 on a CPU in two thirds of the operations of `jnp.exp`: nothing has to be
-    guarded above, and one term less is enough. Elsewhere it is `jnp.exp`.
+    In float32 on a CPU in fewer operations than `jnp.exp`: nothing has to be guarded
+    above, and one term less is enough. Elsewhere it is `jnp.exp`.
     """
     if x.dtype != jnp.float32 or jax.default_backend() != "cpu":
         return jnp.exp(x)

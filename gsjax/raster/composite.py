@@ -236,9 +236,9 @@ def _slopes_by_mean(alpha, splats, pixels, config) -> tuple[Array, Array]:
 def channel_sums(weight: Array, channels: Array) -> Array:
     """Σ_k weight [G, K, P] · channels [G, K, C], as [G, C, P].
 
-    The rule is the plain one but for the order of axes: XLA's products are three times
-    as fast where the rows of the left operand are what is summed over, here
-    channels [G, C, K], and [G, K, C] in the transpose.
+    The rule is the plain one but for the order of axes: XLA's products are faster where
+    the rows of the left operand are what is summed over, here channels [G, C, K], and
+    [G, K, C] in the transpose.
     """
     columns = lax.optimization_barrier(jnp.swapaxes(channels, 1, 2))
     return _einsum("gck,gkp->gcp", columns, weight)

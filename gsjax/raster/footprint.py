@@ -39,7 +39,7 @@ def render_estimate(
 ) -> Estimate:
     """What a render takes beside its inputs, on all devices together.
 
-    Within 1.3 times what XLA reserves, in seven cases of 60 MB to 700 MB a device.
+    Within 1.5 times what XLA reserves, where pairs decide and where Gaussians do.
 
     Args:
       slots: capacity of the Gaussians.

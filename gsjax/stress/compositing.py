@@ -93,8 +93,7 @@ def cap_tie(full: bool) -> Measured:
     cap = np.float32(COMPAT.alpha_cap)
     below = np.nextafter(cap, np.float32(0))
     tie, inside = (float(jax.grad(alpha)(jnp.asarray(o))) for o in (cap, below))
-    right = abs(inside - 1) < 1e-6
-    return Measured(abs(tie) if right else np.nan, f"{inside:g} just below")
+    return Measured(abs(tie) if inside == 1 else np.nan, f"{inside:g} just below")
 
 
 def capacities(full: bool) -> Measured:
