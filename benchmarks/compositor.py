@@ -29,11 +29,10 @@ from jax import lax  # noqa: E402
 from jax.sharding import Mesh, PartitionSpec  # noqa: E402
 
 from gsjax.raster import bins  # noqa: E402
+from gsjax.raster.alpha import alphas, pixel_centres  # noqa: E402
 from gsjax.raster.composite import (  # noqa: E402
-    alphas,
     composite,
     gather_chunks,
-    pixel_centres,
     running_product,
     splats_of,
 )

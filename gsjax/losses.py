@@ -19,7 +19,7 @@ def l1(image: Array, target: Array, weight: Array | None = None) -> Array:
       weight: [H, W], 0 where a pixel is to be left out; or None.
     """
     image, target = seen_only(image, target, weight)
-    return weighted_mean(jnp.mean(jnp.abs(image - target), -1), weight)
+    return weighted_mean(jnp.abs(image - target), weight)
 
 
 def photometric(

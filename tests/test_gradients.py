@@ -21,10 +21,9 @@ from conftest import (
 )
 
 import gsjax
+from gsjax.raster.alpha import alphas, pixel_centres
 from gsjax.raster.composite import (
-    alphas,
     channel_sums,
-    pixel_centres,
     running_product,
     transmittance,
 )

@@ -170,7 +170,10 @@ def _finish(
             # What is not finite would show through wherever the scene is not opaque.
             background = jnp.where(jnp.abs(background) < COLOR_LIMIT, background, 0)
             background = jnp.broadcast_to(background, (cameras, colors))
-            rgb = rgb + (1 - alpha)[..., None] * background[:, None, None]
+            # As a product: its transpose is one too, not a sum over few channels.
+            rgb = rgb + jnp.einsum(
+                "bhw,bc->bhwc", 1 - alpha, background, precision="highest"
+            )
         out["rgb"] = rgb
     if "alpha" in config.outputs:
         out["alpha"] = alpha
