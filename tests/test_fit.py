@@ -31,6 +31,7 @@ import gsjax.train.fit as fit_module
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import CapacityError, DivergedError, InputError
+from gsjax.gaussians import num_active
 from gsjax.train.checkpoint import load_latest, restore, save_checkpoint
 from gsjax.train.config import Level, TrainConfig
 from gsjax.train.fit import (
@@ -215,7 +216,9 @@ def test_too_few_pairs_and_slots_are_grown():
     # Nor does it matter what the caller says may be visible.
     limited = config.replace(raster=config.raster.replace(visible_capacity=2))
     small, log = run(limited, Log(stop_at=6), state=state, pair_capacity=7)
-    large, other = run(config, Log(stop_at=6), state=grow_state(state, 1024))
+    large, other = run(
+        config, Log(stop_at=6), state=grow_state(state, 1024), pair_capacity=4096
+    )
     assert changed(grow_state(small.state, 1024), large.state) == []
     assert log.told("step", "loss", "pairs") == other.told("step", "loss", "pairs")
     assert len(log.records) == 6
@@ -293,10 +296,19 @@ def test_a_photograph_for_each_view():
 
 
 def test_more_room_while_gaussians_are_added():
-    """Fewer programs then: each growth lasts longer."""
-    room = fit_module._Run(scene(), photos(), CONFIG, Hooks()).roomy
-    stop = CONFIG.chosen.stop
-    assert room(1000, stop - 1) > 2 * 1000 > room(1000, stop) > 1000
+    """Fewer programs then: each growth lasts longer. Not for more than may come."""
+
+    first = int(num_active(initial_state(scene(), CONFIG).gaussians))
+
+    def room(step, most):
+        chosen = replace(CONFIG.chosen, max_gaussians=most)
+        config = CONFIG.replace(**{CONFIG.strategy: chosen})
+        state = initial_state(scene(), config).replace(step=jnp.int32(step))
+        return fit_module._Run(scene(), photos(), config, Hooks()).roomy(8000, state)
+
+    stop, many = CONFIG.chosen.stop, 100 * first
+    assert room(stop - 1, many) > 2 * 8000 > room(stop, many) > 8000
+    assert room(stop - 1, first) == room(stop, first)
 
 
 def test_more_pairs_than_can_be_addressed():

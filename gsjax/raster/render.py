@@ -246,16 +246,30 @@ def exact_config(
     Raises:
       CapacityError: as `render_exact`.
     """
+    fitted = _fit(count_demand(gaussians, camera, config, max_capacity), max_capacity)
+    return config.replace(
+        pair_capacity=fitted["pair_capacity"],
+        visible_capacity=min(fitted["visible_capacity"], gaussians.capacity),
+    )
+
+
+def count_demand(
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RasterConfig = DEFAULT_CONFIG,
+    max_capacity: int = 2**30 - 1,
+) -> Demand:
+    """What a view wants, whatever the capacities in ``config``; see `exact_config`.
+
+    Raises:
+      CapacityError: as `render_exact`.
+    """
     light = config.replace(outputs=("alpha",), absgrad=False, rungs=1)
     while True:
         _check_memory(gaussians, camera, light)
         demand, overflowed = _demand_jit(gaussians, camera, light)
         if not bool(overflowed):
-            fitted = _fit(demand, max_capacity)
-            return config.replace(
-                pair_capacity=fitted["pair_capacity"],
-                visible_capacity=min(fitted["visible_capacity"], gaussians.capacity),
-            )
+            return demand
         light = _regrow(light, demand, max_capacity)
 
 

@@ -13,9 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import CapacityError
-from gsjax.gaussians import Gaussians, capacity_bucket, grow, make_gaussians
+from gsjax.gaussians import (
+    Gaussians,
+    capacity_bucket,
+    grow,
+    make_gaussians,
+    num_active,
+)
 from gsjax.memory import require
-from gsjax.raster.render import exact_config
+from gsjax.raster.render import count_demand
 from gsjax.raster.types import RasterConfig
 from gsjax.scene.initialise import init_gaussians, scene_extent
 from gsjax.scene.types import Photo, Scene
@@ -29,7 +35,7 @@ from gsjax.train.step import Metrics, TrainState, init_state, make_train_step
 # Room beyond what is wanted now, so that it lasts for a while.
 _SLOT_MARGIN = 1.3
 # Room for pairs that are not there costs a few ms a step, a new program ten seconds:
-# much while Gaussians are still added, little afterwards.
+# much while Gaussians may still be added, little afterwards.
 _PAIR_MARGIN, _GROWING_MARGIN = 1.5, 2.5
 _MAX_PROBED_VIEWS = 6
 
@@ -227,7 +233,7 @@ class _Run:
             state, metrics = program(state, frames)
             metrics = jax.device_get(metrics)
             if metrics.overflowed:
-                pair_capacity = self.roomy(int(metrics.pair_capacity), step)
+                pair_capacity = self.roomy(int(metrics.pair_capacity), state)
                 continue
             step = int(metrics.step)
             progress = self.progress(metrics, divisor, state)
@@ -267,16 +273,18 @@ class _Run:
         for index in np.unique(few.astype(int)):
             camera = jax.tree.map(lambda a, i=index: a[i], frames.camera)
             # The same settings for each: one program.
-            fitted = exact_config(state.gaussians, camera, config)
-            most = max(most, fitted.pair_capacity or 1)
+            demand = count_demand(state.gaussians, camera, config)
+            most = max(most, int(demand.capacity))
         self.compile_seconds += time.perf_counter() - begun
-        return self.roomy(self.config.batch * most, int(state.step))
+        return self.roomy(self.config.batch * most, state)
 
-    def roomy(self, pairs: int, step: int) -> int:
+    def roomy(self, pairs: int, state: TrainState) -> int:
         """A pair capacity that holds so many, with room to spare where there is."""
-        growing = step < self.config.chosen.stop
-        margin = _GROWING_MARGIN if growing else _PAIR_MARGIN
-        return _roomy(pairs, margin)
+        growth = 1.0
+        if int(state.step) < self.config.chosen.stop:
+            active = max(1, int(num_active(state.gaussians)))
+            growth = max(1.0, self.config.max_gaussians / active)
+        return _roomy(pairs, min(_PAIR_MARGIN * growth, _GROWING_MARGIN))
 
     def program(self, state: TrainState, frames: Frames, raster: RasterConfig):
         """The compiled step for these sizes."""
