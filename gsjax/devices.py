@@ -12,11 +12,15 @@ import ctypes
 import hashlib
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 
 # Programs are a few hundred kB each; a folder of more than this loses its oldest.
 _MAX_KEPT_BYTES = 500_000_000
@@ -77,6 +81,32 @@ def _threads(count: int | None) -> Iterator[None]:
         yield
     finally:
         del os.environ["NPROC"]
+
+
+def spread(work: Callable[..., Any], count: int, *inputs: Any) -> Any:
+    """What ``count`` devices make of the same inputs, each by its number.
+
+    Args:
+      work: (number [1] int32, *inputs) → arrays with a leading axis of 1. Traced once;
+        derivatives go through.
+      count: of local devices, at most.
+      *inputs: whole on every device.
+
+    Returns:
+      The arrays of all, together along that axis, [count, ...].
+    """
+    if count == 1:
+        return work(jnp.zeros(1, jnp.int32), *inputs)
+    mesh = Mesh(np.array(jax.local_devices()[:count]), ("devices",))
+    by_device, whole = PartitionSpec("devices"), PartitionSpec()
+    shared = jax.shard_map(
+        work,
+        mesh=mesh,
+        in_specs=(by_device, *(whole for _ in inputs)),
+        out_specs=by_device,
+        check_vma=False,
+    )
+    return shared(jnp.arange(count, dtype=jnp.int32), *inputs)
 
 
 def keep_memory() -> bool:

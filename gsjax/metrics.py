@@ -10,9 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from gsjax.numerics import safe_divide
+
 Array = jax.Array
 
-_RADIUS, _SIGMA = 5, 1.5
+SSIM_RADIUS, _SIGMA = 5, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
 # Pixels taken at a time: a product with a small banded matrix. On CPU that is faster
 # than with a large one, than eleven shifted sums, and by far than a convolution.
@@ -45,16 +47,22 @@ def seen_only(image: Array, target: Array, weight: Array | None) -> tuple[Array,
 
 
 def weighted_mean(values: Array, weight: Array | None) -> Array:
-    """Mean of [H, W, ...] under weights [H, W]; 0 where all weights are.
+    """Mean of [H, W, ...] under weights [H, W]; 0 where all weights are."""
+    return jnp.mean(values) if weight is None else ratio(*weighted_sum(values, weight))
+
+
+def weighted_sum(values: Array, weight: Array) -> tuple[Array, Array]:
+    """Of [H, W, ...] under weights [H, W], and that of the weights.
 
     In one sum: XLA's sums over the few channels of each pixel are slow on a CPU.
     """
-    if weight is None:
-        return jnp.mean(values)
-    channels = values.size // weight.size
-    total = channels * jnp.sum(weight)
     wide = weight.reshape(*weight.shape, *(1,) * (values.ndim - weight.ndim))
-    return jnp.sum(values * wide) / jnp.where(total > 0, total, 1)
+    return jnp.sum(values * wide), values.size // weight.size * jnp.sum(weight)
+
+
+def ratio(sums: Array, totals: Array) -> Array:
+    """Of sums and what to divide them by; 0 where there is nothing to divide by."""
+    return safe_divide(sums, totals, totals > 0)
 
 
 def ssim(image: Array, target: Array, weight: Array | None = None) -> Array:
@@ -105,9 +113,10 @@ def _blur(planes: Array) -> Array:
 
 def _window() -> np.ndarray:
     """[block, block + 2 · radius]: weights of the pixels of a block and around it."""
-    offset = np.arange(_BLOCK + 2 * _RADIUS) - np.arange(_BLOCK)[:, None] - _RADIUS
+    around = np.arange(-SSIM_RADIUS, _BLOCK + SSIM_RADIUS)
+    offset = around - np.arange(_BLOCK)[:, None]
     weight = np.exp(-0.5 * np.square(offset / _SIGMA))
-    weight = np.where(np.abs(offset) <= _RADIUS, weight, 0)
+    weight = np.where(np.abs(offset) <= SSIM_RADIUS, weight, 0)
     return weight / weight.sum(1, keepdims=True)
 
 
@@ -117,9 +126,9 @@ def _blocks(planes: Array, axis: int) -> Array:
     count = -(-length // _BLOCK)
     blocks = _pad(planes, axis, 0, count * _BLOCK - length)
     blocks = blocks.reshape(*shape[:axis], count, _BLOCK, *shape[axis + 1 :])
-    ends = lax.slice_in_dim(blocks, _BLOCK - _RADIUS, _BLOCK, axis=axis + 1)
+    ends = lax.slice_in_dim(blocks, _BLOCK - SSIM_RADIUS, _BLOCK, axis=axis + 1)
     before = lax.slice_in_dim(ends, 0, count - 1, axis=axis)
-    starts = lax.slice_in_dim(blocks, 0, _RADIUS, axis=axis + 1)
+    starts = lax.slice_in_dim(blocks, 0, SSIM_RADIUS, axis=axis + 1)
     after = lax.slice_in_dim(starts, 1, count, axis=axis)
     parts = [_pad(before, axis, 1, 0), blocks, _pad(after, axis, 0, 1)]
     return jnp.concatenate(parts, axis + 1)

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from gsjax.losses import l1, photometric
+from gsjax.losses import l1, photometric, photometric_spread
 from gsjax.metrics import ssim
 
 
@@ -47,3 +47,36 @@ def test_nothing_to_see_is_no_loss_to_learn_from():
     value, grad = jax.value_and_grad(photometric)(x, y, 0 * weight)
     assert np.isfinite(value)
     assert (grad == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("height", "share", "devices"),
+    [(1, 0.2, 2), (7, 0.2, 2), (30, 0.2, 1), (30, 0.0, 2)],
+)
+def test_spread_over_devices_it_is_the_same(height, share, devices):
+    """Bands of rows, odd ones and such as are less than the window included."""
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(size=(2, 2, height, 14, 3))
+    mask = np.float64(rng.uniform(size=(2, height, 14)) > 0.3)
+    mask[1] = 0
+
+    def total(losses):  # each by its own factor
+        return losses @ np.array([1.0, 2.0])
+
+    def apart(images, weights):
+        axes = (0, 0, None if weights is None else 0)
+        return total(
+            jax.vmap(lambda i, t, w: photometric(i, t, w, share), axes)(
+                images, y, weights
+            )
+        )
+
+    def spread(images, weights):
+        return total(photometric_spread(images, y, weights, share, devices))
+
+    for weights in (mask, None):
+        found, slope = jax.jit(jax.value_and_grad(spread))(x, weights)
+        wanted, wanted_slope = jax.jit(jax.value_and_grad(apart))(x, weights)
+        np.testing.assert_allclose(found, wanted, rtol=1e-12)
+        np.testing.assert_allclose(slope, wanted_slope, atol=1e-15)
+        assert (slope != 0).any()

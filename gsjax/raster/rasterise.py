@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import Mesh, PartitionSpec
 
+from gsjax.devices import spread
 from gsjax.errors import InputError
 from gsjax.gaussians import capacity_bucket
 from gsjax.raster import bins
@@ -42,24 +42,14 @@ def rasterise(
       Images before the background, {"sums": [B, H, W, C], "median": [B, H, W]};
       the demand (``visible`` is left at 0); whether the capacity was too small.
     """
-    devices = _device_count(config)
+    devices = device_count(config)
     grid = bins.make_grid(width, height, config.tile_size, cameras, devices)
     ranks = projected.u.shape[0]
     capacity = config.pair_capacity or default_pair_capacity(ranks, grid)
     share = -(-capacity // devices)
     seen = _unhidden(lax.stop_gradient(projected), cameras, width, height, config)
     local = partial(_rasterise_local, grid=grid, config=config, capacity=share)
-    if devices == 1:
-        images, pairs, wanted = local(jnp.zeros(1, jnp.int32), projected, seen)
-    else:
-        mesh = Mesh(np.array(jax.local_devices()[:devices]), ("tiles",))
-        images, pairs, wanted = jax.shard_map(
-            local,
-            mesh=mesh,
-            in_specs=(PartitionSpec("tiles"), PartitionSpec(), PartitionSpec()),
-            out_specs=PartitionSpec("tiles"),
-            check_vma=False,
-        )(jnp.arange(devices, dtype=jnp.int32), projected, seen)
+    images, pairs, wanted = spread(local, devices, projected, seen)
     images = {name: _untile(image, grid) for name, image in images.items()}
     overflowed = jnp.any(wanted > share)
     wanted = jnp.max(wanted)
@@ -73,7 +63,12 @@ def rasterise(
     return images, demand, overflowed
 
 
-def _device_count(config: RasterConfig) -> int:
+def device_count(config: RasterConfig) -> int:
+    """How many devices share a render.
+
+    Raises:
+      InputError: if there are fewer.
+    """
     there = jax.local_device_count()
     if config.devices is not None and config.devices > there:
         raise InputError(

@@ -19,6 +19,7 @@ from gsjax.raster import bins
 from gsjax.raster.footprint import render_estimate as render_estimate
 from gsjax.raster.order import depth_order
 from gsjax.raster.project import COLOR_LIMIT, project
+from gsjax.raster.rasterise import device_count as device_count
 from gsjax.raster.rasterise import rasterise
 from gsjax.raster.types import Array, Demand, Projected, RasterConfig, Render
 

@@ -14,11 +14,11 @@ from jax import lax
 
 from gsjax.densify.types import Densifier, Observation, apply_edit
 from gsjax.gaussians import Gaussians, num_active
-from gsjax.losses import photometric
+from gsjax.losses import photometric_spread
 from gsjax.metrics import psnr
 from gsjax.numerics import all_within
 from gsjax.optim import adam_step, init_moments, means_rate
-from gsjax.raster.render import render
+from gsjax.raster.render import device_count, render
 from gsjax.raster.types import RasterConfig
 from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Batch
@@ -146,10 +146,9 @@ def make_train_step(
         assert view.rgb is not None
         image = exposed(view.rgb, tuning, batch.view)
         target, weight = targets(batch, background, image.dtype)
-        loss = jax.vmap(
-            lambda i, t, w: photometric(i, t, w, config.ssim_weight),
-            in_axes=(0, 0, None if weight is None else 0),
-        )(image, target, weight)
+        loss = photometric_spread(
+            image, target, weight, config.ssim_weight, device_count(raster)
+        )
         total = jnp.mean(loss)
         if densifier.penalty is not None:
             total += densifier.penalty(gaussians)
