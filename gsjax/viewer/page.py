@@ -21,6 +21,45 @@ from gsjax.viewer.stage import (
 _CAPTION = """<div style="position:fixed;left:12px;bottom:10px;z-index:9;color:#ddd;
 font:13px sans-serif;text-shadow:0 0 3px #000;pointer-events:none">{}</div>"""
 
+# viser sorts its splats in a module worker, which it starts from a blob. A page opened
+# from a disk has no origin; Chromium then starts none from there, and says nothing.
+# From a data URL with the same text it does.
+_WORKERS = """<script>
+(() => {
+  const texts = new Map(), toURL = URL.createObjectURL.bind(URL);
+  const NativeBlob = window.Blob, NativeWorker = window.Worker;
+  const complain = () => {
+    if (document.getElementById("unsorted")) return;
+    const line = document.createElement("div");
+    line.id = "unsorted";
+    line.style = "position:fixed;left:12px;top:10px;z-index:9;color:#f66;" +
+      "font:13px sans-serif";
+    line.textContent = "This browser does not sort the splats of a page from a disk: " +
+      "what is behind shows through. Try another, or gsjax view without --html.";
+    document.body.append(line);
+  };
+  window.Blob = class extends NativeBlob {
+    constructor(parts, options) {
+      super(parts, options);
+      if (parts?.every((part) => typeof part === "string")) this.text_ = parts.join("");
+    }
+  };
+  URL.createObjectURL = (object) => {
+    const url = toURL(object);
+    if (object.text_ !== undefined) texts.set(url, object.text_);
+    return url;
+  };
+  window.Worker = class extends NativeWorker {
+    constructor(url, options) {
+      const text = window.origin === "null" ? texts.get(String(url)) : undefined;
+      const data = "data:text/javascript;charset=utf-8,";
+      super(text === undefined ? url : data + encodeURIComponent(text), options);
+      this.addEventListener("error", complain);
+    }
+  };
+})();
+</script>"""
+
 
 class Page(NamedTuple):
     """What was written: Gaussians drawn, of how many, and bytes."""
@@ -70,6 +109,7 @@ def write_page(exhibit: Exhibit, path: Path, *, title: str) -> Page:
         "from all sides (SH degree 0), drawn by viser; gsjax"
     )
     head, tail = text.rsplit("</body>", 1)
+    head = head.replace("<head>", f"<head>{_WORKERS}", 1)
     head = head.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>")
     data = f"{head}{_CAPTION.format(caption)}</body>{tail}".encode()
     files.make_folder(path.parent)
