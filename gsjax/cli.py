@@ -9,13 +9,14 @@ line, unless --debug asks for the traceback.
 import contextlib
 import io
 import os
-import re
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
+from functools import reduce
 from importlib import import_module
+from operator import or_
 from typing import Annotated, Any
 
 from gsjax.console import one_line, warnings_as_lines
@@ -115,10 +116,8 @@ def _report(message: str, code: int, debug: bool) -> int:
     return code
 
 
-def _commands() -> Any:
-    """The type that tyro reads; not imported before Ctrl-C is told in one line."""
-    from tyro.conf import subcommand
-
+def _commands() -> dict[str, type]:
+    """By their names; not imported before Ctrl-C is told in one line."""
     from gsjax.commands.bench import BenchCommand
     from gsjax.commands.demo import DemoCommand
     from gsjax.commands.doctor import DoctorCommand
@@ -131,19 +130,19 @@ def _commands() -> Any:
     from gsjax.commands.train import TrainCommand
     from gsjax.commands.view import ViewCommand
 
-    return (
-        Annotated[DemoCommand, subcommand("demo")]
-        | Annotated[SfmCommand, subcommand("sfm")]
-        | Annotated[TrainCommand, subcommand("train")]
-        | Annotated[EvalCommand, subcommand("eval")]
-        | Annotated[RenderCommand, subcommand("render")]
-        | Annotated[ViewCommand, subcommand("view")]
-        | Annotated[ExportCommand, subcommand("export")]
-        | Annotated[InfoCommand, subcommand("info")]
-        | Annotated[BenchCommand, subcommand("bench")]
-        | Annotated[DoctorCommand, subcommand("doctor")]
-        | Annotated[StressCommand, subcommand("stress")]
-    )
+    return {
+        "demo": DemoCommand,
+        "sfm": SfmCommand,
+        "train": TrainCommand,
+        "eval": EvalCommand,
+        "render": RenderCommand,
+        "view": ViewCommand,
+        "export": ExportCommand,
+        "info": InfoCommand,
+        "bench": BenchCommand,
+        "doctor": DoctorCommand,
+        "stress": StressCommand,
+    }
 
 
 def _parse(argv: list[str]):
@@ -156,12 +155,17 @@ def _parse(argv: list[str]):
     import tyro
 
     from gsjax.commands.common import UsageError
+    from gsjax.commands.usage import explained
 
-    told = io.StringIO()
+    commands, told = _commands(), io.StringIO()
+    named = [
+        Annotated[kind, tyro.conf.subcommand(name)] for name, kind in commands.items()
+    ]
+    any_of_them: Any = reduce(or_, named)
     try:
         with contextlib.redirect_stderr(told):
             return tyro.cli(
-                _commands(),
+                any_of_them,
                 prog="gsjax",
                 description="3D Gaussian splatting in pure JAX. "
                 "gsjax --version prints the version.",
@@ -171,28 +175,7 @@ def _parse(argv: list[str]):
     except SystemExit as exit_:
         if exit_.code in (0, None):
             raise
-        raise UsageError(_unboxed(told.getvalue())) from None
-
-
-def _unboxed(text: str) -> str:
-    """The messages in tyro's boxes, without frames, colours and advice."""
-    text = re.sub(r"\x1b\[[0-9;]*m", "", text)
-    lines = [line.strip(" │|") for line in text.splitlines()]
-    lines = ["" if re.match("[╭╰─]|[+-]{3}", line) else line for line in lines]
-    parts = [one_line(part) for part in "\n".join(lines).split("\n\n")]
-    advice = ("For full helptext", "Argument helptext")
-    parts = [part for part in parts if part and not part.startswith(advice)]
-    return f"{_shortened('; '.join(parts)) or 'wrong usage'}; see gsjax --help"
-
-
-def _shortened(text: str) -> str:
-    """Of a value that is no number, only what it is and which kind is wanted."""
-    why = r"(?:literal for (int)\(\) with base 10|convert string to (float)): (.+)"
-    found = re.search(rf"Error parsing (\S+): .*{why}", text)
-    if found is None:
-        return text
-    option, whole, _, value = found.groups()
-    return f"{option} {value}: a {'whole ' if whole else ''}number is wanted"
+        raise UsageError(explained(told.getvalue(), argv, commands)) from None
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsjax import images
 from gsjax.cameras import make_camera, resize_camera
-from gsjax.console import progress
+from gsjax.console import note, progress
 from gsjax.gaussians import Gaussians
 from gsjax.movies import check_movie, write_movie
 from gsjax.scene import paths
@@ -26,6 +26,7 @@ from gsjax.views import prepared, rendered
 
 PATHS = ("test", "train", "orbit", "spiral", "interpolate")
 MOVIE_SUFFIXES = (".gif", ".webp", ".webm")
+_WIDEST_GAP = 120.0  # degrees of an orbit without a camera
 _SAMPLED = 4000  # points, or Gaussians, to look at for a range of depths
 
 
@@ -133,7 +134,14 @@ def _flight(
         "spiral": paths.spiral,
         "interpolate": paths.interpolate,
     }[path]
-    flown = fly(viewmats, frames, depth=_depth_ahead(scene))
+    depth = _depth_ahead(scene)
+    unseen = paths.unseen_angle(viewmats, depth=depth)
+    if path == "orbit" and unseen > _WIDEST_GAP:
+        note(
+            f"warning: {unseen:.0f}° of the orbit are on sides that no camera saw, and "
+            "look accordingly; --path interpolate or spiral stay where the cameras were"
+        )
+    flown = fly(viewmats, frames, depth=depth)
     lens = paths.median_intrinsics([_as_trained(v, max_size) for v in scene.views])
     return [_entry(f"frame_{n:04d}", pose, lens) for n, pose in enumerate(flown, 1)]
 

@@ -5,16 +5,15 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.io import load
 from gsjax.raster.types import RasterConfig
 from gsjax.scene.types import Scene
 from gsjax.train.folder import (
     background_of,
+    finished_splat,
     load_scene,
     load_settings,
-    run_files,
 )
 
 PRESETS = {
@@ -54,13 +53,7 @@ def splat_file(path: Path) -> Path:
     if not is_run(path):
         return path
     load_settings(path)
-    splat = run_files(path).splat
-    if not splat.exists():
-        raise InputError(
-            f"{splat}: missing; the run did not come to an end: go on with it, "
-            "gsjax train DATASET -o RUN --resume"
-        )
-    return splat
+    return finished_splat(path)
 
 
 def open_subject(

@@ -181,7 +181,21 @@ BAD = {
     "ply": (3, bad_ply, "end_header"),
     "folder": (3, folder_is_file, "cannot be made a folder"),
     "suffix": (3, lambda _s, _t: ["info", "a.spz"], "no known format"),
-    "command": (2, lambda _s, _t: ["paint"], "paint"),
+    "command": (2, lambda _s, _t: ["xyz"], "xyz: no such command; there are demo"),
+    "like a command": (2, lambda _s, _t: ["rendr", "x"], "did you mean render?; see"),
+    "like an option": (
+        2,
+        lambda _s, _t: ["train", "a", "-o", "b", "--step", "9"],
+        "error: --step: no such option; did you mean --steps?; see gsjax train --help",
+    ),
+    "two things": (
+        2,
+        lambda _s, _t: ["train", "a", "--prest", "fast"],
+        "did you mean --preset?; -o RUN, --out RUN is missing; see gsjax train --help",
+    ),
+    "too many": (2, lambda _s, _t: ["info", "a", "b"], "error: b: not expected; see"),
+    "no value": (2, lambda _s, _t: ["info", "a", "--plot"], "'--plot'"),
+    "no command": (2, lambda _s, _t: ["--foo"], "no such option without a command"),
     "option": (2, lambda s, _t: ["info", str(s / "scene.ply"), "--foo"], "foo"),
     "no cameras": (2, lambda _s, t: ["render", "a.ply", "-o", str(t)], "--cameras"),
     "missing option": (2, lambda _s, _t: ["render", "a.ply"], "--out"),
@@ -200,17 +214,17 @@ BAD = {
     "count": (
         2,
         lambda _s, _t: ["train", "a", "-o", "b", "--steps", "nan"],
-        "error: --steps 'nan': a whole number is wanted; see gsjax --help",
+        "error: --steps 'nan': a whole number is wanted; see gsjax train --help",
     ),
     "whole": (
         2,
         lambda _s, _t: ["demo", "--seed", "1.5"],
-        "error: --seed '1.5': a whole number is wanted; see gsjax --help",
+        "error: --seed '1.5': a whole number is wanted; see gsjax demo --help",
     ),
     "number": (
         2,
         lambda s, t: render_args(s, t, "--fps", "fast"),
-        "error: --fps 'fast': a number is wanted; see gsjax --help",
+        "error: --fps 'fast': a number is wanted; see gsjax render --help",
     ),
 }
 

@@ -102,6 +102,16 @@ def test_orbit_of_a_ring_is_the_ring(up, turn):
     np.testing.assert_allclose(steps, steps[0], rtol=1e-9)  # and so it closes
 
 
+@pytest.mark.parametrize("up", [(0, 0, 1), (0.3, 0.5, -0.8)])
+def test_how_much_of_an_orbit_no_camera_sees(up):
+    def unseen(*ring_of, **how):
+        return paths.unseen_angle(ring(*ring_of, up=up, **how))
+
+    assert unseen(12) == pytest.approx(30)
+    assert unseen(4, turn=1.0) == pytest.approx(360 - np.degrees(0.75))
+    assert unseen(1) == pytest.approx(360)
+
+
 def test_orbit_takes_mean_elevation_and_median_distance():
     cameras = np.concatenate([ring(8, 0.2, 2.0), ring(8, 0.6, 3.0), ring(8, 0.7, 9.0)])
     offsets = centres(paths.orbit(cameras, 7)) - TARGET

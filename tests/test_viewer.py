@@ -158,6 +158,8 @@ def test_where_one_looks_from(up):
     means = np.asarray(scene().params.means)
     np.testing.assert_allclose(eye.target, np.median(means, axis=0), atol=1.0)
     assert (eye.position - eye.target) @ UPS[up] > 0
+    if up in ("-y", "+y"):  # on the side from which COLMAP's, and OpenGL's, look
+        assert (eye.position - eye.target)[2] * UPS[up][1] > 0
     frusta = frusta_of(training.scene().views)
     eye = eye_of_cameras(frusta)
     view = gsjax.look_at(eye.position, eye.target, eye.up)
@@ -459,13 +461,16 @@ def test_a_training_is_shown_by_copies_of_its_own():
         return np.asarray(viewer.window.exhibit.gaussians.params.means)
 
     first = after(1)
-    after(2)  # nobody looks, and it is too early: no copy
+    after(2)  # it is too early: no copy
     np.testing.assert_array_equal(shown(), first)
+    viewer.due = 0.0
+    second = after(2)  # nobody looks: whoever comes then finds it
+    np.testing.assert_array_equal(shown(), second)
     browser = Browser(viewer.window.url)
     wait_for(lambda: viewer.window.watched)
     viewer.due = time.monotonic() + 60
-    after(3)  # too early still
-    np.testing.assert_array_equal(shown(), first)
+    after(3)  # too early again
+    np.testing.assert_array_equal(shown(), second)
     viewer.due = 0.0
     fourth = after(4)
     np.testing.assert_array_equal(shown(), fourth)

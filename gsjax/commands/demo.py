@@ -61,6 +61,7 @@ class DemoCommand(Command):
             f"SSIM {summary.ssim:.4f}"
         )
         note("done; next, try")
+        note(f"  gsjax view {files.run}")
         note(f"  gsjax info {files.run}")
         note(f"  gsjax render {files.run} --path test -o {self.out / 'views'}")
         note(f"  gsjax export {files.run} {self.out / 'scene.ply'} --min-opacity 0.01")

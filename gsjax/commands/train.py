@@ -139,6 +139,10 @@ class TrainCommand(HeavyCommand):
             )
         say(line)
         say(str(result.files.preview))
+        note("next: look at it, fly through it, see how it went")
+        note(f"  gsjax view {self.out}")
+        note(f"  gsjax render {self.out} --path interpolate -o {self.out}/flight.webm")
+        note(f"  gsjax info {self.out}")
         return 0
 
     def _refuse_other(self, settings) -> None:

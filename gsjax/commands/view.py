@@ -23,7 +23,7 @@ class ViewCommand(HeavyCommand):
     html: Annotated[Path | None, arg(metavar="OUT.html")] = None
     """Write one page that opens offline instead of serving."""
     min_opacity: float = 0.0
-    """Leave out Gaussians of a lower opacity."""
+    """Leave out Gaussians of a lower opacity; below 0.01 nothing is drawn anyway."""
     max_gaussians: int | None = None
     """At most that many in the browser, the largest and most opaque first."""
     no_photos: bool = False
@@ -73,11 +73,15 @@ class ViewCommand(HeavyCommand):
     def _write(self, path: Path, exhibit, views) -> int:
         from gsjax.viewer.opening import photographed
         from gsjax.viewer.page import write_page
+        from gsjax.viewer.splats import LEAST_OPACITY
 
         if views:
             exhibit.frusta = photographed(views, _PHOTO_OF_PAGE)
         page = write_page(exhibit, path, title=self.scene.stem)
         less = f" of {page.found:,}" if page.drawn < page.found else ""
+        faint = max(self.min_opacity, LEAST_OPACITY)
+        if less and self.max_gaussians is None:
+            note(f"left out: {page.found - page.drawn:,} of opacities below {faint:g}")
         cameras = f", {len(exhibit.frusta)} cameras" if exhibit.frusta else ""
         say(
             f"{path}  {page.drawn:,}{less} Gaussians{cameras}, "

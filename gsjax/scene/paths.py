@@ -129,6 +129,23 @@ def orbit(viewmats, frames: int, *, depth: float | None = None) -> np.ndarray:
     return np.stack([look_at(focus + distance * eye, focus, up) for eye in eyes])
 
 
+def unseen_angle(viewmats, *, depth: float | None = None) -> float:
+    """Degrees of an `orbit` between those cameras that stand farthest apart on it.
+
+    360 where all stand in one direction, as a single camera does.
+
+    Raises:
+      InputError: as `focus_point`.
+    """
+    centres, _ = _centres_and_axes(viewmats)
+    offsets = centres - focus_point(viewmats, depth)
+    up = up_direction(viewmats)
+    across = np.cross(np.eye(3)[np.abs(up).argmin()], up)
+    angles = np.arctan2(offsets @ np.cross(up, across), offsets @ across)
+    angles = np.sort(angles)
+    return float(np.degrees(np.diff(angles, append=angles[0] + 2 * np.pi).max()))
+
+
 def spiral(
     viewmats, frames: int, *, turns: int = 2, depth: float | None = None
 ) -> np.ndarray:

@@ -293,7 +293,7 @@ class _Run:
             height, width = frames.pixels.shape[1:3]
             slots, pairs = state.gaussians.capacity, raster.pair_capacity
             told = f"{width} × {height} px, {slots:,} slots, {pairs:,} pairs"
-            self.hooks.phase(f"compiling for {told}")
+            self.hooks.phase(f"compiling, half a minute or so, for {told}")
             nbytes = frames.pixels.nbytes
             require(
                 step_estimate(slots, (width, height), self.config, raster, nbytes),

@@ -32,6 +32,7 @@ from gsjax.scene.dataset import load_dataset
 from gsjax.scene.splits import split_views
 from gsjax.scene.types import Scene
 from gsjax.train.config import TrainConfig, check_kinds, from_json, to_json
+from gsjax.train.history import read_metrics
 from gsjax.train.refined import with_cameras
 
 _FORMAT = 1
@@ -233,6 +234,25 @@ def save_scene(
         means = np.asarray(gaussians.params.means, np.float64) + scene.origin
         params = gaussians.params.replace(means=means)  # pyright: ignore
         save(path, gaussians.replace(params=params), overwrite=overwrite)  # pyright: ignore
+
+
+def finished_splat(folder: Path) -> Path:
+    """The Gaussians of a run that has come to its end.
+
+    Raises:
+      InputError: if it has not, with how far it is.
+    """
+    files = run_files(folder)
+    if not files.splat.exists():
+        settings = load_settings(folder)
+        lines = read_metrics(files.metrics)
+        done = lines[-1]["step"] if lines else 0
+        raise InputError(
+            f"{folder}: no scene yet, at step {done:,} of {settings.config.steps:,}: "
+            "wait for its end; or, if it was stopped, go on with gsjax train "
+            f"{settings.dataset} -o {folder} --resume"
+        )
+    return files.splat
 
 
 def load_scene(path: Path, scene: Scene) -> Gaussians:

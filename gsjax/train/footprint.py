@@ -133,8 +133,8 @@ def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) ->
     free = available()
     told = "" if free is None else f"; {size_text(free)} is free"
     note(
-        f"memory: about {size_text(now.total)} at first, {size_text(then)} with "
-        f"{most:,} Gaussians{told}"
+        f"memory: about {size_text(now.total)} for {count:,} Gaussians, "
+        f"{size_text(then)} for {most:,}, which is the most there may be{told}"
     )
     require(now, "this run", "lower --max-size or --max-gaussians")
     if free is not None and then > free:

@@ -18,6 +18,7 @@ from gsjax.train.fit import subset
 from gsjax.train.folder import (
     RunFiles,
     background_of,
+    finished_splat,
     load_data,
     load_scene,
     load_settings,
@@ -49,7 +50,7 @@ def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
             f"no {which} views in this run; evaluate the others with --views "
             f"{'train' if which == 'test' else 'test'}"
         )
-    gaussians = load_scene(files.splat, data.scene)
+    gaussians = load_scene(finished_splat(folder), data.scene)
     scene = subset(data.scene, chosen)
     before = subset(given.scene, chosen).views
     photos = load_photos(before, settings.config.max_size)

@@ -5,28 +5,34 @@ import time
 from typing import Any
 
 from gsjax.console import note
+from gsjax.train.config import TrainConfig
 from gsjax.train.fit import Progress
 
-_LINE_SECONDS = 10.0
+_LINE_SECONDS, _BAR_SECONDS = 10.0, 1.0
 _SMOOTH = 0.05
 
 
 class Reporter:
-    """Shows the steps of one run of ``steps``."""
+    """Shows the steps of one run, of which ``done`` lie behind it."""
 
-    def __init__(self, steps: int, done: int = 0):
-        self.steps = steps
+    def __init__(self, config: TrainConfig, done: int = 0):
+        self.config, self.steps = config, config.steps
         self.bar: Any = None
         if sys.stderr.isatty():
             from tqdm import tqdm
 
+            # tqdm's own guess of the time left takes all steps for alike.
             self.bar = tqdm(
-                total=steps, initial=done, desc="training", unit="step", leave=False,
-                dynamic_ncols=True, smoothing=_SMOOTH,
+                total=self.steps, initial=done, desc="training", leave=False,
+                dynamic_ncols=True,
+                bar_format="{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} "
+                "[{elapsed}{postfix}]",
             )  # fmt: skip
         self.loss = self.psnr = float("nan")
         self.last = time.monotonic()
         self.rate_from = (done, 0.0)
+        self.rate = float("nan")
+        self.compiled: list[float] = []  # seconds by then, after each compilation
 
     def phase(self, text: str) -> None:
         """Say that something begins that takes a while."""
@@ -37,27 +43,40 @@ class Reporter:
         metrics = progress.metrics
         self.loss = _smoothed(self.loss, float(metrics.loss))
         self.psnr = _smoothed(self.psnr, float(metrics.psnr))
-        told = (
-            f"loss {self.loss:.4f}, {self.psnr:.2f} dB, "
-            f"{int(metrics.gaussians):,} Gaussians"
-        )
-        if self.bar is not None:
-            self.bar.set_postfix_str(told, refresh=False)
-            self.bar.update(1)
-            return
+        if [progress.compile_seconds] != self.compiled[-1:]:
+            self.compiled.append(progress.compile_seconds)
         now, step = time.monotonic(), int(metrics.step)
-        if step < self.steps and now < self.last + _LINE_SECONDS:
+        if self.bar is not None:
+            self.bar.update(1)
+        pause = _LINE_SECONDS if self.bar is None else _BAR_SECONDS
+        if step < self.steps and now < self.last + pause:
             return
         self.last = now
         working = progress.seconds - progress.compile_seconds
         before, then = self.rate_from
-        rate = (step - before) / max(working - then, 1e-9)
+        self.rate = (step - before) / max(working - then, 1e-9)
         self.rate_from = (step, working)
-        left = (self.steps - step) / max(rate, 1e-9)
-        note(
-            f"step {step}/{self.steps}: {told}, {rate:.1f} steps/s, "
-            f"{_clock(progress.seconds)} gone, {_clock(left)} left"
+        told = (
+            f"loss {self.loss:.4f}, {self.psnr:.2f} dB, "
+            f"{int(metrics.gaussians):,} Gaussians, {self.rate:.1f} steps/s"
         )
+        left = f"{_clock(self.left(step))} left"
+        if self.bar is not None:
+            self.bar.set_postfix_str(f"{left}, {told}", refresh=False)
+            return
+        note(
+            f"step {step}/{self.steps}: {told}, {_clock(progress.seconds)} gone, {left}"
+        )
+
+    def left(self, step: int) -> float:
+        """Seconds to come, about: a step takes as long as it has pixels, and where
+        pictures become larger there is a program to compile."""
+        divisors = [self.config.divisor(s) for s in range(max(step - 1, 0), self.steps)]
+        here, ahead = divisors[0], divisors[1:]
+        work = sum((here / divisor) ** 2 for divisor in ahead)
+        programs = len({divisor for divisor in ahead if divisor != here})
+        each = self.compiled[-1] / len(self.compiled) if self.compiled else 0.0
+        return work / max(self.rate, 1e-9) + programs * each
 
     def close(self) -> None:
         """Take the bar away."""

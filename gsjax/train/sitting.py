@@ -89,7 +89,7 @@ class Sitting:
 def hooks_of(sitting: Sitting) -> Iterator[Hooks]:
     """What is told and written while a run goes on."""
     config = sitting.config
-    reporter = Reporter(config.steps, sitting.start.step)
+    reporter = Reporter(config, sitting.start.step)
 
     def step(progress: Progress) -> None:
         reporter.step(progress)

@@ -1,7 +1,7 @@
 """A training in the browser, while it goes on.
 
-What is shown is a copy, made between two steps, at most for a fiftieth of the time
-and only while someone looks; so a run comes to the same bits with and without.
+What is shown is a copy, made between two steps, at most for a fiftieth of the time;
+so a run comes to the same bits with and without.
 """
 
 import time
@@ -64,8 +64,8 @@ class LiveViewer:
         return after_step
 
     def wants(self, window: Window, now: float) -> bool:
-        """Whether it is time for the next copy, and anybody there to see it."""
-        return now >= self.due and window.watched and not window.busy
+        """Whether it is time for the next copy, and the last one has been shown."""
+        return now >= self.due and not window.busy
 
     def stay(self) -> None:
         """Until nobody looks any more, or Ctrl-C."""

@@ -199,14 +199,18 @@ def _leant(direction: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def eye_of_gaussians(gaussians: Gaussians, up: np.ndarray) -> Eye:
-    """From obliquely above, far enough to see most of a scene without cameras."""
+    """From obliquely above, far enough to see most of a scene without cameras.
+
+    From the side where cameras stand as a rule: before z = 0 where −y is up (COLMAP),
+    behind it where +y is.
+    """
     shown = within(gaussians, Cut(min_opacity=0.1))
     means = np.asarray(gaussians.params.means, np.float64)[shown]
     if not len(means):
         means = np.zeros((1, 3))
     target = np.median(means, axis=0)
     radius = float(np.percentile(np.linalg.norm(means - target, axis=1), 80)) or 1.0
-    across = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    across = np.cross(np.eye(3)[np.abs(up).argmin()], up)
     direction = np.cos(0.35) * across / np.linalg.norm(across) + np.sin(0.35) * up
     position = target + 1.3 * radius / np.tan(_FOV / 2) * direction
     return Eye(position, target, np.asarray(up, float), float(_FOV))

@@ -1,0 +1,97 @@
+"""What is wrong with a command line, in one line: tyro's boxes read and put shortly."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import fields
+from difflib import get_close_matches
+
+from gsjax.console import one_line
+
+
+def explained(told: str, argv: list[str], commands: Mapping[str, type]) -> str:
+    """One line for a line of arguments that tyro refused.
+
+    Args:
+      told: what tyro printed.
+      argv: the arguments.
+      commands: dataclasses that hold the options, by the commands' names.
+    """
+    command = argv[0] if argv and argv[0] in commands else None
+    lines = _unframed(told)
+    if command is None:
+        said = _unknown_command(lines, commands)
+        return f"{said or _plain(lines)}; see gsjax --help"
+    names = [f.name.replace("_", "-") for f in fields(commands[command])]
+    parts = [_unknown_option(word, names) for word in _unrecognized(lines)]
+    parts += [f"{option} is missing" for option in _missing(lines)]
+    return f"{'; '.join(parts) or _plain(lines)}; see gsjax {command} --help"
+
+
+def _unframed(text: str) -> list[str]:
+    """Lines without colours and frames; what parts them is an empty one."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", text)
+    lines = [re.sub(r"^ ?[│|] ?|\s*[│|]?\s*$", "", line) for line in text.splitlines()]
+    return ["" if re.match(r"\s*([╭╰─]|\+-|-{3})", line) else line for line in lines]
+
+
+def _section(lines: list[str], title: str) -> list[str]:
+    """What follows a title, less its indent, up to an empty line; the first is what
+    stands behind it.
+    """
+    for index, line in enumerate(lines):
+        before, found, behind = line.partition(title)
+        if found and not before.strip():
+            rest = [behind, *(x[len(before) :] for x in lines[index + 1 :])]
+            end = next((n for n, x in enumerate(rest) if n and not x), len(rest))
+            return rest[:end]
+    return []
+
+
+def _unrecognized(lines: list[str]) -> list[str]:
+    """Options that do not exist, or if all do, words that nothing was expected for."""
+    found = _section(lines, "Unrecognized options:")
+    words = [word for line in found for word in re.split(r"[,\s]+", line) if word]
+    return [word for word in words if word.startswith("-")] or words
+
+
+def _unknown_option(word: str, names: list[str]) -> str:
+    if not word.startswith("-"):
+        return f"{word}: not expected"
+    like = get_close_matches(word.lstrip("-"), names, 1, 0.7)
+    return f"{word}: no such option" + (f"; did you mean --{like[0]}?" if like else "")
+
+
+def _unknown_command(lines: list[str], commands: Mapping[str, type]) -> str | None:
+    words = _unrecognized(lines)
+    if not words:
+        return None
+    if words[0].startswith("-"):
+        return f"{words[0]}: no such option without a command"
+    like = get_close_matches(words[0], commands, 1)
+    hint = f"did you mean {like[0]}?" if like else f"there are {', '.join(commands)}"
+    return f"{words[0]}: no such command; {hint}"
+
+
+def _missing(lines: list[str]) -> list[str]:
+    """Options that are required: those with four spaces before them, not their help."""
+    found = _section(lines, "Missing from gsjax")[1:]
+    return [x.strip() for x in found if re.match(r" {4}\S", x)]
+
+
+def _plain(lines: list[str]) -> str:
+    """All of it, without advice."""
+    text = "\n".join(line.strip() for line in lines)
+    parts = [one_line(part) for part in text.split("\n\n")]
+    advice = ("For full helptext", "Argument helptext")
+    parts = [part for part in parts if part and not part.startswith(advice)]
+    return _shortened("; ".join(parts)) or "wrong usage"
+
+
+def _shortened(text: str) -> str:
+    """Of a value that is no number, only what it is and which kind is wanted."""
+    why = r"(?:literal for (int)\(\) with base 10|convert string to (float)): (.+)"
+    found = re.search(rf"Error parsing (\S+): .*{why}", text)
+    if found is None:
+        return text
+    option, whole, _, value = found.groups()
+    return f"{option} {value}: a {'whole ' if whole else ''}number is wanted"

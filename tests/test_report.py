@@ -1,0 +1,45 @@
+"""What a run says of itself as it goes."""
+
+import jax.numpy as jnp
+import pytest
+
+from gsjax.train.config import Level, TrainConfig
+from gsjax.train.fit import Progress
+from gsjax.train.report import Reporter
+from gsjax.train.step import Metrics
+
+CONFIG = TrainConfig(steps=100, levels=(Level(0.0, 4), Level(0.5, 2), Level(0.8, 1)))
+
+
+def progress(step: int, seconds: float, compiling: float) -> Progress:
+    metrics = Metrics(*map(jnp.asarray, [0] * len(Metrics._fields)))
+    metrics = metrics._replace(step=jnp.asarray(step))
+    return Progress(metrics, seconds, compiling, 1, CONFIG.divisor(step), 64)
+
+
+def test_the_time_left_knows_of_larger_pictures_and_of_compiling(monkeypatch, capsys):
+    monkeypatch.setattr("gsjax.train.report._LINE_SECONDS", 0.0)
+    reporter = Reporter(CONFIG)
+    reporter.step(progress(10, 30.0, 20.0))  # a step a second, twenty for a program
+    assert reporter.left(10) == pytest.approx(40 + 4 * 30 + 16 * 20 + 2 * 20)
+    reporter.step(progress(60, 120.0, 20.0 + 30.0))
+    assert reporter.rate == pytest.approx(50 / 60)
+    assert reporter.left(60) == pytest.approx(60 / 50 * (20 + 4 * 20) + 25)
+    reporter.step(progress(100, 200.0, 50.0))
+    assert reporter.left(100) == 0
+    reporter.close()
+    *_, before, last = capsys.readouterr().err.splitlines()
+    assert "step 60/100: loss 0.0000, 0.00 dB, 0 Gaussians, 0.8 steps/s" in before
+    assert last.endswith("3:20 gone, 0:00 left")
+
+
+def test_a_bar_on_a_terminal(monkeypatch, capsys):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    monkeypatch.setattr("gsjax.train.report._BAR_SECONDS", 0.0)
+    reporter = Reporter(CONFIG, 99)
+    reporter.step(progress(100, 2.0, 1.0))
+    reporter.bar.refresh()
+    told = capsys.readouterr().err
+    reporter.close()
+    assert "100/100" in told
+    assert "0:00 left, loss" in told
