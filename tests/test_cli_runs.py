@@ -94,8 +94,9 @@ def test_demo(made, capsys):
     assert np.abs(turntable[0].astype(int) - turntable[24]).mean() > 2, "it turns"
     # The commands that it says to try next are commands.
     tries = [line.split()[2:] for line in made.err.splitlines() if "  gsjax " in line]
-    assert [line[0] for line in tries] == ["info", "render", "export", "sfm", "train"]
-    for line in tries[:3]:
+    wanted = ["view", "info", "render", "export", "sfm", "train"]
+    assert [line[0] for line in tries] == wanted
+    for line in tries[1:4]:  # to view is to serve until Ctrl-C
         assert cli.main(line) == 0
     capsys.readouterr()
     assert cli.main(["demo", "-o", str(out), *DEMO]) == 3
@@ -137,6 +138,27 @@ def test_a_path_to_movies(demo, tmp_path, capsys):
     assert 0.05 < seen.mean() < 0.95
     assert cli.main([*args, "-o", str(path)]) == 3
     assert "exists" in error_of(capsys)
+
+
+@pytest.mark.long
+def test_a_file_before_the_cameras_of_a_dataset(demo, tmp_path, capsys):
+    """The same pictures as of the run; without a path, all views."""
+    ply, dataset = demo / "run" / "splat.ply", demo / "dataset"
+    of_file = ["render", str(ply), "--cameras", str(dataset), "--preset", "compat"]
+    of_run = ["render", str(demo / "run"), "--preset", "compat"]
+    flight = ["--path", "spiral", "--frames", "2", "-o"]
+    assert cli.main([*of_file, *flight, str(tmp_path / "a")]) == 0
+    assert cli.main([*of_run, *flight, str(tmp_path / "b")]) == 0
+    assert names(tmp_path / "a") == names(tmp_path / "b")
+    for name in names(tmp_path / "a"):
+        pictures = [read_image(tmp_path / x / name) for x in "ab"]
+        np.testing.assert_array_equal(*pictures)
+        assert pictures[0].std() > 20
+    assert cli.main([*of_file, "-o", str(tmp_path / "c")]) == 0
+    assert len(names(tmp_path / "c")) == PHOTOS
+    capsys.readouterr()
+    assert cli.main([*of_file, "--path", "test", "-o", str(tmp_path / "d")]) == 2
+    assert "no such views" in error_of(capsys)
 
 
 @pytest.mark.long

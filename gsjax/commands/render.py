@@ -29,10 +29,12 @@ class RenderCommand(HeavyCommand):
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|MOVIE")]
     """Folder for the images, created if missing; or a movie: .gif, .webp or .webm."""
     cameras: Path | None = None
-    """The cameras: a transforms.json (NeRF, instant-ngp, nerfstudio)."""
+    """The cameras: a transforms.json (NeRF, instant-ngp, nerfstudio), or the folder of
+    a dataset, whose views they are, or what --path makes of them."""
     path: Literal["test", "train", "orbit", "spiral", "interpolate"] | None = None
     """Of a run: its held-out or its training views; once around what they look at; a
-    spiral before it; or a flight through all of them. Default of a run: orbit."""
+    spiral before it; or a flight through all of them. Default of a run: orbit, of a
+    dataset: train, which is all its views."""
     frames: int | None = None
     """Of orbit, spiral and interpolate; default 120."""
     fps: float | None = None
@@ -69,9 +71,11 @@ class RenderCommand(HeavyCommand):
         path = self._path()
         start_jax()
         from gsjax.flights import path_entries, write_flight
+        from gsjax.scene.dataset import load_dataset
         from gsjax.scene.transforms import load_transforms
         from gsjax.subjects import open_subject
         from gsjax.train.folder import (
+            Data,
             load_data,
             load_settings,
             refined_data,
@@ -79,19 +83,25 @@ class RenderCommand(HeavyCommand):
         )
         from gsjax.views import write_views
 
-        scene = None
-        if self.cameras is not None:
-            entries = load_transforms(self.cameras, size=size)
-        else:
+        data = largest = None
+        if self.cameras is None:
             settings = load_settings(self.scene)
             data = refined_data(load_data(settings), run_files(self.scene))
-            frames, largest = self.frames or 120, settings.config.max_size
+            largest = settings.config.max_size
+        elif self.cameras.is_dir():
+            scene = load_dataset(self.cameras)
+            data = Data(scene, train=list(range(len(scene.views))), test=[])
+        if data is None:
+            assert self.cameras is not None, "else it is a run's"
+            entries = load_transforms(self.cameras, size=size)
+        else:
+            frames = self.frames or 120
             entries = path_entries(
                 data, path, frames=frames, max_size=largest, size=size
             )
-            scene = data.scene
+        scene = None if data is None else data.scene
         if not entries:
-            raise UsageError(f"--path {path}: this run has no such views")
+            raise UsageError(f"--path {path}: there are no such views")
         subject = open_subject(
             self.scene, scene=scene, preset=self.preset, background=background
         )
@@ -126,16 +136,17 @@ class RenderCommand(HeavyCommand):
         """
         from gsjax.subjects import is_run
 
-        if self.cameras is not None and self.path is not None:
-            raise UsageError("--cameras and --path exclude each other")
+        listed = self.cameras is not None and not self.cameras.is_dir()
+        if listed and self.path is not None:
+            raise UsageError("--cameras FILE and --path exclude each other")
         if not is_run(self.scene) and self.cameras is None:
             raise UsageError(
-                f"{self.scene}: --cameras FILE is wanted for a file; --path is for the "
-                "folder of a run, whose views it goes by"
+                f"{self.scene}: --cameras is wanted for a file, a transforms.json or "
+                "the folder of a dataset; only a run has views of its own"
             )
-        path = self.path or "orbit"
+        path = self.path or ("orbit" if self.cameras is None else "train")
         if self.frames is not None:
-            if self.cameras is not None or path in ("test", "train"):
+            if listed or path in ("test", "train"):
                 raise UsageError("--frames goes with orbit, spiral and interpolate")
             if not 1 <= self.frames <= 100_000:
                 raise UsageError(f"--frames {self.frames}: from 1 to 100000 is wanted")
