@@ -1,5 +1,6 @@
 """Cameras of a run's views and paths: sizes, names, and ranges of depth."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -68,6 +69,21 @@ def test_paths_have_frames_of_one_size_that_see_the_scene(data, path):
         assert (large.width, large.height) == (128, 96)
         np.testing.assert_allclose(large.K[:2], 2 * np.asarray(small.K[:2]))
         np.testing.assert_array_equal(large.viewmat, small.viewmat)
+
+
+def test_an_orbit_past_the_cameras_is_warned_of(data, capsys):
+    path_entries(data, "orbit", frames=2)
+    assert "warning: 245° of the orbit are on sides that" in capsys.readouterr().err
+    path_entries(data, "interpolate", frames=2)
+    views = [
+        replace(
+            data.scene.views[0], viewmat=look_at((np.cos(a), np.sin(a), 1), (0, 0, 0))
+        )
+        for a in (0, 2, 4)
+    ]
+    around = replace(data.scene, views=tuple(views))
+    path_entries(data._replace(scene=around), "orbit", frames=2)
+    assert capsys.readouterr().err == ""
 
 
 def test_no_views_and_no_points(data):
