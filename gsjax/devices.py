@@ -1,4 +1,5 @@
-"""How JAX is set up for a program: its devices, and what it keeps of its compiling.
+"""How JAX is set up for a program: its devices, and what it keeps of its compiling;
+and how work is shared by the devices.
 
 One host device for each core: XLA's CPU backend hardly uses a second core inside the
 compositor's loop, so the tiles are spread over several devices instead.

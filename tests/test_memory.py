@@ -13,6 +13,7 @@ from conftest import LIGHT, camera_of, frustum_points, gaussians_at
 import gsjax
 import gsjax.raster.render as render_module
 from gsjax import CapacityError, RasterConfig, memory
+from gsjax.losses import photometric_spread
 from gsjax.memory import Estimate, require, size_text, system_available, unlimited
 from gsjax.raster.render import render_estimate
 from gsjax.raster.types import Demand
@@ -150,6 +151,25 @@ def test_the_estimate_is_what_xla_reserves(slots, pairs, report, quick_compiles)
     estimate = render_estimate(slots, 4, (128, 96), config, width=8).total
     report("estimate of memory", abs(np.log(estimate / found)), np.log(1.5))
     assert 1 / 1.5 < estimate / found < 1.5
+
+
+@pytest.mark.parametrize("devices", [1, 2])
+def test_the_estimate_of_pictures_is_what_the_loss_reserves(devices, report):
+    """Within 1.5 times, and not less: the picture itself comes on top."""
+    width, height = 320, 240
+
+    def loss(images, targets):
+        return photometric_spread(images, targets, devices=devices).sum()
+
+    shape = jax.ShapeDtypeStruct((1, height, width, 3), jnp.float64)
+    compiled = jax.jit(jax.value_and_grad(loss)).lower(shape, shape).compile()
+    found = devices * compiled.memory_analysis().temp_size_in_bytes
+    config = RasterConfig(**{**LIGHT, "devices": devices})
+    size = (width, height)
+    parts = render_estimate(16, 1, size, config, gradients=True, width=8).parts
+    ratio = parts["for pictures"] / found
+    report("memory of the loss", np.log(ratio), np.log(1.5))
+    assert 1 < ratio < 1.5
 
 
 # Peaks of `gsjax train`, less what the imports had taken; two CPU devices, jax 0.10.2,

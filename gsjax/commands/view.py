@@ -81,7 +81,8 @@ class ViewCommand(HeavyCommand):
         less = f" of {page.found:,}" if page.drawn < page.found else ""
         faint = max(self.min_opacity, LEAST_OPACITY)
         if less and self.max_gaussians is None:
-            note(f"left out: {page.found - page.drawn:,} of opacities below {faint:g}")
+            gone = f"{page.found - page.drawn:,}, of opacities below {faint:g}"
+            note(f"left out: {gone} or not finite")
         cameras = f", {len(exhibit.frusta)} cameras" if exhibit.frusta else ""
         say(
             f"{path}  {page.drawn:,}{less} Gaussians{cameras}, "

@@ -2,8 +2,8 @@
 
 Not measured but counted, and then held against what XLA says of its programs and what
 processes came to: jax 0.10.2, one and two CPU devices. What binning and compositing
-take goes with the pairs, and is shared by the devices; what projection and loss take
-goes with Gaussians and pixels, and each device has its own.
+take goes with the pairs, what the loss takes with the pixels, and both are shared by
+the devices; what projection takes goes with the Gaussians, and each has its own.
 
 Axis legend: P pixels of a tile, K Gaussians of a chunk, C channels.
 """
@@ -23,8 +23,9 @@ _GAUSSIANS, _PICTURES = "for projected Gaussians", "for pictures"
 _IN_CHUNK = 12
 _IN_LISTS = 4  # of a pair, while it is sorted
 _PROJECTED = 53  # of a Gaussian beside its own numbers, as all stages come to
-# Bytes of a pixel: images and their tiles; with gradients also what SSIM blurs.
-_OF_PIXEL, _OF_PIXEL_LEARNT = 26, 480
+# Bytes of a pixel: images and their tiles; with gradients; and what SSIM blurs, which
+# the devices share.
+_OF_PIXEL, _OF_PIXEL_LEARNT, _BLURRED = 26, 35, 190
 
 
 def render_estimate(
@@ -64,12 +65,12 @@ def render_estimate(
     pairs = width * rows * (config.chunk_size * in_chunk + carried)
     numbers = 11 + 3 * bases
     gaussians = seen * (_PROJECTED + numbers * (3 if gradients else 1))
-    pixels = size[0] * size[1] * cameras
-    pixels *= _OF_PIXEL_LEARNT if gradients else _OF_PIXEL
+    each = devices * (_OF_PIXEL_LEARNT if gradients else _OF_PIXEL)
+    pixels = size[0] * size[1] * cameras * (each + (_BLURRED if gradients else 0))
     parts = {
         _PAIRS: devices * (pairs + _IN_LISTS * 4 * share),
         _GAUSSIANS: devices * width * gaussians,
-        _PICTURES: devices * pixels * width // 4,
+        _PICTURES: pixels * width // 4,
     }
     # Of these two, one is over before the other begins.
     stages = (_PAIRS, _PICTURES) if gradients else (_PAIRS, _GAUSSIANS)
