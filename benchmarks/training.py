@@ -2,8 +2,9 @@
 
 ``python benchmarks/training.py DATASET [IMAGE …]`` trains with `gsjax train --preset
 fast`, once for each strategy (or the one of ``--strategy``), with the named images held
-out (else every 8th), in a process that has nothing compiled. Kept are PSNR and SSIM of
-the held-out views over seconds; compiling counts, measuring does not.
+out (else every 8th), in a process that has nothing compiled; with ``--steps N`` so many
+steps. Kept are PSNR and SSIM of the held-out views over seconds; compiling counts,
+measuring does not. What was kept of other runs of that dataset stays.
 """
 
 from __future__ import annotations
@@ -26,10 +27,14 @@ EVERY = 50
 STRATEGIES = ("mcmc", "adaptive")
 
 
-def train(dataset: Path, held_out: list[str], strategy: str, run: Path) -> None:
+def train(
+    dataset: Path, held_out: list[str], strategy: str, steps: int | None, run: Path
+) -> None:
     """One run, from a cold start."""
     program = [sys.executable, "-m", "gsjax.cli", "train", str(dataset), "-o", str(run)]
     options = ["--preset", "fast", "--strategy", strategy, "--eval-every", str(EVERY)]
+    if steps is not None:
+        options += ["--steps", str(steps)]
     if held_out:
         options += ["--test-images", *held_out]
     cold = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
@@ -41,24 +46,40 @@ def lines(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def main(dataset: Path, held_out: list[str], strategies: list[str]) -> None:
+def kept(path: Path, held_out: list[str], new: list[str]) -> list[dict]:
+    """Rows of an earlier result, of the same images, but for those measured anew."""
+    if not path.exists():
+        return []
+    told = json.loads(path.read_text())
+    same = told["held out"] == held_out
+    return [row for row in told["rows"] if same and row["strategy"] not in new]
+
+
+def main(
+    dataset: Path, held_out: list[str], strategies: list[str], steps: int | None
+) -> None:
     """Measure, save and draw."""
-    rows, series = [], []
+    path = measure.RESULTS / f"training_{dataset.name}.json"
+    more = "" if steps is None else f", {steps} steps"
+    rows = kept(path, held_out, [strategy + more for strategy in strategies])
+    machine = measure.machine()
     with tempfile.TemporaryDirectory() as folder:
         for strategy in strategies:
             run = Path(folder) / strategy
-            train(dataset, held_out, strategy, run)
+            train(dataset, held_out, strategy, steps, run)
             found = lines(run / "held_out.jsonl")
-            steps = lines(run / "metrics.jsonl")
-            last = {key: steps[-1][key] for key in ("compilations", "compile_seconds")}
-            rows += [{"strategy": strategy, **record} for record in found]
-            rows[-1] |= last
-            x, y = np.asarray([(r["seconds"], r["psnr"]) for r in found]).T
-            series.append(Series(strategy, x, y))
-    name = f"training_{dataset.name}"
+            logged = lines(run / "metrics.jsonl")[-1]
+            last = {key: logged[key] for key in ("compilations", "compile_seconds")}
+            rows += [{"strategy": strategy + more, **record} for record in found]
+            rows[-1] |= {**last, "date": machine["date"]}
+    names = dict.fromkeys(row["strategy"] for row in rows)
+    series = []
+    for name in names:
+        found = [row for row in rows if row["strategy"] == name]
+        x, y = np.asarray([(r["seconds"], r["psnr"]) for r in found]).T
+        series.append(Series(name, x, y))
     measure.RESULTS.mkdir(exist_ok=True)
-    path = measure.RESULTS / f"{name}.json"
-    content = {"machine": measure.machine(), "claim": __doc__, "held out": held_out}
+    content = {"machine": machine, "claim": __doc__, "held out": held_out}
     files.write_json(path, {**content, "rows": rows})
     title = f"{dataset.name}: PSNR of what was held out, dB"
     picture = curves(series, title=title, x_label="seconds")
@@ -72,5 +93,7 @@ if __name__ == "__main__":
     parser.add_argument("dataset", type=Path)
     parser.add_argument("images", nargs="*")
     parser.add_argument("--strategy", action="append", choices=STRATEGIES)
+    parser.add_argument("--steps", type=int)
     given = parser.parse_args()
-    main(given.dataset, given.images, given.strategy or list(STRATEGIES))
+    chosen = given.strategy or list(STRATEGIES)
+    main(given.dataset, given.images, chosen, given.steps)
