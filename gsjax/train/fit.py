@@ -37,6 +37,7 @@ _SLOT_MARGIN = 1.3
 # Room for pairs that are not there costs a few ms a step, a new program ten seconds:
 # much while Gaussians may still be added, little afterwards.
 _PAIR_MARGIN, _GROWING_MARGIN = 1.5, 2.5
+_PER_GROWTH = 1.2  # what is added is smaller than what is there
 _MAX_PROBED_VIEWS = 6
 
 
@@ -280,11 +281,12 @@ class _Run:
 
     def roomy(self, pairs: int, state: TrainState) -> int:
         """A pair capacity that holds so many, with room to spare where there is."""
-        growth = 1.0
+        margin = _PAIR_MARGIN
         if int(state.step) < self.config.chosen.stop:
             active = max(1, int(num_active(state.gaussians)))
-            growth = max(1.0, self.config.max_gaussians / active)
-        return _roomy(pairs, min(_PAIR_MARGIN * growth, _GROWING_MARGIN))
+            growth = self.config.max_gaussians / active
+            margin = min(max(margin, _PER_GROWTH * growth), _GROWING_MARGIN)
+        return _roomy(pairs, margin)
 
     def program(self, state: TrainState, frames: Frames, raster: RasterConfig):
         """The compiled step for these sizes."""
