@@ -17,8 +17,7 @@ _WORDS = {"int": "N", "float": "X", "str": "TEXT", "Path": "PATH", "bool": ""}
 def command_classes() -> dict[str, str]:
     """Names of the commands, and of the classes that they are."""
     text = (SOURCE / "cli.py").read_text(encoding="utf-8")
-    pairs = re.findall(r'Annotated\[(\w+), subcommand\("(\w+)"\)\]', text)
-    return {name: kind for kind, name in pairs}
+    return dict(re.findall(r'^        "(\w+)": (\w+Command),$', text, re.M))
 
 
 def fields(command: str) -> list[tuple[ast.AnnAssign, str]]:
