@@ -154,13 +154,13 @@ def test_a_diverging_run_is_stopped_and_what_was_good_is_kept(
     """After step 11 something happens; half of so short a run is time enough."""
     settings = settings_of(tmp_path, harmless(), "mcmc")
     run, happened = tmp_path / "run", 11
-    advance = fit_module._Run.with_room
+    with_slots = fit_module.with_slots
 
-    def with_room(self, state, metrics):
-        state = advance(self, state, metrics)
-        return change(state) if metrics.step == happened else state
+    def changed(state, wanted, config):
+        state = with_slots(state, wanted, config)
+        return change(state) if state.step == happened else state
 
-    monkeypatch.setattr(fit_module._Run, "with_room", with_room)
+    monkeypatch.setattr(fit_module, "with_slots", changed)
     with pytest.raises(DivergedError, match=FAULTS[change]) as caught:
         start_run(settings, run)
     assert caught.value.exit_code == 5
@@ -329,7 +329,7 @@ def interrupt(monkeypatch, where, times):
     elif phase == "compiling":
         before(fit_module._Run, "program")
     elif phase == "stepping":
-        before(fit_module._Run, "with_room", lambda _r, _s, m: m.step == 7)
+        before(fit_module, "with_slots", lambda state, *_: state.step == 7)
     elif phase == "densifying":  # after the fifth step, in its program
         before(fit_module._Run, "program", lambda _r, s, *_: s.step == 4)
     elif phase == "saving":  # the file is written, and has no name yet

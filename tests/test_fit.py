@@ -27,7 +27,6 @@ from training import (
     scene,
 )
 
-import gsjax.train.fit as fit_module
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import CapacityError, DivergedError, InputError
@@ -38,10 +37,10 @@ from gsjax.train.fit import (
     Hooks,
     empty_state,
     fit,
-    grow_state,
     initial_state,
     subset,
 )
+from gsjax.train.room import grow_state, roomy_pairs
 from gsjax.train.step import init_state
 
 pytestmark = pytest.mark.usefixtures("quick_compiles")
@@ -304,7 +303,7 @@ def test_more_room_while_gaussians_are_added():
         chosen = replace(CONFIG.chosen, max_gaussians=most)
         config = CONFIG.replace(**{CONFIG.strategy: chosen})
         state = initial_state(scene(), config).replace(step=jnp.int32(step))
-        return fit_module._Run(scene(), photos(), config, Hooks()).roomy(8000, state)
+        return roomy_pairs(8000, state, config)
 
     stop, many = CONFIG.chosen.stop, 100 * first
     assert room(stop - 1, many) > 2 * 8000 > room(stop, many) > 8000
@@ -312,8 +311,9 @@ def test_more_room_while_gaussians_are_added():
 
 
 def test_more_pairs_than_can_be_addressed():
-    roomy = fit_module._roomy
-    assert roomy(1000, 1.5) == 1536
-    assert roomy(2**30 - 9, 1.5) == 2**30 - 1
+    state = initial_state(scene(), CONFIG)
+    done = state.replace(step=jnp.int32(CONFIG.chosen.stop))
+    assert roomy_pairs(1000, done, CONFIG) == 1536
+    assert roomy_pairs(2**30 - 9, done, CONFIG) == 2**30 - 1
     with pytest.raises(CapacityError, match="wants 2,147,483,647 or more pairs"):
-        roomy(2**31 - 1, 1.5)
+        roomy_pairs(2**31 - 1, done, CONFIG)

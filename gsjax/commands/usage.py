@@ -58,7 +58,7 @@ def _unknown_option(word: str, names: list[str]) -> str:
     if not word.startswith("-"):
         return f"{word}: not expected"
     like = get_close_matches(word.lstrip("-"), names, 1, 0.7)
-    return f"{word}: no such option" + (f"; did you mean --{like[0]}?" if like else "")
+    return f"{word}: no such option" + (f" (did you mean --{like[0]}?)" if like else "")
 
 
 def _unknown_command(lines: list[str], commands: Mapping[str, type]) -> str | None:
@@ -69,7 +69,7 @@ def _unknown_command(lines: list[str], commands: Mapping[str, type]) -> str | No
         return f"{words[0]}: no such option without a command"
     like = get_close_matches(words[0], commands, 1)
     hint = f"did you mean {like[0]}?" if like else f"there are {', '.join(commands)}"
-    return f"{words[0]}: no such command; {hint}"
+    return f"{words[0]}: no such command ({hint})"
 
 
 def _missing(lines: list[str]) -> list[str]:

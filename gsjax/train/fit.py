@@ -1,4 +1,4 @@
-"""The loop around the step: resolution, capacities, and what is compiled when.
+"""The loop around the step: resolution, and what is compiled when.
 
 Runs on the host and in memory; files are the business of `gsjax.train.run`.
 """
@@ -13,15 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import CapacityError
-from gsjax.gaussians import (
-    Gaussians,
-    capacity_bucket,
-    grow,
-    make_gaussians,
-    num_active,
-)
+from gsjax.gaussians import Gaussians, grow, make_gaussians
 from gsjax.memory import require
-from gsjax.raster.render import count_demand
 from gsjax.raster.types import RasterConfig
 from gsjax.scene.initialise import init_gaussians, scene_extent
 from gsjax.scene.types import Photo, Scene
@@ -30,15 +23,8 @@ from gsjax.train.config import TrainConfig
 from gsjax.train.footprint import first_slots, step_estimate
 from gsjax.train.frames import Frames, draw, make_frames
 from gsjax.train.health import Health, check_photos, check_points
+from gsjax.train.room import pairs_for, roomy_pairs, with_slots
 from gsjax.train.step import Metrics, TrainState, init_state, make_train_step
-
-# Room beyond what is wanted now, so that it lasts for a while.
-_SLOT_MARGIN = 1.3
-# Room for pairs that are not there costs a few ms a step, a new program ten seconds:
-# much while Gaussians may still be added, little afterwards.
-_PAIR_MARGIN, _GROWING_MARGIN = 1.5, 2.5
-_PER_GROWTH = 1.2  # what is added is smaller than what is there
-_MAX_PROBED_VIEWS = 6
 
 
 class Progress(NamedTuple):
@@ -220,7 +206,9 @@ class _Run:
                 divisor = config.divisor(step)
                 frames = make_frames(self.scene.views, self.photos, divisor)
             if pair_capacity is None or finer:
-                pair_capacity = self.pairs_wanted(state, frames)
+                begun = time.perf_counter()
+                pair_capacity = pairs_for(state, frames, config)
+                self.compile_seconds += time.perf_counter() - begun
             # No limit of what is visible: only the pairs are regrown.
             raster = config.raster.replace(
                 pair_capacity=pair_capacity, visible_capacity=None
@@ -234,14 +222,14 @@ class _Run:
             state, metrics = program(state, frames)
             metrics = jax.device_get(metrics)
             if metrics.overflowed:
-                pair_capacity = self.roomy(int(metrics.pair_capacity), state)
+                pair_capacity = roomy_pairs(int(metrics.pair_capacity), state, config)
                 continue
             step = int(metrics.step)
             progress = self.progress(metrics, divisor, state)
             health.look(metrics)
             hooks.step(progress)
             hooks.state(state, progress)
-            state = self.with_room(state, metrics)
+            state = with_slots(state, int(metrics.wanted), config)
             # The last is saved by the caller, with what belongs to the end.
             every = config.every_checkpoint
             due = every and step % every == 0 and step < config.steps
@@ -265,28 +253,6 @@ class _Run:
             divisor=divisor,
             capacity=state.gaussians.capacity,
         )
-
-    def pairs_wanted(self, state: TrainState, frames: Frames) -> int:
-        """Pair capacity for these images, with room to spare."""
-        begun = time.perf_counter()
-        few = np.linspace(0, frames.count - 1, min(frames.count, _MAX_PROBED_VIEWS))
-        config, most = self.config.raster, 1
-        for index in np.unique(few.astype(int)):
-            camera = jax.tree.map(lambda a, i=index: a[i], frames.camera)
-            # The same settings for each: one program.
-            demand = count_demand(state.gaussians, camera, config)
-            most = max(most, int(demand.capacity))
-        self.compile_seconds += time.perf_counter() - begun
-        return self.roomy(self.config.batch * most, state)
-
-    def roomy(self, pairs: int, state: TrainState) -> int:
-        """A pair capacity that holds so many, with room to spare where there is."""
-        margin = _PAIR_MARGIN
-        if int(state.step) < self.config.chosen.stop:
-            active = max(1, int(num_active(state.gaussians)))
-            growth = self.config.max_gaussians / active
-            margin = min(max(margin, _PER_GROWTH * growth), _GROWING_MARGIN)
-        return _roomy(pairs, margin)
 
     def program(self, state: TrainState, frames: Frames, raster: RasterConfig):
         """The compiled step for these sizes."""
@@ -314,42 +280,6 @@ class _Run:
             self.programs[shapes] = jitted.lower(state, frames).compile()
             self.compile_seconds += time.perf_counter() - begun
         return self.programs[shapes]
-
-    def with_room(self, state: TrainState, metrics: Metrics) -> TrainState:
-        """``state``, with more slots if those it has will soon be too few."""
-        wanted, capacity = int(metrics.wanted), state.gaussians.capacity
-        if _SLOT_MARGIN * wanted <= capacity:
-            return state
-        most = capacity_bucket(self.config.max_gaussians)
-        larger = min(capacity_bucket(2 * wanted), most)
-        return grow_state(state, larger) if larger > capacity else state
-
-
-def _roomy(count: int, margin: float) -> int:
-    """A pair capacity that holds ``count``, with room to spare where there is."""
-    if count >= 2**30:
-        raise CapacityError(
-            f"a step wants {count:,} or more pairs, above the limit of {2**30 - 1:,}; "
-            "train with smaller images, fewer Gaussians, or larger tiles"
-        )
-    return min(capacity_bucket(int(margin * count)), 2**30 - 1)
-
-
-def grow_state(state: TrainState, capacity: int) -> TrainState:
-    """The same run with more slots."""
-    extra = capacity - state.gaussians.capacity
-    slots = state.gaussians.capacity
-
-    def pad(array):
-        if array.ndim and array.shape[0] == slots:
-            return jnp.pad(array, [(0, extra)] + [(0, 0)] * (array.ndim - 1))
-        return array
-
-    return state.replace(
-        gaussians=grow(state.gaussians, capacity),
-        moments=jax.tree.map(pad, state.moments),
-        stats=jax.tree.map(pad, state.stats),
-    )
 
 
 def subset(scene: Scene, indices: Sequence[int]) -> Scene:

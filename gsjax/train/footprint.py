@@ -25,7 +25,7 @@ _LEAST_SLOTS = 32_768
 # further size of the pictures.
 _COMPILING, _COMPILING_MORE = 900_000_000, 150_000_000
 # Pairs of a Gaussian before they are counted: four to five in trained scenes, with the
-# room that `fit` leaves beyond them.
+# room that `gsjax.train.room` leaves beyond them.
 _PAIRS = 7.5
 # And of one of 10⁵ random ones, a pixel of the photographs, as two runs began.
 _PAIRS_RANDOM = 3.3e-4

@@ -4,6 +4,8 @@ import sys
 import time
 from typing import Any
 
+import numpy as np
+
 from gsjax.console import note
 from gsjax.train.config import TrainConfig
 from gsjax.train.fit import Progress
@@ -16,7 +18,10 @@ class Reporter:
     """Shows the steps of one run, of which ``done`` lie behind it."""
 
     def __init__(self, config: TrainConfig, done: int = 0):
-        self.config, self.steps = config, config.steps
+        self.steps = config.steps
+        self.divisors = np.array([config.divisor(s) for s in range(config.steps)])
+        # Pixels of all steps from each on, in those of the photographs.
+        self.ahead = np.append(np.cumsum(self.divisors[::-1] ** -2.0)[::-1], 0)
         self.bar: Any = None
         if sys.stderr.isatty():
             from tqdm import tqdm
@@ -71,10 +76,9 @@ class Reporter:
     def left(self, step: int) -> float:
         """Seconds to come, about: a step takes as long as it has pixels, and where
         pictures become larger there is a program to compile."""
-        divisors = [self.config.divisor(s) for s in range(max(step - 1, 0), self.steps)]
-        here, ahead = divisors[0], divisors[1:]
-        work = sum((here / divisor) ** 2 for divisor in ahead)
-        programs = len({divisor for divisor in ahead if divisor != here})
+        here = self.divisors[max(step - 1, 0)]
+        work = here**2 * self.ahead[step]
+        programs = np.sum(np.unique(self.divisors[step:]) != here)
         each = self.compiled[-1] / len(self.compiled) if self.compiled else 0.0
         return work / max(self.rate, 1e-9) + programs * each
 

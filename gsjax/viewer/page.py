@@ -54,7 +54,7 @@ _WORKERS = """<script>
       const text = window.origin === "null" ? texts.get(String(url)) : undefined;
       const data = "data:text/javascript;charset=utf-8,";
       super(text === undefined ? url : data + encodeURIComponent(text), options);
-      this.addEventListener("error", complain);
+      if (text !== undefined) this.addEventListener("error", complain);
     }
   };
 })();

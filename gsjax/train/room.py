@@ -1,0 +1,85 @@
+"""How many slots and pairs a run has room for, and how that grows.
+
+Each growth is a new program, which takes longer to compile than a little room beyond
+what is wanted costs in all its steps.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.errors import CapacityError
+from gsjax.gaussians import capacity_bucket, grow, num_active
+from gsjax.raster.render import count_demand
+from gsjax.train.config import TrainConfig
+from gsjax.train.frames import Frames
+from gsjax.train.step import TrainState
+
+# Room beyond what is wanted now, so that it lasts for a while.
+_SLOT_MARGIN = 1.3
+# Room for pairs that are not there costs a few ms a step, a new program ten seconds:
+# much while Gaussians may still be added, little afterwards.
+_PAIR_MARGIN, _GROWING_MARGIN = 1.5, 2.5
+_PER_GROWTH = 1.2  # what is added is smaller than what is there
+_MAX_PROBED_VIEWS = 6
+
+
+def pairs_for(state: TrainState, frames: Frames, config: TrainConfig) -> int:
+    """A pair capacity for these photographs, with room to spare.
+
+    Raises:
+      CapacityError: as `roomy_pairs`.
+    """
+    few = np.linspace(0, frames.count - 1, min(frames.count, _MAX_PROBED_VIEWS))
+    most = 1
+    for index in np.unique(few.astype(int)):
+        camera = jax.tree.map(lambda a, i=index: a[i], frames.camera)
+        # The same settings for each: one program.
+        demand = count_demand(state.gaussians, camera, config.raster)
+        most = max(most, int(demand.capacity))
+    return roomy_pairs(config.batch * most, state, config)
+
+
+def roomy_pairs(wanted: int, state: TrainState, config: TrainConfig) -> int:
+    """A pair capacity that holds ``wanted``, with room to spare where there is.
+
+    Raises:
+      CapacityError: if that is more than can be addressed.
+    """
+    if wanted >= 2**30:
+        raise CapacityError(
+            f"a step wants {wanted:,} or more pairs, above the limit of {2**30 - 1:,}; "
+            "train with smaller images, fewer Gaussians, or larger tiles"
+        )
+    margin = _PAIR_MARGIN
+    if int(state.step) < config.chosen.stop:
+        growth = config.max_gaussians / max(1, int(num_active(state.gaussians)))
+        margin = min(max(margin, _PER_GROWTH * growth), _GROWING_MARGIN)
+    return min(capacity_bucket(int(margin * wanted)), 2**30 - 1)
+
+
+def with_slots(state: TrainState, wanted: int, config: TrainConfig) -> TrainState:
+    """``state``, with more slots if it will soon have too few for ``wanted``."""
+    capacity = state.gaussians.capacity
+    if _SLOT_MARGIN * wanted <= capacity:
+        return state
+    most = capacity_bucket(config.max_gaussians)
+    larger = min(capacity_bucket(2 * wanted), most)
+    return grow_state(state, larger) if larger > capacity else state
+
+
+def grow_state(state: TrainState, capacity: int) -> TrainState:
+    """The same run with ``capacity`` slots, more than it has."""
+    slots = state.gaussians.capacity
+
+    def pad(array):
+        if array.ndim and array.shape[0] == slots:
+            widths = [(0, capacity - slots)] + [(0, 0)] * (array.ndim - 1)
+            return jnp.pad(array, widths)
+        return array
+
+    return state.replace(
+        gaussians=grow(state.gaussians, capacity),
+        moments=jax.tree.map(pad, state.moments),
+        stats=jax.tree.map(pad, state.stats),
+    )
