@@ -28,11 +28,14 @@ _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
 
 def running_product(alpha: Array) -> tuple[Array, Array]:
-    """(Π over all K, Π over those before k [G, K, P]) of 1 − alpha [G, K, P]."""
+    """(Π over all K, Π over those before k [G, K, P]) of 1 − alpha [G, K, P].
+
+    By taking T α off T, which rounds once a factor, and T (1 − α) twice.
+    """
     product, before = jnp.ones_like(alpha[:, :1]), []
     for part in _parts(alpha):
         before.append(product)
-        product = product * (1 - part)
+        product = product - product * part
     return product[:, 0], lax.concatenate(before, 1)
 
 

@@ -4,6 +4,8 @@ Each growth is a new program, which takes longer to compile than a little room b
 what is wanted costs in all its steps.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,10 +19,11 @@ from gsjax.train.step import TrainState
 
 # Room beyond what is wanted now, so that it lasts for a while.
 _SLOT_MARGIN = 1.3
-# Room for pairs that are not there costs a few ms a step, a new program ten seconds:
-# much while Gaussians may still be added, little afterwards.
-_PAIR_MARGIN, _GROWING_MARGIN = 1.5, 2.5
+_PAIR_MARGIN, _GROWING_MARGIN = 1.5, 4.0
 _PER_GROWTH = 1.2  # what is added is smaller than what is there
+# A program takes as long to compile as so many empty pairs take in one step: 22 s at
+# 0.12 µs each, on two cores.
+_PAIRS_OF_PROGRAM = 1.8e8
 _MAX_PROBED_VIEWS = 6
 
 
@@ -51,11 +54,16 @@ def roomy_pairs(wanted: int, state: TrainState, config: TrainConfig) -> int:
             f"a step wants {wanted:,} or more pairs, above the limit of {2**30 - 1:,}; "
             "train with smaller images, fewer Gaussians, or larger tiles"
         )
-    margin = _PAIR_MARGIN
-    if int(state.step) < config.chosen.stop:
+    extra = (_PAIR_MARGIN - 1) * wanted
+    steps = config.chosen.stop - int(state.step)
+    if steps > 0:
         growth = config.max_gaussians / max(1, int(num_active(state.gaussians)))
-        margin = min(max(margin, _PER_GROWTH * growth), _GROWING_MARGIN)
-    return min(capacity_bucket(int(margin * wanted)), 2**30 - 1)
+        margin = min(_PER_GROWTH * growth, _GROWING_MARGIN)
+        to_come = max(margin - 1, 0) * wanted
+        # Room and the programs until then cost least together if each lasts for these.
+        each = math.sqrt(2 * _PAIRS_OF_PROGRAM * to_come / steps)
+        extra = max(extra, min(to_come, each))
+    return min(capacity_bucket(int(wanted + extra)), 2**30 - 1)
 
 
 def with_slots(state: TrainState, wanted: int, config: TrainConfig) -> TrainState:
