@@ -2,9 +2,10 @@
 
 ``python benchmarks/pareto.py [NAME|RUN|PLY …]`` turns one knob at a time (α cut, stop
 and its rule, SH degree, tile, chunk, dtype), with a plan for 1/255 beside them, on the
-scenes that are built in, or those named: milliseconds forward, and of value and
-gradient, against the errors of the picture and of the gradient. It exits with 1 if an
-error is beyond its bound at any pixel looked at. ``gsjax bench`` does one scene.
+scenes that are built in, and guitar and garden where their data are, or on those named:
+milliseconds forward, and of value and gradient, against the errors of the picture and
+of the gradient. It exits with 1 if an error is beyond its bound at any pixel looked
+at. ``gsjax bench`` does one scene.
 """
 
 from __future__ import annotations
@@ -16,20 +17,30 @@ import gsjax
 gsjax.use_all_cores(queued=False)
 
 import measure  # noqa: E402
+import scenes  # noqa: E402
 
 from gsjax import files, images  # noqa: E402
 from gsjax.bench.pareto import front, pareto, points, stages  # noqa: E402
 from gsjax.bench.scenes import open_trial  # noqa: E402
 from gsjax.bench.sheet import front_picture, table  # noqa: E402
-from gsjax.scene.trials import TRIALS  # noqa: E402
+from gsjax.scene.trials import TRIALS, Trial  # noqa: E402
+
+REAL = {"guitar": scenes.guitar, "garden": scenes.garden}
+
+
+def trial_of(name: str) -> Trial:
+    """A scene of the benchmarks, or as `gsjax bench` opens it."""
+    if name in REAL:
+        return Trial(*REAL[name](), background=(0.0, 0.0, 0.0))
+    return open_trial(name)
 
 
 def main() -> int:
     """Measure, save and draw; a scene that is measured again replaces its rows."""
-    names = sys.argv[1:] or list(TRIALS)
+    real = [name for name in REAL if (scenes.DATA / name).is_dir()]
     inside = True
-    for name in names:
-        trial = open_trial(name)
+    for name in sys.argv[1:] or [*TRIALS, *real]:
+        trial = trial_of(name)
         made = gsjax.plan(
             trial.gaussians, trial.camera, budget=1 / 255, background=trial.background
         )

@@ -115,6 +115,7 @@ def plot(rows: list[dict], path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib import ticker
 
     figure, axes = plt.subplots(1, 5, figsize=(20, 4))
 
@@ -152,6 +153,14 @@ def plot(rows: list[dict], path) -> None:
     axes[4].legend()
     for axis in axes:
         axis.grid(True, which="both", alpha=0.3)
+        low, high = axis.get_ylim()
+        if high < 100 * low:  # powers of ten alone would be too few
+            axis.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 3, 5)))
+            axis.yaxis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
+            axis.yaxis.set_minor_formatter(ticker.NullFormatter())
+    for axis in axes[2:4]:
+        axis.set_xticks([1, 2, 4, 8], labels=["1", "2", "4", "8"])
+        axis.minorticks_off()
     figure.tight_layout()
     figure.savefig(path, dpi=110)
 

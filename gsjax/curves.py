@@ -11,12 +11,12 @@ from gsjax.errors import InputError
 from gsjax.files import write_file
 from gsjax.sheets import put_text, text_width
 
-_PAPER, _INK, _GRID = (255, 255, 255), (70, 74, 82), (228, 230, 234)
+PAPER, _INK, _GRID = (255, 255, 255), (70, 74, 82), (228, 230, 234)
 COLORS = (
     (38, 98, 186), (214, 92, 52), (44, 142, 92), (142, 82, 168), (176, 138, 28),
     (20, 150, 170), (190, 60, 120), (110, 110, 110), (90, 60, 30), (0, 0, 0),
 )  # fmt: skip
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 18, 34, 40
+LEFT, _RIGHT, _TOP, _BOTTOM = 62, 18, 34, 40
 _FINE = 4  # bits of a pixel's fraction that OpenCV takes
 
 
@@ -103,24 +103,24 @@ def axes(
     if width < 200 or height < 120:
         raise InputError(f"size {size}: a plot has at least 200 × 120 px")
     least, most = np.transpose([x, y])
-    low, high = np.asarray([(_LEFT, height - _BOTTOM), (width - _RIGHT, _TOP)])
+    low, high = np.asarray([(LEFT, height - _BOTTOM), (width - _RIGHT, _TOP)])
 
     def place(points) -> np.ndarray:
         return low + (points - least) / (most - least) * (high - low)
 
-    plot = np.full((height, width, 3), _PAPER, np.uint8)
+    plot = np.full((height, width, 3), PAPER, np.uint8)
     for tick, text in _ticks(*y, (height - _TOP - _BOTTOM) // 45, log[1]):
         v = round(place((x[0], tick))[1])
-        cv2.line(plot, (_LEFT, v), (width - _RIGHT, v), _GRID, 1)
-        put_text(plot, text, (_LEFT - 8 - text_width(text), v + 4), _INK)
-    for tick, text in _ticks(*x, (width - _LEFT - _RIGHT) // 90, log[0]):
+        cv2.line(plot, (LEFT, v), (width - _RIGHT, v), _GRID, 1)
+        put_text(plot, text, (LEFT - 8 - text_width(text), v + 4), _INK)
+    for tick, text in _ticks(*x, (width - LEFT - _RIGHT) // 90, log[0]):
         u = round(place((tick, y[0]))[0])
         cv2.line(plot, (u, _TOP), (u, low[1]), _GRID, 1)
         put_text(plot, text, (u - text_width(text) // 2, low[1] + 16), _INK)
-    frame = np.asarray([(_LEFT, _TOP), low, (width - _RIGHT, low[1])], np.int32)
+    frame = np.asarray([(LEFT, _TOP), low, (width - _RIGHT, low[1])], np.int32)
     cv2.polylines(plot, [frame], False, _INK, 1)
-    put_text(plot, title, (_LEFT, 21), _INK, 0.5)
-    middle = (_LEFT + width - _RIGHT - text_width(x_label)) // 2
+    put_text(plot, title, (LEFT, 21), _INK, 0.5)
+    middle = (LEFT + width - _RIGHT - text_width(x_label)) // 2
     put_text(plot, x_label, (middle, height - 8), _INK)
     put_text(plot, y_label, (width - _RIGHT - text_width(y_label), 21), _INK)
     return plot, place

@@ -10,7 +10,7 @@ from conftest import camera_of, frustum_points, gaussians_at
 import gsjax
 from gsjax import RasterConfig, cli
 from gsjax.bench import pixelwise
-from gsjax.bench.fronts import Mark, scatter
+from gsjax.bench.fronts import Mark, _free_box, scatter
 from gsjax.bench.pareto import Point, front, pareto, points
 from gsjax.bench.scenes import facing, open_trial
 from gsjax.bench.sheet import front_picture, table
@@ -133,6 +133,20 @@ def test_marks_are_where_their_values_are():
     (above, left), (below, right) = spots
     assert left < right - 100
     assert above < below - 100
+
+
+def test_labels_are_clear_of_one_another():
+    """Of marks in one place, at the edge too; a label beside its mark if it may be."""
+    shape, taken = (300, 400, 3), []
+    for x, width in [(200, 60)] * 6 + [(390, 80)] * 6 + [(70, 50)] * 6:
+        box = _free_box(x, 150, width, shape, taken)
+        assert 0 <= box.left < box.right == box.left + width <= 400
+        assert 0 <= box.top < box.bottom <= 300
+        assert all(box.clear_of(other) for other in taken)
+        taken.append(box)
+    assert taken[0].left > 200 > 150 >= taken[0].bottom
+    assert taken[1].right < 200
+    assert _free_box(200, 150, 500, shape, []).right <= 400
 
 
 @pytest.mark.parametrize("name", TRIALS)

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax import images
-from gsjax.curves import COLORS, axes
+from gsjax.curves import COLORS, LEFT, PAPER, axes
 from gsjax.sheets import put_text, text_width
 
 _FRONT, _SMALL = (120, 124, 132), 0.36
+_LINE = 12  # px, height of a label
 
 
 class Mark(NamedTuple):
@@ -67,25 +68,54 @@ def _draw_front(plot: np.ndarray, places: np.ndarray) -> None:
 
 
 def _draw_marks(plot: np.ndarray, places: np.ndarray, marks: Sequence[Mark]) -> None:
-    """Dots, and labels moved down or up until they are clear of one another."""
+    """Dots and their labels, which are clear of dots and of one another."""
     cv2 = images.opencv()
     groups = list(dict.fromkeys(mark.group for mark in marks))
-    taken: list[tuple[int, int, int]] = []
+    colors = [COLORS[groups.index(mark.group) % len(COLORS)] for mark in marks]
+    spots = [(round(float(x)), round(float(y))) for x, y in places]
+    for spot, color in zip(spots, colors):
+        cv2.circle(plot, spot, 4, color, -1, 16)
+    taken = [_Box(x - 5, y - 5, x + 5, y + 5) for x, y in spots]
     for index in np.argsort(places[:, 1]):
-        mark = marks[index]
-        x, y = (round(float(v)) for v in places[index])
-        color = COLORS[groups.index(mark.group) % len(COLORS)]
-        cv2.circle(plot, (x, y), 4, color, -1, 16)
-        wide = text_width(mark.label, _SMALL)
-        line = y + 4
-        for shift in (0, 11, -11, 22, -22, 33, -33, 44, -44, 55, -55):
-            line = y - 5 + shift
-            clear = all(
-                abs(line - other) > 10 or x + 7 > right or x + 7 + wide < left
-                for left, right, other in taken
-            )
-            if clear:
-                break
-        left = min(x + 7, plot.shape[1] - wide - 2)
-        taken.append((left, left + wide, line))
-        put_text(plot, mark.label, (left, line), color, _SMALL)
+        (x, y), label, color = spots[index], marks[index].label, colors[index]
+        box = _free_box(x, y, text_width(label, _SMALL) + 4, plot.shape, taken)
+        taken.append(box)
+        middle = (box.top + box.bottom) // 2
+        if abs(middle - y) > 2 * _LINE:  # too far away to belong together by itself
+            near = box.left if box.left > x else box.right
+            cv2.line(plot, (x, y), (near, middle), color, 1, 16)
+        plot[box.top : box.bottom, box.left : box.right] = PAPER
+        put_text(plot, label, (box.left + 2, box.bottom - 3), color, _SMALL)
+
+
+class _Box(NamedTuple):
+    """A rectangle in px."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def clear_of(self, other: "_Box") -> bool:
+        across = self.right <= other.left or other.right <= self.left
+        return across or self.bottom <= other.top or other.bottom <= self.top
+
+
+def _free_box(
+    x: int, y: int, width: int, shape: tuple[int, ...], taken: Sequence[_Box]
+) -> _Box:
+    """Room for a label beside (x, y): to the right if there is any, else to the left,
+    at first above, then as far up or down as need be.
+    """
+    height, most = shape[0], shape[1] - width
+    boxes = []
+    for step in range(height // _LINE):
+        for shift in (step * _LINE, -step * _LINE):
+            for left in (x + 6, x - 6 - width):
+                top = y - _LINE + shift
+                if LEFT < left <= most and 0 <= top <= height - _LINE:
+                    boxes.append(_Box(left, top, left + width, top + _LINE))
+    if not boxes:  # a label wider than the plot
+        return _Box(0, 0, shape[1], _LINE)
+    free = (box for box in boxes if all(box.clear_of(other) for other in taken))
+    return next(free, boxes[0])

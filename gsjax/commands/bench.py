@@ -26,8 +26,7 @@ class BenchCommand(Command):
     scene: Annotated[Positional[str], arg(metavar="RUN|PLY|NAME")] = "knot"
     """The folder of a run, a .ply file, or built in: knot, fog, needles or huge."""
     cameras: Path | None = None
-    """A transforms.json, of which the first camera is taken; default: of a run its
-    first view, of a .ply one that looks at its middle."""
+    """First camera of this file; default: of the run, or one that faces the scene."""
     size: Annotated[str | None, arg(metavar="WxH")] = None
     """Size of the picture; default: that of the cameras, of a .ply 400x300."""
     budget: Annotated[str | None, arg(metavar="ERROR")] = None

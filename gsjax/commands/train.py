@@ -42,8 +42,7 @@ class TrainCommand(HeavyCommand):
     sh_degree: Literal[0, 1, 2, 3, 4] | None = None
     """Degree of the spherical harmonics; 0 is one colour from all sides."""
     background: Literal["auto", "black", "white", "random"] | None = None
-    """Behind the scene; random while training hides nothing in it; auto: random where
-    photographs are transparent, else black."""
+    """Behind the scene; auto: random where photographs are transparent, else black."""
     initial: Literal["points", "random"] | None = None
     """Start from the dataset's points, or from anywhere in view."""
     antialias: bool = False
