@@ -22,12 +22,12 @@ def on_ladder(
     Args:
       wanted: [] count, int or float.
       full: the capacity, taken where nothing smaller is enough.
-      rungs: number of sizes, at most; those below 256 are not worth their compilation.
+      rungs: number of sizes, at most; those below 128 are not worth their compilation.
       run: what to do at a size.
       step: ratio of one size to the next.
     """
     sizes = [full]
-    while len(sizes) < rungs and sizes[-1] >= 1024:
+    while len(sizes) < rungs and sizes[-1] >= 512:
         sizes.append(-(-sizes[-1] // step))
     if len(sizes) == 1:
         return run(full)
