@@ -11,6 +11,7 @@ at. ``gsjax bench`` does one scene.
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import gsjax
 
@@ -30,7 +31,7 @@ REAL = {"guitar": scenes.guitar, "garden": scenes.garden}
 
 def trial_of(name: str) -> Trial:
     """A scene of the benchmarks, or as `gsjax bench` opens it."""
-    if name in REAL:
+    if name in REAL and not Path(name).exists():
         return Trial(*REAL[name](), background=(0.0, 0.0, 0.0))
     return open_trial(name)
 

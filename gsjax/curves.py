@@ -16,7 +16,7 @@ COLORS = (
     (38, 98, 186), (214, 92, 52), (44, 142, 92), (142, 82, 168), (176, 138, 28),
     (20, 150, 170), (190, 60, 120), (110, 110, 110), (90, 60, 30), (0, 0, 0),
 )  # fmt: skip
-LEFT, _RIGHT, _TOP, _BOTTOM = 62, 18, 34, 40
+LEFT, RIGHT, TOP, BOTTOM = 62, 18, 34, 40
 _FINE = 4  # bits of a pixel's fraction that OpenCV takes
 
 
@@ -103,26 +103,26 @@ def axes(
     if width < 200 or height < 120:
         raise InputError(f"size {size}: a plot has at least 200 × 120 px")
     least, most = np.transpose([x, y])
-    low, high = np.asarray([(LEFT, height - _BOTTOM), (width - _RIGHT, _TOP)])
+    low, high = np.asarray([(LEFT, height - BOTTOM), (width - RIGHT, TOP)])
 
     def place(points) -> np.ndarray:
         return low + (points - least) / (most - least) * (high - low)
 
     plot = np.full((height, width, 3), PAPER, np.uint8)
-    for tick, text in _ticks(*y, (height - _TOP - _BOTTOM) // 45, log[1]):
+    for tick, text in _ticks(*y, (height - TOP - BOTTOM) // 45, log[1]):
         v = round(place((x[0], tick))[1])
-        cv2.line(plot, (LEFT, v), (width - _RIGHT, v), _GRID, 1)
+        cv2.line(plot, (LEFT, v), (width - RIGHT, v), _GRID, 1)
         put_text(plot, text, (LEFT - 8 - text_width(text), v + 4), _INK)
-    for tick, text in _ticks(*x, (width - LEFT - _RIGHT) // 90, log[0]):
+    for tick, text in _ticks(*x, (width - LEFT - RIGHT) // 90, log[0]):
         u = round(place((tick, y[0]))[0])
-        cv2.line(plot, (u, _TOP), (u, low[1]), _GRID, 1)
+        cv2.line(plot, (u, TOP), (u, low[1]), _GRID, 1)
         put_text(plot, text, (u - text_width(text) // 2, low[1] + 16), _INK)
-    frame = np.asarray([(LEFT, _TOP), low, (width - _RIGHT, low[1])], np.int32)
+    frame = np.asarray([(LEFT, TOP), low, (width - RIGHT, low[1])], np.int32)
     cv2.polylines(plot, [frame], False, _INK, 1)
     put_text(plot, title, (LEFT, 21), _INK, 0.5)
-    middle = (LEFT + width - _RIGHT - text_width(x_label)) // 2
+    middle = (LEFT + width - RIGHT - text_width(x_label)) // 2
     put_text(plot, x_label, (middle, height - 8), _INK)
-    put_text(plot, y_label, (width - _RIGHT - text_width(y_label), 21), _INK)
+    put_text(plot, y_label, (width - RIGHT - text_width(y_label), 21), _INK)
     return plot, place
 
 
@@ -197,7 +197,7 @@ def short_number(value: float) -> str:
 def legend(plot: np.ndarray, labels: list[str], faint: Sequence[bool] = ()) -> None:
     """Names in the colours of their lines, at the right above the frame."""
     cv2 = images.opencv()
-    right = plot.shape[1] - _RIGHT
+    right = plot.shape[1] - RIGHT
     for index in reversed(range(len(labels))):
         right -= text_width(labels[index])
         put_text(plot, labels[index], (right, 21), _INK)

@@ -1,5 +1,6 @@
 """The instrument: what theory allows at a pixel, the front, the plot, the scenes."""
 
+import itertools
 import json
 
 import jax.numpy as jnp
@@ -10,10 +11,11 @@ from conftest import camera_of, frustum_points, gaussians_at
 import gsjax
 from gsjax import RasterConfig, cli
 from gsjax.bench import pixelwise
-from gsjax.bench.fronts import Mark, _free_box, scatter
+from gsjax.bench.fronts import Box, Mark, label_boxes, scatter
 from gsjax.bench.pareto import Point, front, pareto, points
 from gsjax.bench.scenes import facing, open_trial
 from gsjax.bench.sheet import front_picture, table
+from gsjax.curves import BOTTOM, LEFT, RIGHT, TOP
 from gsjax.errors import InputError
 from gsjax.scene.trials import TRIALS, Trial
 
@@ -135,18 +137,22 @@ def test_marks_are_where_their_values_are():
     assert above < below - 100
 
 
-def test_labels_are_clear_of_one_another():
-    """Of marks in one place, at the edge too; a label beside its mark if it may be."""
-    shape, taken = (300, 400, 3), []
-    for x, width in [(200, 60)] * 6 + [(390, 80)] * 6 + [(70, 50)] * 6:
-        box = _free_box(x, 150, width, shape, taken)
-        assert 0 <= box.left < box.right == box.left + width <= 400
-        assert 0 <= box.top < box.bottom <= 300
-        assert all(box.clear_of(other) for other in taken)
-        taken.append(box)
-    assert taken[0].left > 200 > 150 >= taken[0].bottom
-    assert taken[1].right < 200
-    assert _free_box(200, 150, 500, shape, []).right <= 400
+def test_labels_are_clear_of_dots_and_of_one_another():
+    """Of dots in one place, at the edge too; beside the dot if that may be."""
+    spots = [(200, 150)] * 6 + [(390, 151)] * 6 + [(75, 149)] * 6 + [(206, 40)]
+    boxes = label_boxes(spots, ["label"] * len(spots), (400, 300))
+    for one, other in itertools.combinations(boxes, 2):
+        assert one.clear_of(other)
+    for box in boxes:
+        assert LEFT < box.left < box.right <= 400 - RIGHT
+        assert TOP <= box.top < box.bottom <= 300 - BOTTOM
+        dots = (Box(x - 4, y - 4, x + 4, y + 4) for x, y in spots)
+        assert all(box.clear_of(dot) for dot in dots)
+    first, second = sorted(boxes[:6], key=lambda box: abs(box.bottom - 150))[:2]
+    assert {first.left > 200, second.left > 200} == {True, False}
+    assert all(box.right < 390 for box in boxes[6:12])
+    (wide,) = label_boxes([(200, 150)], ["w" * 99], (400, 300))
+    assert wide.left == LEFT + 1
 
 
 @pytest.mark.parametrize("name", TRIALS)

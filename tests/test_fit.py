@@ -27,6 +27,7 @@ from training import (
     scene,
 )
 
+import gsjax.train.fit as fit_module
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import CapacityError, DivergedError, InputError
@@ -233,6 +234,27 @@ def test_too_few_pairs_and_slots_are_grown():
     assert bits(state) == before  # the caller's is still there
 
 
+@on_cpu
+@pytest.mark.parametrize("bad", [0, 1])
+def test_what_was_learnt_is_saved_when_pairs_become_too_many(bad, monkeypatch):
+    """As pictures become finer; not where it had just come to nothing."""
+    config = CONFIGS["adaptive"]
+    begun, _ = run(config, Log(stop_at=FINER - 1))
+    log = Log()
+
+    def too_many(*_):
+        raise CapacityError("too many")
+
+    monkeypatch.setattr(fit_module, "pairs_for", too_many)
+    monkeypatch.setattr(
+        fit_module.Health, "look", lambda self, _: setattr(self, "bad", bad)
+    )
+    with pytest.raises(CapacityError, match="too many"):
+        run(config, log, state=begun.state, pair_capacity=begun.pair_capacity)
+    assert [record["step"] for record in log.records] == [FINER]
+    assert log.saved == ([] if bad else [FINER])
+
+
 def test_growing_adds_empty_slots():
     state = init_state(rough_start(1, 64), CONFIGS["adaptive"], EXTENT, VIEWS)
     moments = jax.tree.map(lambda a: a + 1, state.moments)
@@ -295,19 +317,26 @@ def test_a_photograph_for_each_view():
 
 
 def test_more_room_while_gaussians_are_added():
-    """Fewer programs then: each growth lasts longer. Not for more than may come."""
+    """Fewer programs then: each lasts longer. Not for more than may come, nor, where
+    there are many steps ahead, so much that it costs more than a program."""
+    many = 100 * int(num_active(initial_state(scene(), CONFIG).gaussians))
 
-    first = int(num_active(initial_state(scene(), CONFIG).gaussians))
-
-    def room(step, most):
-        chosen = replace(CONFIG.chosen, max_gaussians=most)
-        config = CONFIG.replace(**{CONFIG.strategy: chosen})
+    def margin(pairs, step, most, steps, stop=5000):
+        chosen = replace(CONFIG.chosen, max_gaussians=most, stop=stop)
+        config = CONFIG.replace(
+            **{CONFIG.strategy: chosen}, steps=steps, levels=(Level(0.0, 1),)
+        )
         state = initial_state(scene(), config).replace(step=jnp.int32(step))
-        return roomy_pairs(8000, state, config)
+        return roomy_pairs(pairs, state, config) / pairs
 
-    stop, many = CONFIG.chosen.stop, 100 * first
-    assert room(stop - 1, many) > 2 * 8000 > room(stop, many) > 8000
-    assert room(stop - 1, first) == room(stop, first)
+    roomy = margin(300_000, 0, many, 100)
+    assert roomy == pytest.approx(4, rel=0.4)
+    assert margin(300_000, 0, many, 10_000) == pytest.approx(2.5, rel=0.2)
+    between = margin(60_000, 0, many, 1500)  # 1 + 1.8e8 / 1500 / 60_000
+    assert between == pytest.approx(3, rel=0.2)
+    assert margin(300_000, 99, many, 100) == roomy
+    settled = margin(300_000, 60, many, 100, stop=60)
+    assert settled == margin(300_000, 0, many // 100, 100) < 2
 
 
 def test_more_pairs_than_can_be_addressed():

@@ -1,17 +1,17 @@
 """A scatter plot on two logarithmic axes, with the Pareto front; drawn by OpenCV."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from gsjax import images
-from gsjax.curves import COLORS, LEFT, PAPER, axes
+from gsjax.curves import BOTTOM, COLORS, LEFT, PAPER, RIGHT, TOP, axes
 from gsjax.sheets import put_text, text_width
 
 _FRONT, _SMALL = (120, 124, 132), 0.36
-_LINE = 12  # px, height of a label
+_LINE, _DOT = 12, 5  # px: height of a label, half a dot and its margin
 
 
 class Mark(NamedTuple):
@@ -68,27 +68,26 @@ def _draw_front(plot: np.ndarray, places: np.ndarray) -> None:
 
 
 def _draw_marks(plot: np.ndarray, places: np.ndarray, marks: Sequence[Mark]) -> None:
-    """Dots and their labels, which are clear of dots and of one another."""
+    """Dots and their labels."""
     cv2 = images.opencv()
     groups = list(dict.fromkeys(mark.group for mark in marks))
     colors = [COLORS[groups.index(mark.group) % len(COLORS)] for mark in marks]
     spots = [(round(float(x)), round(float(y))) for x, y in places]
-    for spot, color in zip(spots, colors):
-        cv2.circle(plot, spot, 4, color, -1, 16)
-    taken = [_Box(x - 5, y - 5, x + 5, y + 5) for x, y in spots]
-    for index in np.argsort(places[:, 1]):
-        (x, y), label, color = spots[index], marks[index].label, colors[index]
-        box = _free_box(x, y, text_width(label, _SMALL) + 4, plot.shape, taken)
-        taken.append(box)
+    labels = [mark.label for mark in marks]
+    boxes = label_boxes(spots, labels, (plot.shape[1], plot.shape[0]))
+    for (x, y), box, color in zip(spots, boxes, colors):
         middle = (box.top + box.bottom) // 2
         if abs(middle - y) > 2 * _LINE:  # too far away to belong together by itself
             near = box.left if box.left > x else box.right
             cv2.line(plot, (x, y), (near, middle), color, 1, 16)
+    for box, label, color in zip(boxes, labels, colors):
         plot[box.top : box.bottom, box.left : box.right] = PAPER
         put_text(plot, label, (box.left + 2, box.bottom - 3), color, _SMALL)
+    for spot, color in zip(spots, colors):
+        cv2.circle(plot, spot, _DOT - 1, color, -1, 16)
 
 
-class _Box(NamedTuple):
+class Box(NamedTuple):
     """A rectangle in px."""
 
     left: int
@@ -96,26 +95,38 @@ class _Box(NamedTuple):
     right: int
     bottom: int
 
-    def clear_of(self, other: "_Box") -> bool:
+    def clear_of(self, other: "Box") -> bool:
+        """Whether they have no pixel in common."""
         across = self.right <= other.left or other.right <= self.left
         return across or self.bottom <= other.top or other.bottom <= self.top
 
 
-def _free_box(
-    x: int, y: int, width: int, shape: tuple[int, ...], taken: Sequence[_Box]
-) -> _Box:
-    """Room for a label beside (x, y): to the right if there is any, else to the left,
-    at first above, then as far up or down as need be.
+def label_boxes(
+    spots: Sequence[tuple[int, int]], labels: Sequence[str], size: tuple[int, int]
+) -> list[Box]:
+    """Room for the labels of dots at ``spots``, within the frame of a plot.
+
+    Clear of dots and of one another, as long as there is room: beside the dot, or else
+    as little above or below it as can be.
     """
-    height, most = shape[0], shape[1] - width
-    boxes = []
-    for step in range(height // _LINE):
-        for shift in (step * _LINE, -step * _LINE):
-            for left in (x + 6, x - 6 - width):
-                top = y - _LINE + shift
-                if LEFT < left <= most and 0 <= top <= height - _LINE:
-                    boxes.append(_Box(left, top, left + width, top + _LINE))
-    if not boxes:  # a label wider than the plot
-        return _Box(0, 0, shape[1], _LINE)
-    free = (box for box in boxes if all(box.clear_of(other) for other in taken))
-    return next(free, boxes[0])
+    taken = [Box(x - _DOT, y - _DOT, x + _DOT, y + _DOT) for x, y in spots]
+    boxes = {}
+    for index in sorted(range(len(spots)), key=lambda i: spots[i][1]):
+        width = text_width(labels[index], _SMALL) + 4
+        tried = list(_boxes_beside(*spots[index], width, size))
+        free = (box for box in tried if all(box.clear_of(other) for other in taken))
+        boxes[index] = next(free, tried[0])
+        taken.append(boxes[index])
+    return [boxes[index] for index in range(len(spots))]
+
+
+def _boxes_beside(x: int, y: int, width: int, size: tuple[int, int]) -> Iterator[Box]:
+    """To the right of a dot and to the left, just above it, then ever further away."""
+    least, most = LEFT + 1, size[0] - RIGHT - width
+    low, high = TOP, size[1] - BOTTOM - _LINE
+    sides = [s for s in (x + _DOT + 1, x - _DOT - 1 - width) if least <= s <= most]
+    for step in range(size[1] // _LINE):
+        for top in dict.fromkeys((y + (step - 1) * _LINE, y - (step + 1) * _LINE)):
+            if low <= top <= high:
+                for left in sides or [max(least, most)]:
+                    yield Box(left, top, left + width, top + _LINE)

@@ -26,7 +26,7 @@ class BenchCommand(Command):
     scene: Annotated[Positional[str], arg(metavar="RUN|PLY|NAME")] = "knot"
     """The folder of a run, a .ply file, or built in: knot, fog, needles or huge."""
     cameras: Path | None = None
-    """First camera of this file; default: of the run, or one that faces the scene."""
+    """First camera of this transforms.json; else the scene's own, or one facing it."""
     size: Annotated[str | None, arg(metavar="WxH")] = None
     """Size of the picture; default: that of the cameras, of a .ply 400x300."""
     budget: Annotated[str | None, arg(metavar="ERROR")] = None

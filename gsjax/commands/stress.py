@@ -19,7 +19,7 @@ class StressCommand(Command):
     json: Path | None = None
     """Write the results to this file."""
     markdown: Path | None = None
-    """Put the table into this file, between its comments "gsjax stress"."""
+    """Put the table into this file, between its comments "(/)gsjax stress"."""
     overwrite: bool = False
     """Replace a --json file that exists."""
 

@@ -30,12 +30,12 @@ _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 def running_product(alpha: Array) -> tuple[Array, Array]:
     """(Π over all K, Π over those before k [G, K, P]) of 1 − alpha [G, K, P].
 
-    By taking T α off T, which rounds once a factor, and T (1 − α) twice.
+    T − T α would round once a factor where α is small, and cancel where it is large.
     """
     product, before = jnp.ones_like(alpha[:, :1]), []
     for part in _parts(alpha):
         before.append(product)
-        product = product - product * part
+        product = product * (1 - part)
     return product[:, 0], lax.concatenate(before, 1)
 
 

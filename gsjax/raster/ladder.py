@@ -9,6 +9,7 @@ from jax import lax
 from gsjax.raster.types import Array
 
 T = TypeVar("T")
+_LEAST = 128  # smaller sizes are not worth their compilation
 
 
 def on_ladder(
@@ -22,12 +23,12 @@ def on_ladder(
     Args:
       wanted: [] count, int or float.
       full: the capacity, taken where nothing smaller is enough.
-      rungs: number of sizes, at most; those below 128 are not worth their compilation.
+      rungs: number of sizes, at most; fewer where they would be below 128.
       run: what to do at a size.
       step: ratio of one size to the next.
     """
     sizes = [full]
-    while len(sizes) < rungs and sizes[-1] >= 512:
+    while len(sizes) < rungs and sizes[-1] >= _LEAST * step:
         sizes.append(-(-sizes[-1] // step))
     if len(sizes) == 1:
         return run(full)

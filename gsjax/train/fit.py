@@ -205,25 +205,27 @@ class _Run:
             if frames is None or finer:
                 divisor = config.divisor(step)
                 frames = make_frames(self.scene.views, self.photos, divisor)
-            if pair_capacity is None or finer:
-                begun = time.perf_counter()
-                pair_capacity = pairs_for(state, frames, config)
-                self.compile_seconds += time.perf_counter() - begun
-            # No limit of what is visible: only the pairs are regrown.
-            raster = config.raster.replace(
-                pair_capacity=pair_capacity, visible_capacity=None
-            )
             try:
+                if pair_capacity is None or finer:
+                    begun = time.perf_counter()
+                    pair_capacity = pairs_for(state, frames, config)
+                    self.compile_seconds += time.perf_counter() - begun
+                # No limit of what is visible: only the pairs are regrown.
+                raster = config.raster.replace(
+                    pair_capacity=pair_capacity, visible_capacity=None
+                )
                 program = self.program(state, frames, raster)
+                state, metrics = program(state, frames)
+                metrics = jax.device_get(metrics)
+                if metrics.overflowed:
+                    wanted = int(metrics.pair_capacity)
+                    pair_capacity = roomy_pairs(wanted, state, config)
+                    continue
             except CapacityError:
-                if progress is not None:  # nothing that was learnt is lost
-                    hooks.checkpoint(state, pair_capacity, progress)
+                # Nothing that was learnt is lost, unless it is worth nothing.
+                if progress is not None and not health.bad:
+                    hooks.checkpoint(state, pair_capacity or 0, progress)
                 raise
-            state, metrics = program(state, frames)
-            metrics = jax.device_get(metrics)
-            if metrics.overflowed:
-                pair_capacity = roomy_pairs(int(metrics.pair_capacity), state, config)
-                continue
             step = int(metrics.step)
             progress = self.progress(metrics, divisor, state)
             health.look(metrics)

@@ -4,8 +4,6 @@ Each growth is a new program, which takes longer to compile than a little room b
 what is wanted costs in all its steps.
 """
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,8 +17,9 @@ from gsjax.train.step import TrainState
 
 # Room beyond what is wanted now, so that it lasts for a while.
 _SLOT_MARGIN = 1.3
-_PAIR_MARGIN, _GROWING_MARGIN = 1.5, 4.0
-_PER_GROWTH = 1.2  # what is added is smaller than what is there
+# For pairs: of a scene that does not grow, and from less to more of one that does.
+_PAIR_MARGIN, _GROWING_MARGINS = 1.5, (2.5, 4.0)
+_PER_GROWTH = 1.2  # pairs grow with Gaussians, and views not probed may want more
 # A program takes as long to compile as so many empty pairs take in one step: 22 s at
 # 0.12 µs each, on two cores.
 _PAIRS_OF_PROGRAM = 1.8e8
@@ -31,11 +30,11 @@ def pairs_for(state: TrainState, frames: Frames, config: TrainConfig) -> int:
     """A pair capacity for these photographs, with room to spare.
 
     Raises:
-      CapacityError: as `roomy_pairs`.
+      CapacityError: as `roomy_pairs` and `count_demand`.
     """
-    few = np.linspace(0, frames.count - 1, min(frames.count, _MAX_PROBED_VIEWS))
+    probed = np.linspace(0, frames.count - 1, min(frames.count, _MAX_PROBED_VIEWS))
     most = 1
-    for index in np.unique(few.astype(int)):
+    for index in np.unique(probed.astype(int)):
         camera = jax.tree.map(lambda a, i=index: a[i], frames.camera)
         # The same settings for each: one program.
         demand = count_demand(state.gaussians, camera, config.raster)
@@ -54,16 +53,20 @@ def roomy_pairs(wanted: int, state: TrainState, config: TrainConfig) -> int:
             f"a step wants {wanted:,} or more pairs, above the limit of {2**30 - 1:,}; "
             "train with smaller images, fewer Gaussians, or larger tiles"
         )
-    extra = (_PAIR_MARGIN - 1) * wanted
-    steps = config.chosen.stop - int(state.step)
-    if steps > 0:
+    step, margin = int(state.step), _PAIR_MARGIN
+    if step < config.chosen.stop:
+        # Room until the next program is due anyway, at the price of one.
+        worth = _PAIRS_OF_PROGRAM / _steps_of_program(step, config)
+        growing = float(np.clip(1 + worth / wanted, *_GROWING_MARGINS))
         growth = config.max_gaussians / max(1, int(num_active(state.gaussians)))
-        margin = min(_PER_GROWTH * growth, _GROWING_MARGIN)
-        to_come = max(margin - 1, 0) * wanted
-        # Room and the programs until then cost least together if each lasts for these.
-        each = math.sqrt(2 * _PAIRS_OF_PROGRAM * to_come / steps)
-        extra = max(extra, min(to_come, each))
-    return min(capacity_bucket(int(wanted + extra)), 2**30 - 1)
+        margin = max(margin, min(_PER_GROWTH * growth, growing))
+    return min(capacity_bucket(int(margin * wanted)), 2**30 - 1)
+
+
+def _steps_of_program(step: int, config: TrainConfig) -> int:
+    """Steps from this one on until the photographs become finer, or the run ends."""
+    finer = (level.start * config.steps for level in config.levels)
+    return max(1, int(min((s for s in finer if s > step), default=config.steps)) - step)
 
 
 def with_slots(state: TrainState, wanted: int, config: TrainConfig) -> TrainState:

@@ -54,7 +54,8 @@ _WORKERS = """<script>
       const text = window.origin === "null" ? texts.get(String(url)) : undefined;
       const data = "data:text/javascript;charset=utf-8,";
       super(text === undefined ? url : data + encodeURIComponent(text), options);
-      if (text !== undefined) this.addEventListener("error", complain);
+      const fromDisk = window.origin === "null" && /^(blob|data):/.test(String(url));
+      if (fromDisk) this.addEventListener("error", complain);
     }
   };
 })();
