@@ -6,6 +6,7 @@ of Gaussians and the same image size, and all tests call the same jitted functio
 
 import gc
 import os
+import signal
 import tempfile
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,9 @@ jax.config.update("jax_num_cpu_devices", 2)
 # Commands keep what they compile: for as long as these tests run, and not at home.
 _CACHE = tempfile.TemporaryDirectory(prefix="gsjax-tests-")
 os.environ["XDG_CACHE_HOME"] = _CACHE.name
+# What a shell starts in the background ignores Ctrl-C, and so would our processes.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import jax.numpy as jnp
 
