@@ -20,6 +20,7 @@ def nothing(needed, inputs):
     return jnp.full_like(inputs[0], -1), jnp.zeros_like(needed, jnp.int32)
 
 
+@on_cpu
 @pytest.mark.parametrize("size", [1, 7, BLOCK, 2 * BLOCK + 5])
 def test_blocks_without_need_are_skipped(size):
     values = jnp.arange(size, dtype=jnp.float32)
@@ -31,6 +32,14 @@ def test_blocks_without_need_are_skipped(size):
         np.testing.assert_array_equal(
             squares, np.where(same_block, np.square(values), -1)
         )
+
+
+def test_accelerators_take_one_block(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    values = jnp.arange(2 * BLOCK + 5, dtype=jnp.float32)
+    squares, done = by_blocks(square_and_count, nothing, values == 3, (values,))
+    np.testing.assert_array_equal(squares, np.square(values))
+    assert done.all()
 
 
 @on_cpu

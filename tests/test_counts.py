@@ -32,9 +32,18 @@ def test_squeeze_keeps_the_first(room):
 
 def test_expand_unrolls_counts():
     counts = np.array([2, 0, 3, 0, 0, 1], np.int32)
-    owner, place = jax.jit(expand, static_argnums=1)(counts, 9)
+    owner, first = jax.jit(expand, static_argnums=1)(counts, 9)
     np.testing.assert_array_equal(owner, [0, 0, 2, 2, 2, 5, 6, 6, 6])
-    np.testing.assert_array_equal(place[:6], [0, 1, 0, 1, 2, 0])
+    np.testing.assert_array_equal(first, [0, 2, 2, 5, 5, 5])
+
+
+def test_expand_goes_on_from_an_item():
+    counts = np.array([2, 0, 3, 0, 0, 1], np.int32)
+    whole, _ = expand(counts, 9)
+    rest, first = expand(counts, 5, 4)
+    np.testing.assert_array_equal(rest, whole[4:])
+    number = np.arange(5) - first[np.minimum(rest, 5)]
+    np.testing.assert_array_equal(number[:2], [2, 0])
 
 
 @pytest.mark.parametrize("extra", [-2, 0, 1, 2**30])

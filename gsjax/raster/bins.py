@@ -12,10 +12,12 @@ K Gaussians of a chunk.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 
 from gsjax.numerics import safe_sqrt
+from gsjax.raster.blocks import by_blocks
 from gsjax.raster.counts import COUNT_LIMIT, expand, running_total, total_count
 from gsjax.raster.sorting import argsort_descending, sort_pairs
 from gsjax.raster.types import Array, Projected, RasterConfig
@@ -181,16 +183,17 @@ def _take(values: Array, index: Array) -> Array:
     return values.at[index].get(mode="fill", fill_value=0)
 
 
-def _column_spans(
+def _tiles_in_row(
     projected: Projected, rank: Array, row: Array, grid: Grid, device: Array
 ) -> tuple[Array, Array]:
     """First tile and number of tiles that the ellipse meets along one row of tiles.
 
-    The extreme x of Q ≤ reach within the strip dy ∈ [low, high] lies at the ellipse's
-    own extreme if that is in the strip, else on the strip's nearer edge (the region
-    is convex). The strip spans pixel *centres*: what falls between them is unseen.
+    None for a rank of R, one past the last. The extreme x of Q ≤ reach within the strip
+    dy ∈ [low, high] lies at the ellipse's own extreme if that is in the strip, else on
+    the strip's nearer edge (the region is convex). The strip spans pixel *centres*:
+    what falls between them is unseen.
     """
-    u, v, slope, var_y, det, reach = (
+    u, v, slope, var_y, det, reach, inv_sx = (
         _take(value, rank)
         for value in (
             projected.u,
@@ -199,9 +202,10 @@ def _column_spans(
             projected.var_y,
             projected.det,
             projected.reach,
+            projected.inv_sx,
         )
     )
-    var_x = 1 / jnp.square(_take(projected.inv_sx, rank))
+    var_x = 1 / jnp.square(inv_sx)
     _, top = tile_origins(grid, row * grid.cols, device)
     low = top.astype(u.dtype) + 0.5 - v
     high = jnp.minimum(low + (grid.tile - 1), grid.height - 0.5 - v)
@@ -219,7 +223,7 @@ def _column_spans(
     last = jnp.clip(jnp.floor(u + right - 0.5), -1, grid.width - 1).astype(jnp.int32)
     first_tile, last_tile = first // grid.tile, last // grid.tile
     count = jnp.where((reach > 0) & (first <= last), last_tile - first_tile + 1, 0)
-    return first_tile, count
+    return row * grid.cols + first_tile, count
 
 
 def make_lists(
@@ -236,18 +240,25 @@ def make_lists(
     ranks = projected.u.shape[0]
     items, safe = total_count(spans.rows)
     counts = jnp.where(safe & (items <= capacity), spans.rows, 0)
-    rank, place = expand(counts, capacity)
-    row = _take(spans.first, rank) + place
-    first_tile, tile_count = _column_spans(projected, rank, row, grid, device)
-    tile_count = jnp.where(rank < ranks, tile_count, 0)
-    pairs, safe = total_count(tile_count)
-    tile_count = jnp.where(safe & (pairs <= capacity), tile_count, 0)
+    rank, start = expand(counts, capacity)
+    index = lax.iota(jnp.int32, capacity)
 
-    item, place = expand(tile_count, capacity)
+    # By blocks, though not only to skip those without items: XLA would compute the
+    # first tile of an item again for each of its pairs, but not across a loop.
+    def look(_, inputs):
+        rank, index = inputs
+        row = _take(spans.first - start, rank) + index
+        return _tiles_in_row(projected, rank, row, grid, device)
+
+    def skip(_, inputs):
+        return jax.tree.map(jnp.zeros_like, inputs)
+
+    first, counts = by_blocks(look, skip, rank < ranks, (rank, index))
+    pairs, safe = total_count(counts)
+    counts = jnp.where(safe & (pairs <= capacity), counts, 0)
+    item, start = expand(counts, capacity)
     live = item < capacity
-    tile = jnp.where(
-        live, _take(row * grid.cols + first_tile, item) + place, grid.tiles
-    )
+    tile = jnp.where(live, _take(first - start, item) + index, grid.tiles)
     pair_rank = jnp.where(live, _take(rank, item), ranks)
     return Lists(
         ranks=sort_pairs(tile, pair_rank, grid.tiles + 1, ranks + 1),
@@ -272,13 +283,12 @@ def count_lists(
 
     def add(state):
         index, change = state
-        rank, place = expand(spans.rows, ranks, index * ranks)
-        row = _take(spans.first, rank) + place
-        first, count = _column_spans(projected, rank, row, grid, device)
-        some = ((rank < ranks) & (count > 0)).astype(jnp.int32)
-        tile = row * grid.cols + first
-        change = change.at[tile].add(some, mode="drop")
-        return index + 1, change.at[tile + count].add(-some, mode="drop")
+        rank, start = expand(spans.rows, ranks, index * ranks)
+        row = _take(spans.first - start, rank) + lax.iota(jnp.int32, ranks)
+        first, count = _tiles_in_row(projected, rank, row, grid, device)
+        some = (count > 0).astype(jnp.int32)
+        change = change.at[first].add(some, mode="drop")
+        return index + 1, change.at[first + count].add(-some, mode="drop")
 
     start = (jnp.int32(0), jnp.zeros(grid.tiles, jnp.int32))
     _, change = lax.while_loop(lambda state: state[0] < rounds, add, start)
@@ -326,7 +336,8 @@ def make_work(
     """
     blocks = schedule.levels.shape[0]
     fits = lists.fit & (schedule.steps <= room)
-    block, level = expand(jnp.where(fits, schedule.levels, 0), room)
+    block, begin = expand(jnp.where(fits, schedule.levels, 0), room)
+    level = lax.iota(jnp.int32, room) - _take(begin, block)
     live = block < blocks
     start = running_total(lists.length) - lists.length
     tile = schedule.tiles.at[block].get(mode="fill", fill_value=lists.length.shape[0])

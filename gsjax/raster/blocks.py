@@ -3,6 +3,7 @@
 What is paid then goes with the slots in use and not with the capacity. Made for what
 no derivative is taken of: a transposed loop would copy more than it saves. Nor are the
 blocks shared by devices: on CPU the exchange of what comes out costs as much.
+Accelerators, where a loop waits for its launches, take everything as one block.
 """
 
 from collections.abc import Callable
@@ -33,7 +34,7 @@ def by_blocks(
       Arrays [N, …].
     """
     size = needed.shape[0]
-    block = max(1, min(BLOCK, size))
+    block = max(1, min(BLOCK, size) if jax.default_backend() == "cpu" else size)
     blocks = -(-size // block)
 
     def split(a: Array) -> Array:

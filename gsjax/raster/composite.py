@@ -30,12 +30,13 @@ _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 def running_product(alpha: Array) -> tuple[Array, Array]:
     """(Π over all K, Π over those before k [G, K, P]) of 1 − alpha [G, K, P].
 
-    T − T α would round once a factor where α is small, and cancel where it is large.
+    T − T α rounds less than T (1 − α) where α is small; from a half on 1 − α is exact.
     """
     product, before = jnp.ones_like(alpha[:, :1]), []
     for part in _parts(alpha):
         before.append(product)
-        product = product * (1 - part)
+        less = product - product * part
+        product = jnp.where(part < 0.5, less, product * (1 - part))
     return product[:, 0], lax.concatenate(before, 1)
 
 
@@ -183,7 +184,10 @@ def _blend(
     sums = channel_sums(jnp.where(blended, alpha * before, 0), chunk.channels)
     out = {"sums": carried[:, None] * sums}
     if chunk.depth is not None:
-        half = (reached > 0.5) & (behind <= 0.5) & blended
+        # What is behind one is what reaches the next, to the bit: computed in any other
+        # way one half may be crossed twice, or not at all.
+        after = jnp.concatenate([reached[:, 1:], (carried * total)[:, None]], 1)
+        half = (reached > 0.5) & (after <= 0.5) & blended
         out["median"] = jnp.sum(jnp.where(half, chunk.depth, 0), axis=1)
     return carried * total, out
 

@@ -36,17 +36,19 @@ def running_total(counts: Array, levels: int = 3) -> Array:
 
 
 def expand(counts: Array, capacity: int, start=0) -> tuple[Array, Array]:
-    """Unroll ``counts`` [n] into items: (owner, place within owner), [capacity] each.
+    """Unroll ``counts`` [n] into items, from item ``start`` on.
 
-    From item ``start`` on. Items past the total have owner n. The counts must sum to
-    less than 2^31.
+    The counts must sum to less than 2^31.
+
+    Returns:
+      owner: [capacity] int32, whose each item is, rising; n past the total.
+      first: [n] int32, where the items of each begin: item i is number
+        i - first[owner[i]] of its owner's.
     """
     ends = running_total(counts) - start
     passed = jnp.zeros(capacity, jnp.int32)
     passed = passed.at[jnp.maximum(ends, 0)].add(1, mode="drop")
-    owner = running_total(passed)
-    starts = (ends - counts).at[owner].get(mode="fill", fill_value=0)
-    return owner, lax.iota(jnp.int32, capacity) - starts
+    return running_total(passed), ends - counts
 
 
 def squeeze(chosen: Array, room: int) -> tuple[Array, Array]:

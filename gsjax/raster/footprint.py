@@ -18,11 +18,12 @@ from gsjax.raster.types import RasterConfig
 _PAIRS = "for (tile, Gaussian) pairs"
 _GAUSSIANS, _PICTURES = "for projected Gaussians", "for pictures"
 
-# Numbers of a Gaussian in a chunk beside its channels: rank, place, ellipse, opacity,
-# and what is made on the way to them.
-_IN_CHUNK = 12
+# Numbers of a Gaussian in a chunk beside its channels: rank, place, ellipse, opacity;
+# and those more than twice as many with gradients.
+_IN_CHUNK, _IN_CHUNK_LEARNT = 7, 8
 _IN_LISTS = 4  # of a pair, while it is sorted
-_PROJECTED = 53  # of a Gaussian beside its own numbers, as all stages come to
+# Of a Gaussian beside its own numbers, as all stages come to; and with gradients.
+_PROJECTED, _PROJECTED_LEARNT = 42, 60
 # Bytes of a pixel: images and their tiles; with gradients; and what SSIM blurs, which
 # the devices share.
 _OF_PIXEL, _OF_PIXEL_LEARNT, _BLURRED = 26, 35, 190
@@ -61,10 +62,11 @@ def render_estimate(
     channels = 1 + 3 * ("rgb" in config.outputs) + ("depth" in config.outputs)
     in_chunk, carried = _IN_CHUNK + channels, 0
     if gradients:  # forward and backward; and the transmittance kept of each step
-        in_chunk, carried = 2 * in_chunk - 2, config.tile_size**2
+        in_chunk, carried = 2 * in_chunk + _IN_CHUNK_LEARNT, config.tile_size**2
     pairs = width * rows * (config.chunk_size * in_chunk + carried)
     numbers = 11 + 3 * bases
-    gaussians = seen * (_PROJECTED + numbers * (3 if gradients else 1))
+    projected = _PROJECTED_LEARNT if gradients else _PROJECTED
+    gaussians = seen * (projected + numbers * (3 if gradients else 1))
     each = devices * (_OF_PIXEL_LEARNT if gradients else _OF_PIXEL)
     pixels = size[0] * size[1] * cameras * (each + (_BLURRED if gradients else 0))
     parts = {

@@ -1,0 +1,119 @@
+"""Claim: a training step costs little more than the gradient of its picture.
+
+``python benchmarks/training_step.py RUN...`` takes the last checkpoint of runs that
+``gsjax train`` made, and times one step from there, in turn with its parts: the value
+and gradient of the picture by all parameters, the loss with its gradient by the
+picture, the optimiser, and one edit of the strategy (which is not due at each step).
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import gsjax
+
+gsjax.use_all_cores(queued=False)
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import measure  # noqa: E402
+
+from gsjax.densify.types import apply_edit  # noqa: E402
+from gsjax.losses import photometric_spread  # noqa: E402
+from gsjax.raster.render import device_count  # noqa: E402
+from gsjax.scene.photos import load_photos  # noqa: E402
+from gsjax.train.checkpoint import load_latest, restore  # noqa: E402
+from gsjax.train.fit import empty_state, extent_of, subset  # noqa: E402
+from gsjax.train.folder import load_data, load_settings, run_files  # noqa: E402
+from gsjax.train.frames import draw, make_frames  # noqa: E402
+from gsjax.train.room import pairs_for  # noqa: E402
+from gsjax.train.step import _optimise, make_train_step, targets  # noqa: E402
+
+
+def parts(folder: Path) -> tuple[dict, dict]:
+    """What the step works on, and functions that do it and its parts."""
+    settings, data = load_settings(folder), load_data(load_settings(folder))
+    config, scene = settings.config, subset(data.scene, data.train)
+    checkpoint = load_latest(run_files(folder).checkpoints)
+    extent, views = extent_of(scene), len(scene.views)
+    slots = int(checkpoint.meta["capacity"])
+    state = restore(checkpoint, empty_state(config, extent, views, slots))
+    frames = make_frames(scene.views, load_photos(scene.views, config.max_size))
+    raster = config.raster.replace(pair_capacity=pairs_for(state, frames, config))
+    densifier = config.densifier(extent)
+    raster = raster.replace(outputs=("rgb",), absgrad=densifier.absgrad)
+    train_step = make_train_step(config, extent, raster)
+    batch = jax.jit(draw, static_argnums=3)(frames, state.key, state.step, config.batch)
+    target, weight = targets(batch, jnp.zeros(3), jnp.float32)
+    probe = jnp.zeros((config.batch, slots, 2))
+    name = "abs_probe" if densifier.absgrad else "probe"
+
+    @jax.jit
+    def step(state, frames):
+        return train_step(state, draw(frames, state.key, state.step, config.batch))
+
+    @jax.jit
+    @jax.value_and_grad
+    def picture(differentiated, camera, cotangent):
+        params, probe = differentiated
+        scene = state.gaussians.replace(params=params)
+        view = gsjax.render(scene, camera, raster, jnp.zeros(3), **{name: probe})
+        return jnp.sum(view.rgb * cotangent)
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(image):
+        devices = device_count(raster)
+        ssim = config.ssim_weight
+        return jnp.mean(photometric_spread(image, target, weight, ssim, devices))
+
+    optimise = jax.jit(lambda state, grads: _optimise(state, grads, config, extent))
+
+    @jax.jit
+    def edit(state):
+        plan, fresh = densifier.plan(
+            state.key, state.step, state.gaussians, state.stats
+        )
+        return apply_edit(plan, state.moments), fresh
+
+    differentiated = (state.gaussians.params, probe)
+    image = 0.9 * target
+    _, cotangent = loss(image)
+    _, (slopes, _) = picture(differentiated, batch.camera, cotangent)
+    grads = slopes, jax.tree.map(jnp.zeros_like, state.tuning), probe
+    about = {
+        "run": folder.name,
+        "strategy": config.strategy,
+        "size": f"{frames.camera.width} x {frames.camera.height}",
+        "gaussians": int(gsjax.num_active(state.gaussians)),
+        "slots": slots,
+        "pair capacity": raster.pair_capacity,
+    }
+    return about, {
+        "step": lambda: step(state, frames),
+        "picture v+g": lambda: picture(differentiated, batch.camera, cotangent),
+        "loss v+g": lambda: loss(image),
+        "optimiser": lambda: optimise(state, grads),
+        "edit": lambda: edit(state),
+    }
+
+
+def main() -> None:
+    """Measure and save."""
+    rows = []
+    for folder in sys.argv[1:]:
+        about, functions = parts(Path(folder))
+        ms = measure.interleaved(functions)
+        rows.append(
+            {
+                **about,
+                **{f"{name} ms": value for name, value in ms.items()},
+                "step / picture v+g": ms["step"] / ms["picture v+g"],
+            }
+        )
+    measure.save("training_step", rows, claim=__doc__)
+
+
+if __name__ == "__main__":
+    main()

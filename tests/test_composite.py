@@ -1,0 +1,64 @@
+"""Blending of one chunk, where rounding could tell two stories of one pixel."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax import RasterConfig
+from gsjax.raster import composite
+from gsjax.raster.alpha import pixel_centres
+from gsjax.raster.composite import Chunk, running_product
+
+TILES, SPLATS, TILE = 16, 6, 8
+
+
+@jax.jit
+def blend(alpha, carried):
+    """What a chunk of splats of one alpha everywhere, all of depth 1, adds to
+    transmittances ``carried`` [TILES, P]: (what is left, the median depth).
+    """
+    config = RasterConfig(outputs=("rgb", "median_depth"), tile_size=TILE)
+    one = jnp.ones((TILES, SPLATS, 1), alpha.dtype)
+    flat = jnp.zeros((TILES, SPLATS, 5), alpha.dtype)
+    chunk = Chunk(
+        splats=jnp.concatenate([flat, alpha[..., None]], -1),
+        channels=one,
+        corner=jnp.zeros((TILES, 2), alpha.dtype),
+        depth=one,
+        probe=None,
+    )
+    pixels = pixel_centres(TILE, alpha.dtype)
+    left, out = composite._blend(carried, chunk, pixels=pixels, config=config)
+    return left, out["median"]
+
+
+@pytest.mark.usefixtures("float32")
+def test_one_half_is_crossed_once():
+    """Transmittances within rounding of one half, on either side, at some splat."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        alpha = rng.uniform(0.02, 0.9, (TILES, SPLATS)).astype(np.float32)
+        passed = np.cumprod(1 - alpha.astype(np.float64), 1)
+        at_half = 0.5 / passed[np.arange(TILES), rng.integers(1, SPLATS, TILES)]
+        nearly = 1 + np.arange(-32, 32) * 2.0**-25
+        carried = (at_half[:, None] * nearly).astype(np.float32)
+        left, median = blend(alpha, carried)
+        crossed = (carried > 0.5) & (np.asarray(left) <= 0.5)
+        assert crossed.any()
+        assert not crossed.all()
+        np.testing.assert_array_equal(median, crossed)
+
+
+@pytest.mark.usefixtures("float32")
+@pytest.mark.parametrize("largest", [0.004, 0.2, 0.6, 1.0])
+def test_product_rounds_little(largest):
+    """Of 32 factors: within so many roundings of the product as exact numbers."""
+    alpha = np.random.default_rng(1).uniform(0, largest, (50, 32, 40))
+    alpha = alpha.astype(np.float32)
+    total, before = jax.jit(running_product)(alpha)
+    exact = np.cumprod(1 - alpha.astype(np.float64), 1)
+    for found, wanted in ((total, exact[:, -1]), (before[:, 1:], exact[:, :-1])):
+        relative = np.abs(np.asarray(found) / wanted - 1)
+        assert relative.max() < 64 * 2.0**-24
+        assert np.sqrt(np.mean(relative**2)) < 4 * 2.0**-24
