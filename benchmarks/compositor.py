@@ -44,7 +44,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     """Jitted stages of one view, each with its inputs ready: a dict of functions."""
     gaussians, camera = case.gaussians, case.camera
     devices = jax.local_device_count()
-    grid = bins.make_grid(camera.width, camera.height, config.tile_size, 1, devices)
+    grid = bins.make_grid(camera.width, camera.height, config.tile_size, devices)
     group = bins.tiles_per_step(config, grid, jax.default_backend())
     room = -(-config.pair_capacity // devices)
     mesh = Mesh(np.array(jax.local_devices()), ("tiles",))
@@ -74,8 +74,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
         return project(gaussians, camera, config, order, count)
 
     def bin_local(device, projected):
-        camera_index = jnp.zeros(projected.u.shape, jnp.int32)
-        spans = bins.row_spans(projected, camera_index, grid, device)
+        spans = bins.row_spans(projected, grid, device)
         lists = bins.make_lists(projected, spans, grid, device, room)
         schedule = bins.make_schedule(lists.length, grid, group, config.chunk_size)
         return lists, schedule

@@ -131,10 +131,9 @@ def _ellipses(seen, shape: tuple[int, ...]) -> np.ndarray:
 def _lengths(seen, picture: np.ndarray) -> np.ndarray:
     """How many Gaussians each tile's list has, in colours over the picture."""
     height, width = picture.shape[:2]
-    grid = bins.make_grid(width, height, _TILE, 1, 1)
-    camera = jnp.zeros(seen.u.shape, jnp.int32)
+    grid = bins.make_grid(width, height, _TILE, 1)
     device = jnp.int32(0)
-    spans = bins.row_spans(seen, camera, grid, device)
+    spans = bins.row_spans(seen, grid, device)
     lists = bins.make_lists(seen, spans, grid, device, 2**17)
     assert lists.fit
     length = np.asarray(lists.length, np.float64).reshape(grid.rows, grid.cols)

@@ -36,6 +36,7 @@ def test_single_batch_and_vmap(report):
         assert np.abs(batch.rgb[0] - batch.rgb[1]).max() > 0.1
         assert batch.demand.pairs == mapped.demand.pairs.sum()
         assert batch.demand.visible == mapped.demand.visible.max()
+        assert batch.demand.capacity == mapped.demand.capacity.max()
 
 
 def test_a_batch_of_one(report):

@@ -18,14 +18,13 @@ CONFIG = RasterConfig(rungs=1, devices=1)
 
 
 def lists_of(kind: str, tile: int, stride: int = 1, device: int = 0):
-    grid = bins.make_grid(WIDTH, HEIGHT, tile, 1, stride)
+    grid = bins.make_grid(WIDTH, HEIGHT, tile, stride)
 
     @jax.jit
     def run(gaussians, camera):
         order, count = depth_order(gaussians, camera, CONFIG)
         projected = project(gaussians, camera, CONFIG, order, count)
-        which = jnp.zeros(COUNT, jnp.int32)
-        spans = bins.row_spans(projected, which, grid, jnp.int32(device))
+        spans = bins.row_spans(projected, grid, jnp.int32(device))
         lists = bins.make_lists(projected, spans, grid, jnp.int32(device), CAPACITY)
         return projected, lists
 
@@ -144,7 +143,7 @@ def test_devices_share_the_rows():
 @pytest.mark.parametrize(("group", "chunk"), [(1, 1), (8, 16), (8, 32), (2048, 32)])
 def test_steps_and_pairs_that_have_room_for_one_another(group, chunk):
     """The capacity named for so many steps holds them, and a smaller one does not."""
-    grid = bins.make_grid(800, 600, 8, 1, 1)
+    grid = bins.make_grid(800, 600, 8, 1)
     steps = np.unique(np.geomspace(1, 5000, 60).astype(int))
     for wanted in steps:
         count = jnp.int32(wanted)

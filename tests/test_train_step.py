@@ -67,7 +67,7 @@ TUNED = TrainConfig(
     pose_rate=1e-3,
     intrinsics_rate=1e-3,
     exposure_rate=5e-3,
-    raster=RASTER.replace(pair_capacity=1024),
+    raster=RASTER.replace(pair_capacity=512),
 )
 
 plain_step = jax.jit(
@@ -376,7 +376,7 @@ def test_an_overflow_changes_nothing_and_says_so():
     batch = tuned_batch()
     after, metrics = tuned_step(start, batch)
     assert metrics.overflowed
-    assert metrics.pair_capacity > 1024
+    assert metrics.pair_capacity > 512
     assert metrics.step == metrics.wanted == 0
     assert changed(start, after) == []
 

@@ -24,14 +24,13 @@ from gsjax.raster.types import Array, Projected, RasterConfig
 
 
 class Grid(NamedTuple):
-    """The tiles one device works on: every ``stride``-th row of tiles of each camera.
+    """The tiles one device works on: every ``stride``-th row of tiles.
 
     Attributes:
       width, height: image size in pixels.
       tile: side of a tile in pixels.
       cols: tiles along a row.
-      rows: rows of tiles of one camera on this device.
-      cameras: number of cameras B.
+      rows: rows of tiles on this device.
       stride: number of devices that share the rows.
     """
 
@@ -40,26 +39,23 @@ class Grid(NamedTuple):
     tile: int
     cols: int
     rows: int
-    cameras: int
     stride: int
 
     @property
     def tiles(self) -> int:
-        """Tiles on this device, of all cameras."""
-        return self.cameras * self.rows * self.cols
+        """Tiles on this device."""
+        return self.rows * self.cols
 
 
-def make_grid(width: int, height: int, tile: int, cameras: int, stride: int) -> Grid:
+def make_grid(width: int, height: int, tile: int, stride: int) -> Grid:
     """Tiles that cover the image, the rows dealt out to ``stride`` devices."""
     rows = -(-height // tile)
-    return Grid(
-        width, height, tile, -(-width // tile), -(-rows // stride), cameras, stride
-    )
+    return Grid(width, height, tile, -(-width // tile), -(-rows // stride), stride)
 
 
 def tile_origins(grid: Grid, tile: Array, device: Array) -> tuple[Array, Array]:
     """Pixel coordinates (x, y) of the upper left corners of local tiles."""
-    row, col = tile // grid.cols % grid.rows, tile % grid.cols
+    row, col = tile // grid.cols, tile % grid.cols
     return col * grid.tile, (row * grid.stride + device) * grid.tile
 
 
@@ -127,13 +123,10 @@ def tiles_per_step(config: RasterConfig, grid: Grid, platform: str) -> int:
     return max(1, min(chosen, grid.tiles))
 
 
-def row_spans(projected: Projected, camera: Array, grid: Grid, device: Array) -> Spans:
-    """Local rows of tiles that the box of each rank meets.
+def row_spans(projected: Projected, grid: Grid, device: Array) -> Spans:
+    """Local rows of tiles that the box of each rank [R] meets.
 
-    Args:
-      projected: [R].
-      camera: [R] int32 index of the camera each rank belongs to.
-      grid, device: the rows of this device are device, device + stride, ….
+    The rows of this device are device, device + stride, ….
     """
     left, right, top, bottom, seen = _boxes(projected, grid.width, grid.height)
     # Global rows of tiles g0 … g1 hold the local rows j with g0 ≤ j·stride + d ≤ g1.
@@ -141,7 +134,7 @@ def row_spans(projected: Projected, camera: Array, grid: Grid, device: Array) ->
     last = (bottom // grid.tile - device) // grid.stride
     rows = jnp.where(seen, jnp.maximum(last - first + 1, 0), 0)
     cols = right // grid.tile - left // grid.tile + 1
-    return Spans(first=camera * grid.rows + first, rows=rows, cols=cols)
+    return Spans(first=first, rows=rows, cols=cols)
 
 
 def radii(projected: Projected, width: int, height: int) -> Array:

@@ -48,25 +48,27 @@ def render_estimate(
       bases: spherical harmonics of each.
       size: (width, height) of the images, px.
       config: static settings.
-      cameras: images in one call.
+      cameras: images in one call, made in turn; what their gradients need is kept.
       gradients: whether by reverse mode, as in a training step.
       width: bytes of a number.
     """
     devices = config.devices or jax.local_device_count()
-    grid = bins.make_grid(*size, config.tile_size, cameras, devices)
-    seen = min(slots, config.visible_capacity or slots) * cameras
+    grid = bins.make_grid(*size, config.tile_size, devices)
+    seen = min(slots, config.visible_capacity or slots)
     capacity = config.pair_capacity or default_pair_capacity(seen, grid)
     group = bins.tiles_per_step(config, grid, jax.default_backend())
     share = -(-capacity // devices)
     rows = group * bins.step_capacity(share, grid, group, config.chunk_size)
     channels = 1 + 3 * ("rgb" in config.outputs) + ("depth" in config.outputs)
-    in_chunk, carried = _IN_CHUNK + channels, 0
-    if gradients:  # forward and backward; and the transmittance kept of each step
-        in_chunk, carried = 2 * in_chunk + _IN_CHUNK_LEARNT, config.tile_size**2
-    pairs = width * rows * (config.chunk_size * in_chunk + carried)
-    numbers = 11 + 3 * bases
-    projected = _PROJECTED_LEARNT if gradients else _PROJECTED
-    gaussians = seen * (projected + numbers * (3 if gradients else 1))
+    numbers, in_chunk = 11 + 3 * bases, _IN_CHUNK + channels
+    of_pairs = config.chunk_size * in_chunk
+    of_gaussians = _PROJECTED + numbers
+    if gradients:  # what is kept of each camera, and backward of one
+        of_pairs = cameras * (of_pairs + config.tile_size**2)
+        of_pairs += config.chunk_size * (in_chunk + _IN_CHUNK_LEARNT)
+        of_gaussians = cameras * (_PROJECTED_LEARNT + numbers) + 2 * numbers
+    pairs = width * rows * of_pairs
+    gaussians = seen * of_gaussians
     each = devices * (_OF_PIXEL_LEARNT if gradients else _OF_PIXEL)
     pixels = size[0] * size[1] * cameras * (each + (_BLURRED if gradients else 0))
     parts = {

@@ -1,7 +1,7 @@
 """Bin and composite what was projected, over all devices.
 
-Axis legend: B cameras, R ranks of all cameras, D devices, T tiles of a device, P pixels
-of a tile, C channels, H W image.
+Axis legend: R ranks, D devices, T tiles of a device, P pixels of a tile, C channels,
+H W image.
 """
 
 from functools import partial
@@ -28,26 +28,25 @@ def default_pair_capacity(ranks: int, grid: bins.Grid) -> int:
 
 
 def rasterise(
-    projected: Projected, cameras: int, width: int, height: int, config: RasterConfig
+    projected: Projected, width: int, height: int, config: RasterConfig
 ) -> tuple[dict[str, Array], Demand, Array]:
     """Bin and composite what was projected, over all devices.
 
     Args:
-      projected: [R], ranks of all cameras one after another, R / B each.
-      cameras: B.
+      projected: [R].
       width, height: image size.
       config: static settings.
 
     Returns:
-      Images before the background, {"sums": [B, H, W, C], "median": [B, H, W]};
-      the demand (``visible`` is left at 0); whether the capacity was too small.
+      Images before the background, {"sums": [H, W, C], "median": [H, W]}; the demand
+      (``visible`` is left at 0); whether the capacity was too small.
     """
     devices = device_count(config)
-    grid = bins.make_grid(width, height, config.tile_size, cameras, devices)
+    grid = bins.make_grid(width, height, config.tile_size, devices)
     ranks = projected.u.shape[0]
     capacity = config.pair_capacity or default_pair_capacity(ranks, grid)
     share = -(-capacity // devices)
-    seen = _unhidden(lax.stop_gradient(projected), cameras, width, height, config)
+    seen = _unhidden(lax.stop_gradient(projected), width, height, config)
     local = partial(_rasterise_local, grid=grid, config=config, capacity=share)
     images, pairs, wanted = spread(local, devices, projected, seen)
     images = {name: _untile(image, grid) for name, image in images.items()}
@@ -80,19 +79,13 @@ def device_count(config: RasterConfig) -> int:
 
 
 def _unhidden(
-    projected: Projected, cameras: int, width: int, height: int, config: RasterConfig
+    projected: Projected, width: int, height: int, config: RasterConfig
 ) -> Projected:
     """``projected`` with no reach for what is hidden."""
     if config.stop <= 0 or not config.occlusion:
         return projected
-
-    def split(value):  # [..., B · R] → [B, ..., R]
-        value = value.reshape(*value.shape[:-1], cameras, -1)
-        return jnp.moveaxis(value, -2, 0)
-
-    per_camera = jax.tree.map(split, projected)
-    behind = lax.map(lambda one: hidden(one, width, height, config), per_camera)
-    return projected._replace(reach=jnp.where(behind.ravel(), 0, projected.reach))
+    behind = hidden(projected, width, height, config)
+    return projected._replace(reach=jnp.where(behind, 0, projected.reach))
 
 
 def _rasterise_local(
@@ -112,8 +105,7 @@ def _rasterise_local(
     device = device[0]
     ranks = projected.u.shape[0]
     group = bins.tiles_per_step(config, grid, jax.default_backend())
-    camera = lax.iota(jnp.int32, ranks) // (ranks // grid.cameras)
-    spans = bins.row_spans(geometry, camera, grid, device)
+    spans = bins.row_spans(geometry, grid, device)
     # The boxes bound the pairs from above, for no more than a sum (and its rounding).
     bound = jnp.sum(spans.rows.astype(jnp.float32) * spans.cols) * (1 + 1e-5)
 
@@ -138,22 +130,13 @@ def _rasterise_local(
 
 
 def _untile(image: Array, grid: bins.Grid) -> Array:
-    """[D, T, (C,) P] to [B, H, W, (C)]: rows of tiles were dealt out to D devices."""
+    """[D, T, (C,) P] to [H, W, (C)]: rows of tiles were dealt out to D devices."""
     channels = image.shape[2:-1]
     image = image.reshape(
-        grid.stride,
-        grid.cameras,
-        grid.rows,
-        grid.cols,
-        int(np.prod(channels)),
-        grid.tile,
-        grid.tile,
+        grid.stride, grid.rows, grid.cols, int(np.prod(channels)), grid.tile, grid.tile
     )
-    image = image.transpose(1, 2, 0, 5, 3, 6, 4)
+    image = image.transpose(1, 0, 4, 2, 5, 3)
     image = image.reshape(
-        grid.cameras,
-        grid.rows * grid.stride * grid.tile,
-        grid.cols * grid.tile,
-        *channels,
+        grid.rows * grid.stride * grid.tile, grid.cols * grid.tile, *channels
     )
-    return image[:, : grid.height, : grid.width]
+    return image[: grid.height, : grid.width]

@@ -16,12 +16,13 @@ from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.memory import require
 from gsjax.numerics import safe_divide
 from gsjax.raster import bins
+from gsjax.raster.counts import total_count
 from gsjax.raster.footprint import render_estimate as render_estimate
 from gsjax.raster.order import depth_order
 from gsjax.raster.project import COLOR_LIMIT, project
 from gsjax.raster.rasterise import device_count as device_count
 from gsjax.raster.rasterise import rasterise
-from gsjax.raster.types import Array, Demand, Projected, RasterConfig, Render
+from gsjax.raster.types import Array, Demand, RasterConfig, Render
 
 DEFAULT_CONFIG = RasterConfig()
 
@@ -44,7 +45,8 @@ def render(
 
     Args:
       gaussians: N slots.
-      camera: one camera, or a batch B (one call, one image each).
+      camera: one camera, or a batch B (one call, one image each, made in turn; see
+        `jax.vmap` for all at once).
       config: static settings.
       background: [C] or [B, C]; default black, as is a component that is not finite.
       features: [N, C] composited in place of the SH colour.
@@ -74,24 +76,24 @@ def render(
         raise InputError("config.absgrad and abs_probe go together: pass both or none")
     _check_features(features, gaussians)
 
-    def project_one(inputs):
-        return _project_one(gaussians, config, features, *inputs)
+    def render_one(inputs):
+        return _render_one(gaussians, config, features, *inputs)
 
+    # One after another: no more at a time than one camera takes, and its program.
+    inputs = (cameras, probe, abs_probe)
     if count == 1:
-        squeezed = jax.tree.map(lambda a: a[0], (cameras, probe, abs_probe))
-        projected, radii, visible = project_one(squeezed)
-        radii = radii[None]
+        out = render_one(jax.tree.map(lambda a: a[0], inputs))
+        sums, radii, demands, overflowed = jax.tree.map(lambda a: a[None], out)
     else:
-        projected, radii, visible = lax.map(project_one, (cameras, probe, abs_probe))
-        projected = _flatten_cameras(projected)
-    sums, demand, overflowed = rasterise(
-        projected, count, camera.width, camera.height, config
+        sums, radii, demands, overflowed = lax.map(render_one, inputs)
+    demand = Demand(
+        visible=jnp.max(demands.visible),
+        pairs=total_count(demands.pairs)[0],
+        capacity=jnp.max(demands.capacity),
     )
-    visible = jnp.max(visible)
-    room = min(config.visible_capacity or gaussians.capacity, gaussians.capacity)
-    demand = demand._replace(visible=visible)
-    overflowed |= visible > room
-    images = _finish(sums, config, background, count, projected.colors.shape[0])
+    overflowed = jnp.any(overflowed)
+    colors = 3 if features is None else features.shape[1]
+    images = _finish(sums, config, background, count, colors)
     if not camera.batched:
         images = {name: image[0] for name, image in images.items()}
         radii = radii[0]
@@ -106,20 +108,27 @@ def render(
     )
 
 
-def _project_one(
+def _render_one(
     gaussians: Gaussians,
     config: RasterConfig,
     features: Array | None,
     camera: Camera,
     probe: Array | None,
     abs_probe: Array | None,
-) -> tuple[Projected, Array, Array]:
-    """One camera: what was projected, radii [N], and the count of what may be seen."""
+) -> tuple[dict[str, Array], Array, Demand, Array]:
+    """One camera: images before the background, radii [N], demand, overflowed."""
     order, visible = depth_order(gaussians, camera, config)
     out = project(gaussians, camera, config, order, visible, features, probe, abs_probe)
     radii = jnp.zeros(gaussians.capacity, out.u.dtype)
     seen = bins.radii(lax.stop_gradient(out), camera.width, camera.height)
-    return out, radii.at[order].set(seen, mode="drop"), visible
+    sums, demand, overflowed = rasterise(out, camera.width, camera.height, config)
+    room = min(config.visible_capacity or gaussians.capacity, gaussians.capacity)
+    return (
+        sums,
+        radii.at[order].set(seen, mode="drop"),
+        demand._replace(visible=visible),
+        overflowed | (visible > room),
+    )
 
 
 def _with_batch(name: str, probe, gaussians: Gaussians, camera: Camera):
@@ -140,16 +149,6 @@ def _check_features(features, gaussians: Gaussians) -> None:
         raise InputError(
             f"features has shape {shape}; ({gaussians.capacity}, C) is wanted, C ≥ 1"
         )
-
-
-def _flatten_cameras(projected: Projected) -> Projected:
-    """[B, R] and [B, C, R] to [B · R] and [C, B · R]: more ranks, as it were."""
-
-    def flatten(value):
-        value = jnp.moveaxis(value, 0, -2)
-        return value.reshape(*value.shape[:-2], -1)
-
-    return jax.tree.map(flatten, projected)
 
 
 def _finish(

@@ -43,7 +43,8 @@ class RasterConfig:
       tile_size: pixels along the side of a tile.
       chunk_size: Gaussians of a tile composited in one go.
       tiles_per_step: tiles composited side by side; None chooses by platform.
-      pair_capacity: room for (tile, Gaussian) pairs; None chooses from the sizes.
+      pair_capacity: room for (tile, Gaussian) pairs of a camera; None chooses from
+        the sizes.
         If it is too small, `Render.overflowed` is set and `Render.demand` says what
         was wanted; `render_exact` regrows. Unused room costs memory, hardly time.
       visible_capacity: room for Gaussians in view (of each camera); None means all
@@ -176,8 +177,8 @@ class Demand(NamedTuple):
       visible: Gaussians that may be in the view, of the camera that sees most; the
         ``visible_capacity`` that would have been enough.
       pairs: (tile, Gaussian) pairs, of all cameras.
-      capacity: the ``pair_capacity`` that would have been enough. Where ``visible``
-        did not fit, this and ``pairs`` count only those that did.
+      capacity: the ``pair_capacity`` that would have been enough, for each camera.
+        Where ``visible`` did not fit, this and ``pairs`` count only those that did.
     """
 
     visible: Array

@@ -151,15 +151,13 @@ def _rows_of_wild(gaussians: Gaussians, camera, value):
     """Rows of tiles that Gaussians moved to ± ``value`` px are given."""
     order = jnp.arange(SLOTS)
     out = project(gaussians, camera, COMPAT, order, num_active(gaussians))
-    grid = make_grid(SIZE, SIZE, COMPAT.tile_size, 1, 1)
+    grid = make_grid(SIZE, SIZE, COMPAT.tile_size, 1)
     sign = jnp.where(order % 2 == 0, value, -value)
     rows = [
-        row_spans(moved, 0 * order, grid, jnp.int32(0)).rows
+        row_spans(moved, grid, jnp.int32(0)).rows
         for moved in (out._replace(u=sign), out._replace(v=sign))
     ]
-    return jnp.sum(jnp.stack(rows)), jnp.sum(
-        row_spans(out, 0 * order, grid, jnp.int32(0)).rows
-    )
+    return jnp.sum(jnp.stack(rows)), jnp.sum(row_spans(out, grid, jnp.int32(0)).rows)
 
 
 def wild_coordinates(full: bool) -> Measured:

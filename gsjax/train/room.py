@@ -39,7 +39,7 @@ def pairs_for(state: TrainState, frames: Frames, config: TrainConfig) -> int:
         # The same settings for each: one program.
         demand = count_demand(state.gaussians, camera, config.raster)
         most = max(most, int(demand.capacity))
-    return roomy_pairs(config.batch * most, state, config)
+    return roomy_pairs(most, state, config)
 
 
 def roomy_pairs(wanted: int, state: TrainState, config: TrainConfig) -> int:
