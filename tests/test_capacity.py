@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import (
+    ALL,
     BACKGROUND,
     COMPAT,
     camera_of,
@@ -12,7 +13,7 @@ from conftest import (
     render,
     scene_of,
 )
-from pictures import assert_same, images
+from pictures import assert_same, images, largest_difference
 
 import gsjax
 from gsjax.errors import CapacityError
@@ -52,6 +53,26 @@ def test_capacity_over_two_devices():
     out = render(gaussians, camera, enough.replace(pair_capacity=need - 2))
     assert out.overflowed
     assert out.demand.capacity == need
+
+
+def test_each_camera_of_a_batch_has_the_room():
+    gaussians, first = cast(scene_of("random"), jnp.float32)
+    second = cast(camera_of(centre=(60.0, 8.0)), jnp.float32)
+    alone = {0: images(gaussians, first), 1: images(gaussians, second)}
+    needs = [int(alone[i].demand.capacity) for i in alone]
+    assert needs[0] != needs[1]
+    for order in ((0, 1), (1, 0)):
+        cameras = gsjax.stack_cameras([(first, second)[i] for i in order])
+        small = COMPAT.replace(pair_capacity=min(needs))
+        out = render(gaussians, cameras, small, jnp.float32(BACKGROUND))
+        assert out.overflowed
+        assert out.demand.capacity == max(needs)
+        out = images(gaussians, cameras, COMPAT.replace(pair_capacity=max(needs)))
+        assert not out.overflowed
+        assert out.demand.pairs == sum(needs)
+        for place, i in enumerate(order):
+            one = out._replace(**{name: getattr(out, name)[place] for name in ALL})
+            assert largest_difference(one, alone[i]) <= 1e-6
 
 
 def test_render_exact_regrows():

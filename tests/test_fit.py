@@ -321,10 +321,13 @@ def test_more_room_while_gaussians_are_added():
     there are many steps ahead, so much that it costs more than a program."""
     many = 100 * int(num_active(initial_state(scene(), CONFIG).gaussians))
 
-    def margin(pairs, step, most, steps, stop=5000):
+    def margin(pairs, step, most, steps, stop=5000, batch=1):
         chosen = replace(CONFIG.chosen, max_gaussians=most, stop=stop)
         config = CONFIG.replace(
-            **{CONFIG.strategy: chosen}, steps=steps, levels=(Level(0.0, 1),)
+            **{CONFIG.strategy: chosen},
+            steps=steps,
+            batch=batch,
+            levels=(Level(0.0, 1),),
         )
         state = initial_state(scene(), config).replace(step=jnp.int32(step))
         return roomy_pairs(pairs, state, config) / pairs
@@ -334,6 +337,8 @@ def test_more_room_while_gaussians_are_added():
     assert margin(300_000, 0, many, 10_000) == pytest.approx(2.5, rel=0.2)
     between = margin(60_000, 0, many, 1500)  # 1 + 1.8e8 / 1500 / 60_000
     assert between == pytest.approx(3, rel=0.2)
+    # What is empty costs something in each view of a step.
+    assert margin(30_000, 0, many, 1500, batch=2) == pytest.approx(3, rel=0.2)
     assert margin(300_000, 99, many, 100) == roomy
     settled = margin(300_000, 60, many, 100, stop=60)
     assert settled == margin(300_000, 0, many // 100, 100) < 2

@@ -153,6 +153,35 @@ def test_the_estimate_is_what_xla_reserves(slots, pairs, report, quick_compiles)
     assert 1 / 1.5 < estimate / found < 1.5
 
 
+@pytest.mark.parametrize(
+    ("cameras", "slots", "pairs"),
+    [(1, 4096, 2**17), (4, 4096, 2**17), (4, 2**15, 2**14)],
+)
+def test_the_estimate_of_gradients_is_what_xla_reserves(
+    cameras, slots, pairs, report, quick_compiles
+):
+    """Within 1.5 times; of one camera, and of some in one call."""
+    del quick_compiles
+    config = RasterConfig(**{**LIGHT, "pair_capacity": pairs}, occlusion=False)
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
+    scene = {name: np.zeros((slots, *shape)) for name, shape in shapes.items()}
+    gaussians = gsjax.make_gaussians(**scene, sh=np.zeros((slots, 4, 3)))
+    camera = gsjax.stack_cameras([camera_of(128, 96)] * cameras)
+
+    def brightness(params, camera):
+        view = gsjax.render(gaussians.replace(params=params), camera, config)
+        return jnp.sum(view.rgb)
+
+    gradient = jax.jit(jax.grad(brightness))
+    sizes = gradient.lower(gaussians.params, camera).compile().memory_analysis()
+    found = sizes.temp_size_in_bytes + sizes.output_size_in_bytes
+    estimate = render_estimate(
+        slots, 4, (128, 96), config, cameras=cameras, gradients=True, width=8
+    ).total
+    report("estimate of memory", abs(np.log(estimate / found)), np.log(1.5))
+    assert 1 / 1.5 < estimate / found < 1.5
+
+
 @pytest.mark.parametrize("devices", [1, 2])
 def test_the_estimate_of_pictures_is_what_the_loss_reserves(devices, report):
     """Within 1.5 times, and not less: the picture itself comes on top."""

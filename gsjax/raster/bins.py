@@ -283,8 +283,8 @@ def count_lists(
         change = change.at[first].add(some, mode="drop")
         return index + 1, change.at[first + count].add(-some, mode="drop")
 
-    start = (jnp.int32(0), jnp.zeros(grid.tiles, jnp.int32))
-    _, change = lax.while_loop(lambda state: state[0] < rounds, add, start)
+    none = (jnp.int32(0), jnp.zeros(grid.tiles, jnp.int32))
+    _, change = lax.while_loop(lambda state: state[0] < rounds, add, none)
     length = jnp.where(lists.fit, lists.length, running_total(change))
     counted, _ = total_count(length)
     pairs = jnp.where(countable, counted, jnp.maximum(lists.pairs, lists.items))

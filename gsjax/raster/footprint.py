@@ -19,11 +19,12 @@ _PAIRS = "for (tile, Gaussian) pairs"
 _GAUSSIANS, _PICTURES = "for projected Gaussians", "for pictures"
 
 # Numbers of a Gaussian in a chunk beside its channels: rank, place, ellipse, opacity;
-# and those more than twice as many with gradients.
+# and how many more the backward pass makes of it.
 _IN_CHUNK, _IN_CHUNK_LEARNT = 7, 8
 _IN_LISTS = 4  # of a pair, while it is sorted
-# Of a Gaussian beside its own numbers, as all stages come to; and with gradients.
-_PROJECTED, _PROJECTED_LEARNT = 42, 60
+# Of a Gaussian beside its own numbers, as all stages come to; with gradients; and what
+# is kept of it for another camera.
+_PROJECTED, _PROJECTED_LEARNT, _KEPT = 42, 60, 32
 # Bytes of a pixel: images and their tiles; with gradients; and what SSIM blurs, which
 # the devices share.
 _OF_PIXEL, _OF_PIXEL_LEARNT, _BLURRED = 26, 35, 190
@@ -61,12 +62,11 @@ def render_estimate(
     rows = group * bins.step_capacity(share, grid, group, config.chunk_size)
     channels = 1 + 3 * ("rgb" in config.outputs) + ("depth" in config.outputs)
     numbers, in_chunk = 11 + 3 * bases, _IN_CHUNK + channels
-    of_pairs = config.chunk_size * in_chunk
-    of_gaussians = _PROJECTED + numbers
-    if gradients:  # what is kept of each camera, and backward of one
-        of_pairs = cameras * (of_pairs + config.tile_size**2)
+    of_pairs, of_gaussians = config.chunk_size * in_chunk, _PROJECTED + numbers
+    if gradients:  # of one camera; of the others there is what is kept for it
+        of_pairs += config.tile_size**2
         of_pairs += config.chunk_size * (in_chunk + _IN_CHUNK_LEARNT)
-        of_gaussians = cameras * (_PROJECTED_LEARNT + numbers) + 2 * numbers
+        of_gaussians = _PROJECTED_LEARNT + 3 * numbers
     pairs = width * rows * of_pairs
     gaussians = seen * of_gaussians
     each = devices * (_OF_PIXEL_LEARNT if gradients else _OF_PIXEL)
@@ -79,6 +79,10 @@ def render_estimate(
     # Of these two, one is over before the other begins.
     stages = (_PAIRS, _PICTURES) if gradients else (_PAIRS, _GAUSSIANS)
     del parts[min(stages, key=lambda name: parts[name])]
-    if not gradients:
+    if gradients:
+        kept = width * rows * (config.chunk_size * in_chunk + config.tile_size**2)
+        kept += width * seen * (numbers + _KEPT)
+        parts["kept of other cameras"] = devices * kept * (cameras - 1)
+    else:
         parts["to share the scene"] = (devices - 1) * width * slots * numbers
     return Estimate(parts)

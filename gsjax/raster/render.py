@@ -45,8 +45,7 @@ def render(
 
     Args:
       gaussians: N slots.
-      camera: one camera, or a batch B (one call, one image each, made in turn; see
-        `jax.vmap` for all at once).
+      camera: one camera, or a batch B (one call, one image each, made in turn).
       config: static settings.
       background: [C] or [B, C]; default black, as is a component that is not finite.
       features: [N, C] composited in place of the SH colour.
@@ -79,7 +78,8 @@ def render(
     def render_one(inputs):
         return _render_one(gaussians, config, features, *inputs)
 
-    # One after another: no more at a time than one camera takes, and its program.
+    # One after another: no more at a time than one camera takes (a gradient keeps what
+    # it needs of each), and the program of one.
     inputs = (cameras, probe, abs_probe)
     if count == 1:
         out = render_one(jax.tree.map(lambda a: a[0], inputs))
@@ -239,7 +239,7 @@ def exact_config(
 
     Args:
       gaussians: N slots, concrete.
-      camera: one, or a batch, which is then rendered in one call.
+      camera: one, or a batch: enough for each of them, alone or in one call.
       config: all else stays as it is.
       max_capacity: as for `render_exact`.
 
@@ -285,11 +285,11 @@ def _check_memory(gaussians: Gaussians, camera: Camera, config: RasterConfig) ->
         width=gaussians.params.means.dtype.itemsize,
     )
     several = f"{cameras} images" if cameras > 1 else "an image"
-    pairs = config.pair_capacity
+    pairs, each = config.pair_capacity, " each" if cameras > 1 else ""
     require(
         estimate,
         f"{several} of {camera.width} × {camera.height} px of {gaussians.capacity:,} "
-        "Gaussians" + (f", {pairs:,} (tile, Gaussian) pairs," if pairs else ""),
+        "Gaussians" + (f", {pairs:,} (tile, Gaussian) pairs{each}," if pairs else ""),
         "render smaller images, or fewer Gaussians (export --min-opacity), or larger "
         "tiles (RasterConfig.tile_size)",
     )

@@ -44,9 +44,9 @@ class RasterConfig:
       chunk_size: Gaussians of a tile composited in one go.
       tiles_per_step: tiles composited side by side; None chooses by platform.
       pair_capacity: room for (tile, Gaussian) pairs of a camera; None chooses from
-        the sizes.
-        If it is too small, `Render.overflowed` is set and `Render.demand` says what
-        was wanted; `render_exact` regrows. Unused room costs memory, hardly time.
+        the sizes. If it is too small, `Render.overflowed` is set and `Render.demand`
+        says what was wanted; `render_exact` regrows. Unused room costs memory, hardly
+        time; in a gradient once for each camera of a batch.
       visible_capacity: room for Gaussians in view (of each camera); None means all
         slots. Reported and regrown like ``pair_capacity``.
       occlusion: leave out, before binning, what lies behind pixels that have all
@@ -177,8 +177,9 @@ class Demand(NamedTuple):
       visible: Gaussians that may be in the view, of the camera that sees most; the
         ``visible_capacity`` that would have been enough.
       pairs: (tile, Gaussian) pairs, of all cameras.
-      capacity: the ``pair_capacity`` that would have been enough, for each camera.
-        Where ``visible`` did not fit, this and ``pairs`` count only those that did.
+      capacity: the ``pair_capacity`` that would have been enough, of the camera that
+        wants most. Where ``visible`` did not fit, this and ``pairs`` count only those
+        that did.
     """
 
     visible: Array

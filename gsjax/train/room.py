@@ -20,7 +20,7 @@ _SLOT_MARGIN = 1.3
 # For pairs: of a scene that does not grow, and from less to more of one that does.
 _PAIR_MARGIN, _GROWING_MARGINS = 1.5, (2.5, 4.0)
 _PER_GROWTH = 1.2  # pairs grow with Gaussians, and views not probed may want more
-# A program takes as long to compile as so many empty pairs take in one step: 22 s at
+# A program takes as long to compile as so many empty pairs take in one view: 22 s at
 # 0.12 µs each, on two cores.
 _PAIRS_OF_PROGRAM = 1.8e8
 _MAX_PROBED_VIEWS = 6
@@ -50,13 +50,14 @@ def roomy_pairs(wanted: int, state: TrainState, config: TrainConfig) -> int:
     """
     if wanted >= 2**30:
         raise CapacityError(
-            f"a step wants {wanted:,} or more pairs, above the limit of {2**30 - 1:,}; "
+            f"a view wants {wanted:,} or more pairs, above the limit of {2**30 - 1:,}; "
             "train with smaller images, fewer Gaussians, or larger tiles"
         )
     step, margin = int(state.step), _PAIR_MARGIN
     if step < config.chosen.stop:
         # Room until the next program is due anyway, at the price of one.
-        worth = _PAIRS_OF_PROGRAM / _steps_of_program(step, config)
+        views = config.batch * _steps_of_program(step, config)
+        worth = _PAIRS_OF_PROGRAM / views
         growing = float(np.clip(1 + worth / wanted, *_GROWING_MARGINS))
         growth = config.max_gaussians / max(1, int(num_active(state.gaussians)))
         margin = max(margin, min(_PER_GROWTH * growth, growing))

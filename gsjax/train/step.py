@@ -74,7 +74,8 @@ class Metrics(NamedTuple):
       psnr: dB of the views of this step, before it.
       gaussians: active ones, after it.
       wanted: how many there would be with room for all; 0 where nothing was edited.
-      pairs, pair_capacity: (tile, Gaussian) pairs, and the capacity that they want.
+      pairs: (tile, Gaussian) pairs of all views of this step.
+      pair_capacity: what the view that wants most of it would have room in.
       overflowed: the pairs did not fit, and nothing was changed, nor counted as a
         step: grow `RasterConfig.pair_capacity`, and go on.
       finite: False if loss or gradients were not, and nothing but ``step`` changed; or
