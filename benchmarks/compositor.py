@@ -79,17 +79,21 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
         schedule = bins.make_schedule(lists.length, grid, group, config.chunk_size)
         return lists, schedule
 
-    steps = bins.step_capacity(room, grid, group, config.chunk_size)
+    def work_of(lists, schedule, ranks):
+        count = bins.step_capacity(room, grid, group, config.chunk_size)
+        steps = bins.make_steps(lists, schedule, count)
+        chunk = config.chunk_size
+        return bins.make_work(lists, schedule, steps, chunk, ranks, count)
 
     def composite_local(device, projected, lists, schedule):
         ranks = projected.u.shape[0]
-        work = bins.make_work(lists, schedule, config.chunk_size, ranks, steps)
+        work = work_of(lists, schedule, ranks)
         return composite(projected, work, schedule, grid, device, config)
 
     def count_local(device, projected, lists, schedule):
         """[steps] each: evaluations made, and those of them that change the image."""
         ranks = projected.u.shape[0]
-        work = bins.make_work(lists, schedule, config.chunk_size, ranks, steps)
+        work = work_of(lists, schedule, ranks)
         chunks = gather_chunks(projected, work, schedule.tiles, grid, device, config)
         pixels = pixel_centres(grid.tile, projected.u.dtype)
 

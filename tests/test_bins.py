@@ -1,6 +1,8 @@
 """The lists hold every pair that matters, hardly any other, in the right order."""
 
 import dataclasses
+from functools import partial
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -9,26 +11,40 @@ import pytest
 from conftest import COUNT, HEIGHT, SCENES, WIDTH, scene_of
 
 from gsjax import RasterConfig
-from gsjax.raster import bins
+from gsjax.raster import bins, blocks
 from gsjax.raster.order import depth_order
 from gsjax.raster.project import project
 
 CAPACITY = 16384
 CONFIG = RasterConfig(rungs=1, devices=1)
 
+pytestmark = pytest.mark.usefixtures("quick_compiles")
 
-def lists_of(kind: str, tile: int, stride: int = 1, device: int = 0):
+
+@jax.jit
+def projected_of(gaussians, camera):
+    order, count = depth_order(gaussians, camera, CONFIG)
+    return project(gaussians, camera, CONFIG, order, count)
+
+
+@partial(jax.jit, static_argnames=("grid", "capacity", "block"))
+def make_lists(projected, device, grid, capacity, block):
+    with mock.patch.object(blocks, "BLOCK", block):
+        spans = bins.row_spans(projected, grid, device)
+        return bins.make_lists(projected, spans, grid, device, capacity)
+
+
+def lists_of(
+    kind: str,
+    tile: int,
+    stride: int = 1,
+    device: int = 0,
+    capacity: int = CAPACITY,
+    block: int = blocks.BLOCK,
+):
     grid = bins.make_grid(WIDTH, HEIGHT, tile, stride)
-
-    @jax.jit
-    def run(gaussians, camera):
-        order, count = depth_order(gaussians, camera, CONFIG)
-        projected = project(gaussians, camera, CONFIG, order, count)
-        spans = bins.row_spans(projected, grid, jnp.int32(device))
-        lists = bins.make_lists(projected, spans, grid, jnp.int32(device), CAPACITY)
-        return projected, lists
-
-    projected, lists = run(*scene_of(kind))
+    projected = projected_of(*scene_of(kind))
+    lists = make_lists(projected, jnp.int32(device), grid, capacity, block)
     return grid, jax.tree.map(np.asarray, projected), jax.tree.map(np.asarray, lists)
 
 
@@ -128,6 +144,32 @@ def test_other_tile_sizes(tile):
     assert not (touched & ~listed).any()
 
 
+@pytest.mark.parametrize("block", [7, 32])
+@pytest.mark.parametrize("kind", ["random", "huge"])
+def test_blocks_of_any_size_make_the_same_lists(kind, block):
+    _, _, whole = lists_of(kind, 8)
+    _, _, lists = lists_of(kind, 8, block=block)
+    assert whole.pairs > 4 * 2 * block
+    np.testing.assert_array_equal(lists.length, whole.length)
+    count = int(whole.pairs)
+    np.testing.assert_array_equal(lists.ranks[:count], whole.ranks[:count])
+
+
+@pytest.mark.parametrize("block", [7, 8192])
+def test_room_changes_no_count(block):
+    """What is wanted is told whatever the room; with room for it, so are the lists."""
+    _, _, whole = lists_of("random", 8)
+    count = int(whole.pairs)
+    for capacity in (1, count - 1, count):
+        _, _, lists = lists_of("random", 8, capacity=capacity, block=block)
+        assert lists.pairs == count
+        np.testing.assert_array_equal(lists.length, whole.length)
+        assert lists.fit == (capacity >= count)
+        assert lists.ranks.shape == (capacity,)
+        if lists.fit:
+            np.testing.assert_array_equal(lists.ranks[:count], whole.ranks[:count])
+
+
 def test_devices_share_the_rows():
     """The lists of two devices are those of one, dealt out by rows of tiles."""
     whole, _, all_lists = lists_of("random", 8)
@@ -160,9 +202,9 @@ def test_schedule_covers_every_chunk_once():
     grid, _, lists = lists_of("random", 8)
     schedule = bins.make_schedule(jnp.asarray(lists.length), grid, group, chunk)
     room = bins.step_capacity(CAPACITY, grid, group, chunk)
-    work = bins.make_work(
-        jax.tree.map(jnp.asarray, lists), schedule, chunk, COUNT, room
-    )
+    lists = jax.tree.map(jnp.asarray, lists)
+    steps = bins.make_steps(lists, schedule, room)
+    work = bins.make_work(lists, schedule, steps, chunk, COUNT, room)
     ranks, block = np.asarray(work.ranks), np.asarray(work.block)
     live, first = np.asarray(work.live), np.asarray(work.first)
     assert live.sum() == int(schedule.steps)

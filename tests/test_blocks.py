@@ -7,7 +7,7 @@ import pytest
 from conftest import camera_of, gaussians_at, on_cpu
 
 import gsjax
-from gsjax.raster.blocks import BLOCK, by_blocks
+from gsjax.raster.blocks import BLOCK, by_blocks, over_blocks
 from gsjax.raster.order import depth_order
 
 
@@ -40,6 +40,21 @@ def test_accelerators_take_one_block(monkeypatch):
     squares, done = by_blocks(square_and_count, nothing, values == 3, (values,))
     np.testing.assert_array_equal(squares, np.square(values))
     assert done.all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 30])
+def test_over_as_many_blocks_as_there_are(count):
+    def add(start, state):
+        blocks, seen = state
+        index = start + jnp.arange(8)
+        return blocks + 1, seen.at[index].add(index < count)
+
+    init = (0, jnp.zeros(64, jnp.int32))
+    blocks, seen = jax.jit(over_blocks, static_argnums=(0, 2))(
+        add, jnp.int32(count), 8, init
+    )
+    assert blocks == -(-count // 8)
+    np.testing.assert_array_equal(seen, np.arange(64) < count)
 
 
 @on_cpu

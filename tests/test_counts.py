@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.raster.counts import expand, running_total, squeeze, total_count
+from gsjax.raster.counts import owners, running_total, squeeze, total_count
 
 
 @pytest.mark.parametrize("size", [1, 2, 63, 64, 65, 127, 1000, 4097])
@@ -30,20 +30,13 @@ def test_squeeze_keeps_the_first(room):
     np.testing.assert_array_equal(index, wanted)
 
 
-def test_expand_unrolls_counts():
+@pytest.mark.parametrize("start", [0, 1, 4, 6, 9])
+def test_owners_of_unrolled_counts(start):
     counts = np.array([2, 0, 3, 0, 0, 1], np.int32)
-    owner, first = jax.jit(expand, static_argnums=1)(counts, 9)
-    np.testing.assert_array_equal(owner, [0, 0, 2, 2, 2, 5, 6, 6, 6])
-    np.testing.assert_array_equal(first, [0, 2, 2, 5, 5, 5])
-
-
-def test_expand_goes_on_from_an_item():
-    counts = np.array([2, 0, 3, 0, 0, 1], np.int32)
-    whole, _ = expand(counts, 9)
-    rest, first = expand(counts, 5, 4)
-    np.testing.assert_array_equal(rest, whole[4:])
-    number = np.arange(5) - first[np.minimum(rest, 5)]
-    np.testing.assert_array_equal(number[:2], [2, 0])
+    whole = np.repeat(np.arange(6), counts)
+    found = jax.jit(owners, static_argnums=1)(np.cumsum(counts), 9, start)
+    wanted = np.append(whole[start:], np.full(9, 6))[:9]
+    np.testing.assert_array_equal(found, wanted)
 
 
 @pytest.mark.parametrize("extra", [-2, 0, 1, 2**30])

@@ -1,5 +1,7 @@
 """Packed single-key sorts equal numpy's stable sorts, whatever the widths."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,13 +13,20 @@ from gsjax.raster.sorting import (
     argsort_descending,
     argsort_float,
     bits_for,
+    pair_keys,
     sort_pairs,
 )
 
 LENGTH = 64  # one shape, one compilation
 
-sort_narrow = jax.jit(lambda h, l: sort_pairs(h, l, 2**10, 2**12))
-sort_wide = jax.jit(lambda h, l: sort_pairs(h, l, 2**20, 2**31 - 1))
+
+@partial(jax.jit, static_argnames=("high_count", "low_count"))
+def sort_by_both(high, low, high_count, low_count):
+    return sort_pairs(pair_keys(high, low, high_count, low_count), low_count)
+
+
+sort_narrow = partial(sort_by_both, high_count=2**10, low_count=2**12)
+sort_wide = partial(sort_by_both, high_count=2**20, low_count=2**31 - 1)
 argsort = jax.jit(argsort_float)
 descending = jax.jit(argsort_descending)
 

@@ -10,16 +10,17 @@ Axis legend: R ranks (front to back), T tiles, P pairs, S steps, G tiles of a st
 K Gaussians of a chunk.
 """
 
+from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
 from gsjax.numerics import safe_sqrt
-from gsjax.raster.blocks import by_blocks
-from gsjax.raster.counts import COUNT_LIMIT, expand, running_total, total_count
-from gsjax.raster.sorting import argsort_descending, sort_pairs
+from gsjax.raster.blocks import block_size, over_blocks
+from gsjax.raster.counts import COUNT_LIMIT, owners, running_total, total_count
+from gsjax.raster.ladder import on_ladder
+from gsjax.raster.sorting import argsort_descending, pair_keys, sort_pairs
 from gsjax.raster.types import Array, Projected, RasterConfig
 
 
@@ -72,15 +73,14 @@ class Lists(NamedTuple):
 
     Attributes:
       ranks: [P] ranks sorted by (tile, rank); what follows the last is never read.
-      length: [T] entries of each tile.
-      items: [] (Gaussian, row) items wanted; pairs: [] pairs wanted.
+      length: [T] entries of each tile; zero if they cannot be counted.
+      pairs: [] their sum, saturating.
       fit: [] bool, whether there was room; if not, ``ranks`` holds nothing of use, and
         the counts are right all the same.
     """
 
     ranks: Array
     length: Array
-    items: Array
     pairs: Array
     fit: Array
 
@@ -173,7 +173,13 @@ def _pixel_range(centre: Array, extent: Array, size: int) -> tuple[Array, Array]
 
 
 def _take(values: Array, index: Array) -> Array:
+    """``values`` at ``index``, 0 past the last."""
     return values.at[index].get(mode="fill", fill_value=0)
+
+
+def _at(values: Array, index: Array) -> Array:
+    """``values`` at ``index``, the last past the last."""
+    return values.at[index].get(mode="clip")
 
 
 def _tiles_in_row(
@@ -181,13 +187,12 @@ def _tiles_in_row(
 ) -> tuple[Array, Array]:
     """First tile and number of tiles that the ellipse meets along one row of tiles.
 
-    None for a rank of R, one past the last. The extreme x of Q ≤ reach within the strip
-    dy ∈ [low, high] lies at the ellipse's own extreme if that is in the strip, else on
-    the strip's nearer edge (the region is convex). The strip spans pixel *centres*:
-    what falls between them is unseen.
+    The extreme x of Q ≤ reach within the strip dy ∈ [low, high] lies at the ellipse's
+    own extreme if that is in the strip, else on the strip's nearer edge (the region is
+    convex). The strip spans pixel *centres*: what falls between them is unseen.
     """
     u, v, slope, var_y, det, reach, inv_sx = (
-        _take(value, rank)
+        _at(value, rank)
         for value in (
             projected.u,
             projected.v,
@@ -199,7 +204,7 @@ def _tiles_in_row(
         )
     )
     var_x = 1 / jnp.square(inv_sx)
-    _, top = tile_origins(grid, row * grid.cols, device)
+    top = (row * grid.stride + device) * grid.tile
     low = top.astype(u.dtype) + 0.5 - v
     high = jnp.minimum(low + (grid.tile - 1), grid.height - 0.5 - v)
     safe_c = jnp.where(var_y > 0, var_y, 1)
@@ -214,7 +219,8 @@ def _tiles_in_row(
     right = _extent(0 * u) + reach_towards(1.0) * (1 + 1e-4)
     first = jnp.clip(jnp.ceil(u - left - 0.5), 0, grid.width).astype(jnp.int32)
     last = jnp.clip(jnp.floor(u + right - 0.5), -1, grid.width - 1).astype(jnp.int32)
-    first_tile, last_tile = first // grid.tile, last // grid.tile
+    # Towards zero, which is down where there is any.
+    first_tile, last_tile = (lax.div(a, jnp.int32(grid.tile)) for a in (first, last))
     count = jnp.where((reach > 0) & (first <= last), last_tile - first_tile + 1, 0)
     return row * grid.cols + first_tile, count
 
@@ -225,71 +231,90 @@ def make_lists(
     grid: Grid,
     device: Array,
     capacity: int,
+    rungs: int = 1,
 ) -> Lists:
-    """Expand to items, to pairs, and sort; room for ``capacity`` of each.
+    """Expand ranks to items, items to pairs, and sort; room for ``capacity`` pairs.
 
-    If either does not fit the lists come out empty; see `count_lists`.
+    By blocks within blocks, and only as many as there are: what is paid goes with what
+    a view holds, and not with the capacity. Without room the rest is counted alone.
+
+    Args:
+      projected: [R], front to back.
+      spans: of `row_spans`.
+      grid: the tiles of this device.
+      device: [] its number.
+      capacity: of pairs.
+      rungs: sizes at which to sort, at most.
     """
     ranks = projected.u.shape[0]
-    items, safe = total_count(spans.rows)
-    counts = jnp.where(safe & (items <= capacity), spans.rows, 0)
-    rank, start = expand(counts, capacity)
-    index = lax.iota(jnp.int32, capacity)
+    # Nor do the sums over a block wrap.
+    in_ranks = min(block_size(ranks), 2**30 // grid.rows)
+    in_items = min(2 * block_size(capacity), 2**30 // grid.cols)
+    in_pairs = 2 * in_items
+    _, countable = total_count(spans.rows)
+    past = jnp.where(spans.rows > 0, lax.iota(jnp.int32, ranks) + 1, 0)
+    past = jnp.where(countable, jnp.max(past), 0)
 
-    # By blocks, though not only to skip those without items: XLA would compute the
-    # first tile of an item again for each of its pairs, but not across a loop.
-    def look(_, inputs):
-        rank, index = inputs
-        row = _take(spans.first - start, rank) + index
-        return _tiles_in_row(projected, rank, row, grid, device)
+    def add_ranks(start, state):
+        rank = start + lax.iota(jnp.int32, in_ranks)
+        rows = _take(spans.rows, rank)
+        ends = running_total(rows)
+        first_row = _at(spans.first, rank) - (ends - rows)
+        add = partial(add_items, start, first_row, ends)
+        return over_blocks(add, ends[-1], in_items, state)
 
-    def skip(_, inputs):
-        return jax.tree.map(jnp.zeros_like, inputs)
-
-    first, counts = by_blocks(look, skip, rank < ranks, (rank, index))
-    pairs, safe = total_count(counts)
-    counts = jnp.where(safe & (pairs <= capacity), counts, 0)
-    item, start = expand(counts, capacity)
-    live = item < capacity
-    tile = jnp.where(live, _take(first - start, item) + index, grid.tiles)
-    pair_rank = jnp.where(live, _take(rank, item), ranks)
-    return Lists(
-        ranks=sort_pairs(tile, pair_rank, grid.tiles + 1, ranks + 1),
-        length=jnp.zeros(grid.tiles, jnp.int32).at[tile].add(1, mode="drop"),
-        items=items,
-        pairs=pairs,
-        fit=(items <= capacity) & (pairs <= capacity),
-    )
-
-
-def count_lists(
-    lists: Lists, projected: Projected, spans: Spans, grid: Grid, device: Array
-) -> Lists:
-    """``lists``, its ``length`` and ``pairs`` those wanted where they did not fit.
-
-    Without room for items or pairs, by as many items at a time as there are ranks:
-    each adds 1 where its tiles begin and takes it off where they end.
-    """
-    ranks = projected.u.shape[0]
-    countable = ~lists.fit & (lists.items < COUNT_LIMIT)
-    rounds = jnp.where(countable, -(-lists.items // ranks), 0)
-
-    def add(state):
-        index, change = state
-        rank, start = expand(spans.rows, ranks, index * ranks)
-        row = _take(spans.first - start, rank) + lax.iota(jnp.int32, ranks)
+    def add_items(first_rank, first_row, ends, start, state):
+        written, change, keys = state
+        place = owners(ends, in_items, start)
+        rank = first_rank + place
+        row = _at(first_row, place) + start + lax.iota(jnp.int32, in_items)
         first, count = _tiles_in_row(projected, rank, row, grid, device)
+        count = jnp.where(place < in_ranks, count, 0)
+        # Else computed by each of those who use them.
+        first, count = lax.optimization_barrier((first, count))
+        # 1 where its tiles begin, off again where they end.
         some = (count > 0).astype(jnp.int32)
         change = change.at[first].add(some, mode="drop")
-        return index + 1, change.at[first + count].add(-some, mode="drop")
+        change = change.at[first + count].add(-some, mode="drop")
+        ends = running_total(count)
+        left = capacity - written
+        add = partial(add_pairs, rank, first - (ends - count), ends, written)
+        keys = over_blocks(add, jnp.minimum(ends[-1], left), in_pairs, keys)
+        return written + jnp.minimum(ends[-1], left), change, keys
 
-    none = (jnp.int32(0), jnp.zeros(grid.tiles, jnp.int32))
-    _, change = lax.while_loop(lambda state: state[0] < rounds, add, none)
-    length = jnp.where(lists.fit, lists.length, running_total(change))
-    counted, _ = total_count(length)
-    pairs = jnp.where(countable, counted, jnp.maximum(lists.pairs, lists.items))
-    pairs = jnp.where(lists.fit, lists.pairs, pairs)
-    return lists._replace(length=length, pairs=pairs)
+    def add_pairs(rank, first, ends, written, start, keys):
+        item = owners(ends, in_pairs, start)
+        live = item < in_items
+        tile = _at(first, item) + start + lax.iota(jnp.int32, in_pairs)
+        more = pair_keys(
+            jnp.where(live, tile, grid.tiles),
+            jnp.where(live, _at(rank, item), ranks),
+            grid.tiles + 1,
+            ranks + 1,
+        )
+        at = (written + start,)
+        return tuple(map(lambda k, m: lax.dynamic_update_slice(k, m, at), keys, more))
+
+    # The last block may reach beyond the capacity by what is not live of it.
+    room = jnp.full(capacity + in_pairs, grid.tiles, jnp.int32)
+    keys = pair_keys(room, jnp.full_like(room, ranks), grid.tiles + 1, ranks + 1)
+    init = (jnp.int32(0), jnp.zeros(grid.tiles, jnp.int32), keys)
+    _, change, keys = over_blocks(add_ranks, past, in_ranks, init)
+    length = running_total(change)
+    pairs, _ = total_count(length)
+    pairs = jnp.where(countable, pairs, 2**31 - 1)
+
+    def sort(size):
+        low = sort_pairs([key[:size] for key in keys], ranks + 1)
+        return jnp.pad(low, (0, capacity - size))
+
+    return Lists(
+        # Sizes lie close together: to sort is quick to compile, and slow to do.
+        ranks=on_ladder(pairs, capacity, 2 * rungs - 1, sort, step=2),
+        length=length,
+        pairs=pairs,
+        fit=pairs <= capacity,
+    )
 
 
 def make_schedule(length: Array, grid: Grid, group: int, chunk: int) -> Schedule:
@@ -321,22 +346,36 @@ def pairs_for_steps(steps: Array, grid: Grid, group: int, chunk: int) -> Array:
     return jnp.where(huge, 2**31 - 1, jnp.where(huge, 0, wanted).astype(jnp.int32))
 
 
-def make_work(
-    lists: Lists, schedule: Schedule, chunk: int, ranks: int, room: int
-) -> Work:
-    """Unroll the schedule into ``room`` steps; none are live if they do not fit, or
-    the lists did not.
+class Steps(NamedTuple):
+    """Which chunk of which block each step is, [S] each, and where lists begin, [T]."""
+
+    block: Array
+    level: Array
+    start: Array
+
+
+def make_steps(lists: Lists, schedule: Schedule, room: int) -> Steps:
+    """Unroll the schedule into ``room`` steps; all past the last block if they do not
+    fit, or the lists did not.
     """
-    blocks = schedule.levels.shape[0]
     fits = lists.fit & (schedule.steps <= room)
-    block, begin = expand(jnp.where(fits, schedule.levels, 0), room)
-    level = lax.iota(jnp.int32, room) - _take(begin, block)
-    live = block < blocks
-    start = running_total(lists.length) - lists.length
+    levels = jnp.where(fits, schedule.levels, 0)
+    ends = running_total(levels)
+    block = owners(ends, room)
+    level = lax.iota(jnp.int32, room) - _take(ends - levels, block)
+    return Steps(block, level, running_total(lists.length) - lists.length)
+
+
+def make_work(
+    lists: Lists, schedule: Schedule, steps: Steps, chunk: int, ranks: int, room: int
+) -> Work:
+    """What the first ``room`` of the steps composite."""
+    block, level = steps.block[:room], steps.level[:room]
+    live = block < schedule.levels.shape[0]
     tile = schedule.tiles.at[block].get(mode="fill", fill_value=lists.length.shape[0])
     offset = level[:, None, None] * chunk + lax.iota(jnp.int32, chunk)
     inside = live[:, None, None] & (offset < _take(lists.length, tile)[..., None])
-    position = _take(start, tile)[..., None] + offset
+    position = _take(steps.start, tile)[..., None] + offset
     return Work(
         ranks=jnp.where(inside, _take(lists.ranks, position), ranks),
         block=block,

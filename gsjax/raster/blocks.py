@@ -20,6 +20,24 @@ T = TypeVar("T")
 BLOCK = 8192  # slots; what they hold stays in a core's cache
 
 
+def block_size(size: int) -> int:
+    """Slots of a block where there are ``size`` in all."""
+    return max(1, min(BLOCK, size) if jax.default_backend() == "cpu" else size)
+
+
+def over_blocks(add: Callable[[Array, T], T], count: Array, block: int, state: T) -> T:
+    """``add(start, state)`` for each block of ``count`` slots, one after the other.
+
+    Args:
+      add: from the block's first slot [] int32, and what those before came to.
+      count: [] int32, known when it runs.
+      block: slots of a block.
+      state: before the first.
+    """
+    blocks = -(-count // block)
+    return lax.fori_loop(0, blocks, lambda i, s: add(i * block, s), state)
+
+
 def by_blocks(
     run: Callable[..., T], skip: Callable[..., T], needed: Array, inputs
 ) -> T:
@@ -34,7 +52,7 @@ def by_blocks(
       Arrays [N, …].
     """
     size = needed.shape[0]
-    block = max(1, min(BLOCK, size) if jax.default_backend() == "cpu" else size)
+    block = block_size(size)
     blocks = -(-size // block)
 
     def split(a: Array) -> Array:

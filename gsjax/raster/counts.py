@@ -35,20 +35,20 @@ def running_total(counts: Array, levels: int = 3) -> Array:
     return (spread + lax.pad(both, zero, [(1, 0, 1)]))[:size]
 
 
-def expand(counts: Array, capacity: int, start=0) -> tuple[Array, Array]:
-    """Unroll ``counts`` [n] into items, from item ``start`` on.
+def owners(ends: Array, room: int, start: Array | int = 0) -> Array:
+    """Whose item each is of ``room`` items from item ``start`` on.
 
-    The counts must sum to less than 2^31.
+    Args:
+      ends: [n] int32, `running_total` of how many items each has.
+      room: how many to unroll.
+      start: [] the first of them.
 
     Returns:
-      owner: [capacity] int32, whose each item is, rising; n past the total.
-      first: [n] int32, where the items of each begin: item i is number
-        i - first[owner[i]] of its owner's.
+      [room] int32, rising; n past the last.
     """
-    ends = running_total(counts) - start
-    passed = jnp.zeros(capacity, jnp.int32)
-    passed = passed.at[jnp.maximum(ends, 0)].add(1, mode="drop")
-    return running_total(passed), ends - counts
+    passed = jnp.zeros(room, jnp.int32)
+    passed = passed.at[jnp.maximum(ends - start, 0)].add(1, mode="drop")
+    return running_total(passed)
 
 
 def squeeze(chosen: Array, room: int) -> tuple[Array, Array]:

@@ -106,25 +106,18 @@ def _rasterise_local(
     ranks = projected.u.shape[0]
     group = bins.tiles_per_step(config, grid, jax.default_backend())
     spans = bins.row_spans(geometry, grid, device)
-    # The boxes bound the pairs from above, for no more than a sum (and its rounding).
-    bound = jnp.sum(spans.rows.astype(jnp.float32) * spans.cols) * (1 + 1e-5)
-
-    def sort(room):
-        lists = bins.make_lists(geometry, spans, grid, device, room)
-        return lists._replace(ranks=jnp.pad(lists.ranks, (0, capacity - room)))
-
-    lists = on_ladder(bound, capacity, config.rungs, sort)
-    lists = bins.count_lists(lists, geometry, spans, grid, device)
+    lists = bins.make_lists(geometry, spans, grid, device, capacity, config.rungs)
     schedule = bins.make_schedule(lists.length, grid, group, config.chunk_size)
+    room = bins.step_capacity(capacity, grid, group, config.chunk_size)
+    steps = bins.make_steps(lists, schedule, room)
 
     def blend(room):
-        work = bins.make_work(lists, schedule, config.chunk_size, ranks, room)
+        work = bins.make_work(lists, schedule, steps, config.chunk_size, ranks, room)
         return composite(projected, work, schedule, grid, device, config)
 
-    room = bins.step_capacity(capacity, grid, group, config.chunk_size)
     images = on_ladder(schedule.steps, room, config.rungs, blend)
     for_steps = bins.pairs_for_steps(schedule.steps, grid, group, config.chunk_size)
-    wanted = jnp.maximum(jnp.maximum(lists.items, lists.pairs), for_steps)
+    wanted = jnp.maximum(lists.pairs, for_steps)
     images = {name: image[None] for name, image in images.items()}
     return images, lists.pairs[None], wanted[None]
 

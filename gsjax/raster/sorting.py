@@ -7,6 +7,8 @@ one uint32 is sorted, else one uint64, which is built inside `jax.enable_x64` so
 it exists whatever the user's setting; both are exact.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,17 +22,24 @@ def bits_for(count: int) -> int:
     return max(1, (count - 1).bit_length())
 
 
-def sort_pairs(high: Array, low: Array, high_count: int, low_count: int) -> Array:
-    """Sort by (high, low), both int32 and below their counts; returns ``low`` sorted.
-
-    Equal to ``low[np.lexsort((low, high))]``.
+def pair_keys(
+    high: Array, low: Array, high_count: int, low_count: int
+) -> tuple[Array, ...]:
+    """What to sort by (high, low), both int32 ≥ 0 and below their counts: one key of
+    32 bits where they fit, else both.
     """
     low_bits = bits_for(low_count)
     if bits_for(high_count) + low_bits <= 32:
-        key = (high.astype(jnp.uint32) << low_bits) | low.astype(jnp.uint32)
-        mask = jnp.uint32(2**low_bits - 1)
-        return (lax.sort(key, is_stable=True) & mask).astype(jnp.int32)
-    return _sort_wide(high.astype(jnp.uint32), low)
+        return ((high.astype(jnp.uint32) << low_bits) | low.astype(jnp.uint32),)
+    return high.astype(jnp.uint32), low
+
+
+def sort_pairs(keys: Sequence[Array], low_count: int) -> Array:
+    """``low`` of `pair_keys`, sorted by (high, low)."""
+    if len(keys) == 2:
+        return _sort_wide(*keys)
+    mask = jnp.uint32(2 ** bits_for(low_count) - 1)
+    return (lax.sort(keys[0], is_stable=True) & mask).astype(jnp.int32)
 
 
 def argsort_float(values: Array) -> Array:
