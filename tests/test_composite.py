@@ -64,3 +64,14 @@ def test_product_rounds_once_a_factor(largest, bound):
         relative = np.abs(np.asarray(found) / wanted - 1)
         assert relative.max() < 32 * 2.0**-24
         assert np.sqrt(np.mean(relative**2)) < bound * 2.0**-24
+
+
+@pytest.mark.usefixtures("float32")
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_products_of_any_number(size):
+    alpha = np.random.default_rng(size).uniform(0, 1, (3, size, 4)).astype(np.float32)
+    total, before = jax.jit(running_product)(alpha)
+    passed = np.cumprod(1 - alpha.astype(np.float64), 1)
+    np.testing.assert_allclose(total, passed[:, -1], rtol=size * 2.0**-23)
+    np.testing.assert_allclose(before[:, 1:], passed[:, :-1], rtol=size * 2.0**-23)
+    np.testing.assert_array_equal(before[:, 0], 1)

@@ -8,7 +8,7 @@ import pytest
 from gsjax.raster.counts import owners, running_total, squeeze, total_count
 
 
-@pytest.mark.parametrize("size", [1, 2, 63, 64, 65, 127, 1000, 4097])
+@pytest.mark.parametrize("size", [1, 2, 65, 4095, 4096, 4097, 10007])
 def test_running_totals(size):
     counts = np.random.default_rng(size).integers(0, 2**20, size).astype(np.int32)
     wanted = np.cumsum(counts, dtype=np.int32)

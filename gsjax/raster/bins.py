@@ -61,11 +61,10 @@ def tile_origins(grid: Grid, tile: Array, device: Array) -> tuple[Array, Array]:
 
 
 class Spans(NamedTuple):
-    """Boxes of tiles, [R] each: ``rows`` local rows from ``first``, ``cols`` wide."""
+    """``rows`` local rows of tiles from ``first``, [R] each."""
 
     first: Array
     rows: Array
-    cols: Array
 
 
 class Lists(NamedTuple):
@@ -128,13 +127,12 @@ def row_spans(projected: Projected, grid: Grid, device: Array) -> Spans:
 
     The rows of this device are device, device + stride, ….
     """
-    left, right, top, bottom, seen = _boxes(projected, grid.width, grid.height)
+    *_, top, bottom, seen = _boxes(projected, grid.width, grid.height)
     # Global rows of tiles g0 … g1 hold the local rows j with g0 ≤ j·stride + d ≤ g1.
     first = -((device - top // grid.tile) // grid.stride)
     last = (bottom // grid.tile - device) // grid.stride
     rows = jnp.where(seen, jnp.maximum(last - first + 1, 0), 0)
-    cols = right // grid.tile - left // grid.tile + 1
-    return Spans(first=first, rows=rows, cols=cols)
+    return Spans(first=first, rows=rows)
 
 
 def radii(projected: Projected, width: int, height: int) -> Array:
@@ -249,8 +247,9 @@ def make_lists(
     ranks = projected.u.shape[0]
     # Nor do the sums over a block wrap.
     in_ranks = min(block_size(ranks), 2**30 // grid.rows)
-    in_items = min(2 * block_size(capacity), 2**30 // grid.cols)
-    in_pairs = 2 * in_items
+    items = min(ranks * grid.rows, max(ranks, capacity))
+    in_items = min(block_size(items, 2), 2**30 // grid.cols)
+    in_pairs = block_size(capacity, 4)
     _, countable = total_count(spans.rows)
     past = jnp.where(spans.rows > 0, lax.iota(jnp.int32, ranks) + 1, 0)
     past = jnp.where(countable, jnp.max(past), 0)

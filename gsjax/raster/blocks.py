@@ -20,9 +20,10 @@ T = TypeVar("T")
 BLOCK = 8192  # slots; what they hold stays in a core's cache
 
 
-def block_size(size: int) -> int:
-    """Slots of a block where there are ``size`` in all."""
-    return max(1, min(BLOCK, size) if jax.default_backend() == "cpu" else size)
+def block_size(size: int, times: int = 1) -> int:
+    """Slots of a block, ``times`` the usual many, where there are ``size`` in all."""
+    cpu = jax.default_backend() == "cpu"
+    return max(1, min(times * BLOCK, size) if cpu else size)
 
 
 def over_blocks(add: Callable[[Array, T], T], count: Array, block: int, state: T) -> T:

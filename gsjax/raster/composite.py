@@ -12,6 +12,7 @@ running product. Chunks are recomputed in the backward pass instead of kept. A c
 behind pixels that have all stopped is skipped, in both directions, by `lax.cond`.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -28,32 +29,42 @@ _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
 
 def running_product(alpha: Array) -> tuple[Array, Array]:
-    """(Π over all K, Π over those before k [G, K, P]) of 1 − alpha [G, K, P].
-
-    T − T α rounds less than T (1 − α) where α is small; from a half on 1 − α is exact.
-    """
-    product, before = jnp.ones_like(alpha[:, :1]), []
-    for part in _parts(alpha):
-        before.append(product)
-        less = product - product * part
-        product = jnp.where(part < 0.5, less, product * (1 - part))
-    return product[:, 0], lax.concatenate(before, 1)
+    """(Π over all K, Π over those before k [G, K, P]) of 1 − alpha [G, K, P]."""
+    return _running(_pass, jnp.ones_like(alpha[:, :1]), alpha)
 
 
 def _running_sum(values: Array) -> tuple[Array, Array]:
     """(Σ over all K, Σ over those before k [G, K, P]) of values [G, K, P]."""
-    total, before = jnp.zeros_like(values[:, :1]), []
-    for part in _parts(values):
-        before.append(total)
-        total = total + part
-    return total[:, 0], lax.concatenate(before, 1)
+    return _running(jnp.add, jnp.zeros_like(values[:, :1]), values)
 
 
-def _parts(values: Array) -> list[Array]:
-    """[G, 1, P] for each k. By `lax.split`, whose transpose is one concatenation; that
-    of K slices would be a sum of K padded arrays.
+def _pass(product: Array, alpha: Array) -> Array:
+    """T (1 − α): as T − T α where that rounds less; from a half on 1 − α is exact."""
+    return jnp.where(alpha < 0.5, product - product * alpha, product * (1 - alpha))
+
+
+def _running(
+    add: Callable[[Array, Array], Array], none: Array, values: Array
+) -> tuple[Array, Array]:
+    """(What all K come to, what those before k come to [G, K, P]), from ``none`` on.
+
+    Two at a time, and what the first of them comes to then for all K at once: each turn
+    is a kernel to be compiled and called.
     """
-    return list(lax.split(values, [1] * values.shape[1], axis=1))
+    groups, size, pixels = values.shape
+    values = jnp.pad(values, ((0, 0), (0, size % 2), (0, 0)))
+    # By `lax.split`, whose transpose is one concatenation; that of slices would be a
+    # sum of padded arrays.
+    parts = lax.split(values, [1] * values.shape[1], axis=1)
+    so_far, before = none, []
+    for first, second in zip(parts[::2], parts[1::2]):
+        before.append(so_far)
+        so_far = add(add(so_far, first), second)
+    pairs = values.reshape(groups, -1, 2, pixels)
+    first = lax.concatenate(before, 1)[:, :, None]
+    is_first = lax.broadcasted_iota(jnp.int32, pairs.shape, 2) == 0
+    both = jnp.where(is_first, first, add(first, pairs[:, :, :1]))
+    return so_far[:, 0], both.reshape(values.shape)[:, :size]
 
 
 @jax.custom_jvp
@@ -184,10 +195,11 @@ def _blend(
     sums = channel_sums(jnp.where(blended, alpha * before, 0), chunk.channels)
     out = {"sums": carried[:, None] * sums}
     if chunk.depth is not None:
-        # What is behind one is what reaches the next, to the bit: computed in any other
-        # way one half may be crossed twice, or not at all.
-        after = jnp.concatenate([reached[:, 1:], (carried * total)[:, None]], 1)
-        half = (reached > 0.5) & (after <= 0.5) & blended
+        # The last that more than half reaches, if less is left behind all. By their
+        # number: rounding may let more reach one than the one before it.
+        number = jnp.sum(reached > 0.5, axis=1, dtype=jnp.int32, keepdims=True)
+        last = lax.broadcasted_iota(jnp.int32, reached.shape, 1) == number - 1
+        half = last & (carried * total <= 0.5)[:, None] & blended
         out["median"] = jnp.sum(jnp.where(half, chunk.depth, 0), axis=1)
     return carried * total, out
 

@@ -9,6 +9,10 @@ from gsjax.raster.types import Array
 COUNT_LIMIT = 2**30
 
 
+# Below this a sum takes less than its kernels, of which `jnp.cumsum` has fewest.
+_FEW = 4096
+
+
 def total_count(counts: Array) -> tuple[Array, Array]:
     """Sum of int32 counts, saturating: (total, whether it is below `COUNT_LIMIT`)."""
     safe = jnp.sum(counts.astype(jnp.float32)) < COUNT_LIMIT
@@ -24,7 +28,7 @@ def running_total(counts: Array, levels: int = 3) -> Array:
     `lax.associative_scan`.
     """
     size = counts.shape[0]
-    if levels == 0 or size < 64:
+    if levels == 0 or size < _FEW:
         return jnp.cumsum(counts, dtype=jnp.int32)
     counts = jnp.pad(counts.astype(jnp.int32), (0, size % 2))
     first, second = counts[0::2], counts[1::2]
