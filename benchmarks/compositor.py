@@ -28,7 +28,7 @@ import yardstick  # noqa: E402
 from jax import lax  # noqa: E402
 from jax.sharding import Mesh, PartitionSpec  # noqa: E402
 
-from gsjax.raster import bins  # noqa: E402
+from gsjax.raster import bins, schedules  # noqa: E402
 from gsjax.raster.alpha import alphas, pixel_centres  # noqa: E402
 from gsjax.raster.composite import (  # noqa: E402
     composite,
@@ -45,7 +45,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     gaussians, camera = case.gaussians, case.camera
     devices = jax.local_device_count()
     grid = bins.make_grid(camera.width, camera.height, config.tile_size, devices)
-    group = bins.tiles_per_step(config, grid, jax.default_backend())
+    group = schedules.tiles_per_step(config, grid, jax.default_backend())
     room = -(-config.pair_capacity // devices)
     mesh = Mesh(np.array(jax.local_devices()), ("tiles",))
     index = jnp.arange(devices, dtype=jnp.int32)
@@ -76,14 +76,14 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     def bin_local(device, projected):
         spans = bins.row_spans(projected, grid, device)
         lists = bins.make_lists(projected, spans, grid, device, room)
-        schedule = bins.make_schedule(lists.length, grid, group, config.chunk_size)
+        schedule = schedules.make_schedule(lists.length, grid, group, config.chunk_size)
         return lists, schedule
 
     def work_of(lists, schedule, ranks):
-        count = bins.step_capacity(room, grid, group, config.chunk_size)
-        steps = bins.make_steps(lists, schedule, count)
+        count = schedules.step_capacity(room, grid, group, config.chunk_size)
+        steps = schedules.make_steps(lists, schedule, count)
         chunk = config.chunk_size
-        return bins.make_work(lists, schedule, steps, chunk, ranks, count)
+        return schedules.make_work(lists, schedule, steps, chunk, ranks, count)
 
     def composite_local(device, projected, lists, schedule):
         ranks = projected.u.shape[0]

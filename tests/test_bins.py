@@ -11,7 +11,7 @@ import pytest
 from conftest import COUNT, HEIGHT, SCENES, WIDTH, scene_of
 
 from gsjax import RasterConfig
-from gsjax.raster import bins, blocks
+from gsjax.raster import bins, blocks, schedules
 from gsjax.raster.order import depth_order
 from gsjax.raster.project import project
 
@@ -189,22 +189,22 @@ def test_steps_and_pairs_that_have_room_for_one_another(group, chunk):
     steps = np.unique(np.geomspace(1, 5000, 60).astype(int))
     for wanted in steps:
         count = jnp.int32(wanted)
-        pairs = int(bins.pairs_for_steps(count, grid, group, chunk))
-        assert bins.step_capacity(pairs, grid, group, chunk) >= wanted
+        pairs = int(schedules.pairs_for_steps(count, grid, group, chunk))
+        assert schedules.step_capacity(pairs, grid, group, chunk) >= wanted
         if pairs > 0:
             fewer = int(pairs * (1 - 2e-6)) - 1
-            assert bins.step_capacity(fewer, grid, group, chunk) < wanted
+            assert schedules.step_capacity(fewer, grid, group, chunk) < wanted
 
 
 def test_schedule_covers_every_chunk_once():
     """Steps hold each pair exactly once, blocks in order, front to back."""
     chunk, group = 8, 4
     grid, _, lists = lists_of("random", 8)
-    schedule = bins.make_schedule(jnp.asarray(lists.length), grid, group, chunk)
-    room = bins.step_capacity(CAPACITY, grid, group, chunk)
+    schedule = schedules.make_schedule(jnp.asarray(lists.length), grid, group, chunk)
+    room = schedules.step_capacity(CAPACITY, grid, group, chunk)
     lists = jax.tree.map(jnp.asarray, lists)
-    steps = bins.make_steps(lists, schedule, room)
-    work = bins.make_work(lists, schedule, steps, chunk, COUNT, room)
+    steps = schedules.make_steps(lists, schedule, room)
+    work = schedules.make_work(lists, schedule, steps, chunk, COUNT, room)
     ranks, block = np.asarray(work.ranks), np.asarray(work.block)
     live, first = np.asarray(work.live), np.asarray(work.first)
     assert live.sum() == int(schedule.steps)

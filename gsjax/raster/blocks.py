@@ -1,4 +1,5 @@
-"""Work on one slot at a time, block by block; blocks that need none are skipped.
+"""Work block by block: on each slot by itself (`by_blocks`), or one block after another
+with what those before came to (`over_blocks`).
 
 What is paid then goes with the slots in use and not with the capacity. Made for what
 no derivative is taken of: a transposed loop would copy more than it saves. Nor are the

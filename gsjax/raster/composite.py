@@ -22,7 +22,8 @@ import numpy as np
 from jax import lax
 
 from gsjax.raster.alpha import alphas, collect_absolute, pixel_centres
-from gsjax.raster.bins import Grid, Schedule, Work, tile_origins
+from gsjax.raster.bins import Grid, tile_origins
+from gsjax.raster.schedules import Schedule, Work
 from gsjax.raster.types import Array, Projected, RasterConfig
 
 _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)

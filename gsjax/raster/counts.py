@@ -71,3 +71,8 @@ def squeeze(chosen: Array, room: int) -> tuple[Array, Array]:
     target = jnp.where(chosen, place - 1, room)
     index = jnp.full(room, size, jnp.int32)
     return index.at[target].set(lax.iota(jnp.int32, size), mode="drop"), place[-1]
+
+
+def take(values: Array, index: Array) -> Array:
+    """``values`` at ``index``, 0 past the last."""
+    return values.at[index].get(mode="fill", fill_value=0)

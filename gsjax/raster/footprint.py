@@ -11,7 +11,7 @@ Axis legend: P pixels of a tile, K Gaussians of a chunk, C channels.
 import jax
 
 from gsjax.memory import Estimate
-from gsjax.raster import bins
+from gsjax.raster import bins, schedules
 from gsjax.raster.rasterise import default_pair_capacity
 from gsjax.raster.types import RasterConfig
 
@@ -57,9 +57,9 @@ def render_estimate(
     grid = bins.make_grid(*size, config.tile_size, devices)
     seen = min(slots, config.visible_capacity or slots)
     capacity = config.pair_capacity or default_pair_capacity(seen, grid)
-    group = bins.tiles_per_step(config, grid, jax.default_backend())
+    group = schedules.tiles_per_step(config, grid, jax.default_backend())
     share = -(-capacity // devices)
-    rows = group * bins.step_capacity(share, grid, group, config.chunk_size)
+    rows = group * schedules.step_capacity(share, grid, group, config.chunk_size)
     channels = 1 + 3 * ("rgb" in config.outputs) + ("depth" in config.outputs)
     numbers, in_chunk = 11 + 3 * bases, _IN_CHUNK + channels
     of_pairs, of_gaussians = config.chunk_size * in_chunk, _PROJECTED + numbers

@@ -14,7 +14,7 @@ from jax import lax
 from gsjax.devices import spread
 from gsjax.errors import InputError
 from gsjax.gaussians import capacity_bucket
-from gsjax.raster import bins
+from gsjax.raster import bins, schedules
 from gsjax.raster.composite import composite
 from gsjax.raster.counts import COUNT_LIMIT
 from gsjax.raster.ladder import on_ladder
@@ -104,19 +104,20 @@ def _rasterise_local(
     """
     device = device[0]
     ranks = projected.u.shape[0]
-    group = bins.tiles_per_step(config, grid, jax.default_backend())
+    chunk = config.chunk_size
+    group = schedules.tiles_per_step(config, grid, jax.default_backend())
     spans = bins.row_spans(geometry, grid, device)
     lists = bins.make_lists(geometry, spans, grid, device, capacity, config.rungs)
-    schedule = bins.make_schedule(lists.length, grid, group, config.chunk_size)
-    room = bins.step_capacity(capacity, grid, group, config.chunk_size)
-    steps = bins.make_steps(lists, schedule, room)
+    schedule = schedules.make_schedule(lists.length, grid, group, chunk)
+    room = schedules.step_capacity(capacity, grid, group, chunk)
+    steps = schedules.make_steps(lists, schedule, room)
 
     def blend(room):
-        work = bins.make_work(lists, schedule, steps, config.chunk_size, ranks, room)
+        work = schedules.make_work(lists, schedule, steps, chunk, ranks, room)
         return composite(projected, work, schedule, grid, device, config)
 
     images = on_ladder(schedule.steps, room, config.rungs, blend)
-    for_steps = bins.pairs_for_steps(schedule.steps, grid, group, config.chunk_size)
+    for_steps = schedules.pairs_for_steps(schedule.steps, grid, group, chunk)
     wanted = jnp.maximum(lists.pairs, for_steps)
     images = {name: image[None] for name, image in images.items()}
     return images, lists.pairs[None], wanted[None]

@@ -1,0 +1,123 @@
+"""The list of work that the lists of tiles come to: which chunk of which tiles, when.
+
+A step is one chunk of K Gaussians for each of G tiles. Tiles are taken in order of list
+length, so the G tiles of a block need nearly the same number of steps and no tile waits
+for the longest. No derivative is taken here.
+
+Axis legend: T tiles, S steps, G tiles of a step, K Gaussians of a chunk.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from gsjax.raster.bins import Grid, Lists
+from gsjax.raster.counts import COUNT_LIMIT, owners, running_total, take, total_count
+from gsjax.raster.sorting import argsort_descending
+from gsjax.raster.types import Array, RasterConfig
+
+
+class Schedule(NamedTuple):
+    """Blocks of G tiles of like length, each taking ``levels`` steps.
+
+    Attributes:
+      tiles: [blocks, G]; places past the last tile hold T, whose list is empty.
+      levels: [blocks] steps of each block.
+      steps: [] their sum, saturating.
+    """
+
+    tiles: Array
+    levels: Array
+    steps: Array
+
+
+class Steps(NamedTuple):
+    """Which chunk of which block each step is, [S] each, and where lists begin, [T]."""
+
+    block: Array
+    level: Array
+    start: Array
+
+
+class Work(NamedTuple):
+    """The steps, [S] each; those of a block follow one another, front to back.
+
+    Attributes:
+      ranks: [S, G, K] what to composite; R where there is none.
+      block: which block of tiles. Past the last step: one past the last block.
+      first: whether it is the first of its block.
+      live: whether there is anything to do.
+    """
+
+    ranks: Array
+    block: Array
+    first: Array
+    live: Array
+
+
+def tiles_per_step(config: RasterConfig, grid: Grid, platform: str) -> int:
+    """G: small keeps a CPU's caches, large keeps launches on accelerators rare."""
+    chosen = config.tiles_per_step
+    if chosen is None:
+        chosen = 16 if platform == "cpu" else 2048
+    return max(1, min(chosen, grid.tiles))
+
+
+def make_schedule(length: Array, grid: Grid, group: int, chunk: int) -> Schedule:
+    """Tiles by falling length, in blocks of ``group``, ``chunk`` Gaussians a step."""
+    blocks = -(-grid.tiles // group)
+    order = argsort_descending(length)
+    padding = jnp.full(blocks * group - grid.tiles, grid.tiles, jnp.int32)
+    tiles = jnp.concatenate([order, padding]).reshape(blocks, group)
+    levels = -(-take(length, tiles[:, 0]) // chunk)
+    return Schedule(tiles, levels, total_count(levels)[0])
+
+
+def step_capacity(capacity: int, grid: Grid, group: int, chunk: int) -> int:
+    """Room for steps that goes with a pair capacity: as if every chunk were full but
+    for an eighth, and half a chunk more for each block.
+    """
+    blocks = -(-grid.tiles // group)
+    return -(-blocks // 2) + -(-9 * capacity // (8 * group * chunk))
+
+
+def pairs_for_steps(steps: Array, grid: Grid, group: int, chunk: int) -> Array:
+    """Smallest pair capacity whose `step_capacity` holds ``steps``, to a millionth;
+    saturating int32."""
+    blocks = -(-grid.tiles // group)
+    extra = jnp.maximum(steps - -(-blocks // 2), 0).astype(jnp.float32)
+    above = (extra - 1) * (8 * group * chunk / 9) * (1 + 1e-6)
+    wanted = jnp.where(extra > 0, jnp.floor(above) + 1, 0)
+    huge = wanted >= COUNT_LIMIT
+    return jnp.where(huge, 2**31 - 1, jnp.where(huge, 0, wanted).astype(jnp.int32))
+
+
+def make_steps(lists: Lists, schedule: Schedule, room: int) -> Steps:
+    """Unroll the schedule into ``room`` steps; all past the last block if they do not
+    fit, or the lists did not.
+    """
+    fits = lists.fit & (schedule.steps <= room)
+    levels = jnp.where(fits, schedule.levels, 0)
+    ends = running_total(levels)
+    block = owners(ends, room)
+    level = lax.iota(jnp.int32, room) - take(ends - levels, block)
+    return Steps(block, level, running_total(lists.length) - lists.length)
+
+
+def make_work(
+    lists: Lists, schedule: Schedule, steps: Steps, chunk: int, ranks: int, room: int
+) -> Work:
+    """What the first ``room`` of the steps composite."""
+    block, level = steps.block[:room], steps.level[:room]
+    live = block < schedule.levels.shape[0]
+    tile = schedule.tiles.at[block].get(mode="fill", fill_value=lists.length.shape[0])
+    offset = level[:, None, None] * chunk + lax.iota(jnp.int32, chunk)
+    inside = live[:, None, None] & (offset < take(lists.length, tile)[..., None])
+    position = take(steps.start, tile)[..., None] + offset
+    return Work(
+        ranks=jnp.where(inside, take(lists.ranks, position), ranks),
+        block=block,
+        first=level == 0,
+        live=live,
+    )
