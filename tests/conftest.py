@@ -14,6 +14,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from jax._src import compiler
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
@@ -51,40 +52,75 @@ BACKGROUND = np.array([0.2, 0.5, 0.9])
 # Every program is a handful of mappings, of which Linux gives a process 65 530. Where
 # they run out XLA crashes, or hangs, wherever it is.
 _MANY_MAPPINGS = 30_000
+_MUCH_MEMORY = 2e9  # bytes, of programs alike
 
 
 class _Programs:
-    """How what this process keeps was compiled."""
+    """How what this process keeps was compiled: "quickly", or as a mark of the test."""
 
-    quickly = False
+    kind = "as_users"
 
 
-def _of_one_kind(quickly: bool) -> None:
+def _kind(item) -> str:
+    marks = (item.get_closest_marker(name) for name in ("equal_bits", "as_users"))
+    return next((mark.name for mark in marks if mark), "quickly")
+
+
+def _compile(kind: str) -> None:
     """Two kinds of programs round differently, and would be compared."""
-    if quickly != _Programs.quickly:
+    if kind != _Programs.kind:
         jax.clear_caches()
-        _Programs.quickly = quickly
+        jax.config.update("jax_disable_most_optimizations", kind != "as_users")
+        _Programs.kind = kind
+
+
+def _with_older_emitters(get_compile_options):
+    """XLA's older emitters of kernels, for what is compiled quickly: JAX has no setting
+    for them, and XLA's own is for a whole process. They round a number by where in an
+    array it stands.
+    """
+
+    def get(*args, **kwargs):
+        options = get_compile_options(*args, **kwargs)
+        if _Programs.kind == "quickly":
+            older = ("xla_cpu_use_fusion_emitters", False)
+            options.env_option_overrides = [*options.env_option_overrides, older]
+        return options
+
+    return get
+
+
+compiler.get_compile_options = _with_older_emitters(compiler.get_compile_options)
+
+
+def pytest_collection_modifyitems(items):
+    """Modules that take long come first, lest one process waits for the other; in each,
+    those of a kind together.
+    """
+    slow = {item.path for item in items if item.get_closest_marker("long")}
+    slow |= {item.path for item in items if _kind(item) != "quickly"}
+    paths = list(dict.fromkeys(item.path for item in items))
+    items.sort(key=lambda x: (x.path not in slow, paths.index(x.path), _kind(x)))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Programs are many, and each runs once: XLA compiles them in a third of the time
+    where it optimises little. What is computed is the same, to rounding.
+    """
+    _compile(_kind(item))
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _room_for_programs(request):
-    _of_one_kind("quick_compiles" in request.fixturenames)
+def _room_for_programs():
     yield
-    mappings = Path("/proc/self/maps")
-    if mappings.exists() and mappings.read_bytes().count(b"\n") > _MANY_MAPPINGS:
+    mappings, sizes = Path("/proc/self/maps"), Path("/proc/self/statm")
+    if mappings.exists() and (
+        mappings.read_bytes().count(b"\n") > _MANY_MAPPINGS
+        or int(sizes.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > _MUCH_MEMORY
+    ):
         jax.clear_caches()
         gc.collect()
-
-
-@pytest.fixture(scope="module")
-def quick_compiles():
-    """For a module whose programs are many and run once: XLA compiles them in half of
-    the time where it optimises little. What is computed is the same, to rounding.
-    """
-    _of_one_kind(True)
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(scope="module")
@@ -93,12 +129,6 @@ def float32():
     jax.config.update("jax_enable_x64", False)
     yield
     jax.config.update("jax_enable_x64", True)
-
-
-def pytest_collection_modifyitems(items):
-    """Modules that compile quickly come first: what is kept changes kind once."""
-    quick = {item.path for item in items if "quick_compiles" in item.fixturenames}
-    items.sort(key=lambda item: item.path not in quick)
 
 
 needs_two_devices = pytest.mark.skipif(

@@ -15,6 +15,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+QUICK = "--xla_cpu_use_fusion_emitters=false"
 _BLOCK = re.compile(r"^(?:<!-- (\S+) -->\n)?```(\w+)\n((?:.*\n)*?)```$", re.M)
 _TOLD = re.compile(r"^\s*print\(.*\)  # (.*)$")
 
@@ -62,7 +63,9 @@ def run_pages(paths: list[Path], *, claims: str = "", cwd: Path) -> str:
         **os.environ,
         "PYTHONPATH": str(ROOT),
         "JAX_ENABLE_X64": "0",
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",  # many programs, each run once
+        # Many programs, each run once: see conftest.py.
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {QUICK}",
     }
     done = subprocess.run(
         [sys.executable, "-W", "error::UserWarning", __file__, *map(str, paths)],

@@ -23,8 +23,6 @@ from conftest import (
 import gsjax
 from gsjax import InputError, RasterConfig
 
-pytestmark = pytest.mark.usefixtures("quick_compiles")
-
 GOOD = {
     "means": np.zeros((4, 3)),
     "quats": np.ones((4, 4)),

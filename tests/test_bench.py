@@ -19,8 +19,6 @@ from gsjax.curves import BOTTOM, LEFT, RIGHT, TOP
 from gsjax.errors import InputError
 from gsjax.scene.trials import TRIALS, Trial
 
-pytestmark = pytest.mark.usefixtures("quick_compiles")
-
 BEHIND = np.array([0.2, 0.5, 0.9])
 COUNT, SIZE = 60, 16
 EXACT = RasterConfig(

@@ -18,8 +18,6 @@ from gsjax.raster.project import project
 CAPACITY = 16384
 CONFIG = RasterConfig(rungs=1, devices=1)
 
-pytestmark = pytest.mark.usefixtures("quick_compiles")
-
 
 @jax.jit
 def projected_of(gaussians, camera):

@@ -18,8 +18,6 @@ from gsjax.scene.synthetic import torus_knot_scene
 from gsjax.scene.transforms import CameraEntry, load_transforms
 from gsjax.scene.transforms_writer import transforms_json
 
-pytestmark = pytest.mark.usefixtures("quick_compiles")
-
 WIDTH, HEIGHT = 32, 24
 CONFIG = gsjax.RasterConfig(outputs=("rgb",), rungs=1)  # one rung compiles faster
 

@@ -15,8 +15,6 @@ import gsjax
 from gsjax import cli
 from gsjax.gaussians import activate
 
-pytestmark = pytest.mark.usefixtures("quick_compiles")
-
 WIDTH, HEIGHT, PHOTOS, STEPS = 64, 48, 9, 20
 HELD_OUT = ["photo_000", "photo_008"]
 DEMO = ["--photos", str(PHOTOS), "--size", f"{WIDTH}x{HEIGHT}", "--steps", str(STEPS)]

@@ -44,8 +44,6 @@ from gsjax.train.fit import (
 from gsjax.train.room import grow_state, roomy_pairs
 from gsjax.train.step import init_state
 
-pytestmark = pytest.mark.usefixtures("quick_compiles")
-
 STEPS, FINER = 60, 30
 _PAUSE = 2.0  # s
 CONFIG = TrainConfig(
@@ -82,7 +80,6 @@ def _shared_programs(tmp_path_factory):
     settings = {  # here, and as everywhere else
         "jax_compilation_cache_dir": (str(tmp_path_factory.mktemp("programs")), None),
         "jax_persistent_cache_min_compile_time_secs": (0.5, 1.0),
-        "jax_disable_most_optimizations": (True, False),
         "jax_enable_x64": (False, True),
     }
     for name, (here, _) in settings.items():
@@ -204,6 +201,7 @@ def test_killed_and_taken_up_from_the_last_checkpoint(whole, tmp_path):
     assert changed(again.state, whole["adaptive"][0].state) == []
 
 
+@pytest.mark.equal_bits
 @on_cpu
 def test_too_few_pairs_and_slots_are_grown():
     """Until the first edit no size matters; it tells how many slots it wants.

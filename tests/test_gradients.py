@@ -29,8 +29,6 @@ from gsjax.raster.composite import (
 )
 from gsjax.raster.reference import reference_colors, reference_project
 
-pytestmark = pytest.mark.usefixtures("quick_compiles")
-
 COUNT, WIDTH, HEIGHT, DIRECTIONS = 24, 19, 13, 32
 OUTPUTS = ("rgb", "alpha", "depth")
 COMPAT = COMPAT.replace(outputs=OUTPUTS)

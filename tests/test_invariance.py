@@ -24,7 +24,7 @@ from pictures import KINDS, assert_same, images
 
 import gsjax
 
-DTYPES = (jnp.float32, jnp.float64)
+pytestmark = pytest.mark.as_users
 
 
 @on_cpu
@@ -32,10 +32,13 @@ DTYPES = (jnp.float32, jnp.float64)
     ("changes", "dtype"),
     [
         ({"pair_capacity": 5000, "tiles_per_step": 5}, jnp.float32),
-        ({"pair_capacity": 20000, "visible_capacity": 192}, jnp.float64),
+        pytest.param(
+            {"pair_capacity": 20000, "visible_capacity": 192},
+            jnp.float64,
+            marks=pytest.mark.equal_bits,
+        ),
         ({"rungs": 3}, jnp.float32),
         pytest.param({"devices": 2}, jnp.float32, marks=needs_two_devices),
-        pytest.param({"devices": 2}, jnp.float64, marks=needs_two_devices),
     ],
     ids=str,
 )
@@ -116,7 +119,10 @@ def with_garbage(gaussians: gsjax.Gaussians, value: float):
 
 
 @on_cpu
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(
+    "dtype",
+    [jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.equal_bits)],
+)
 def test_contents_of_dead_slots_are_bit_equal(dtype):
     gaussians, camera = cast(scene_of("random"), dtype)
     wanted = images(gaussians, camera, dtype=dtype)

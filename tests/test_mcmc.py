@@ -17,8 +17,6 @@ from gsjax.errors import InputError
 from gsjax.optim import init_moments
 from gsjax.rotations import covariance
 
-pytestmark = pytest.mark.usefixtures("quick_compiles")
-
 SLOTS = 96
 SETTINGS = McmcSettings(start=0, stop=1000, every=10, max_gaussians=1000)
 GARBAGE = (np.nan, np.inf, -1e30)

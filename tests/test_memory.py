@@ -134,10 +134,10 @@ def test_huge_images_are_refused_at_once(monkeypatch):
         gsjax.render_exact(scene, camera_of(60_000, 60_000))
 
 
+@pytest.mark.equal_bits
 @pytest.mark.parametrize(("slots", "pairs"), [(4096, 2**18), (2**16, 2**14)])
-def test_the_estimate_is_what_xla_reserves(slots, pairs, report, quick_compiles):
+def test_the_estimate_is_what_xla_reserves(slots, pairs, report):
     """Within 1.5 times; where pairs decide, and where Gaussians do."""
-    del quick_compiles
     config = RasterConfig(**{**LIGHT, "pair_capacity": pairs}, occlusion=False)
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
     scene = {name: np.zeros((slots, *shape)) for name, shape in shapes.items()}
@@ -155,13 +155,14 @@ def test_the_estimate_is_what_xla_reserves(slots, pairs, report, quick_compiles)
 
 @pytest.mark.parametrize(
     ("cameras", "slots", "pairs"),
-    [(1, 4096, 2**17), (4, 4096, 2**17), (4, 2**15, 2**14)],
+    [
+        (1, 4096, 2**17),
+        pytest.param(4, 4096, 2**17, marks=pytest.mark.equal_bits),
+        (4, 2**15, 2**14),
+    ],
 )
-def test_the_estimate_of_gradients_is_what_xla_reserves(
-    cameras, slots, pairs, report, quick_compiles
-):
+def test_the_estimate_of_gradients_is_what_xla_reserves(cameras, slots, pairs, report):
     """Within 1.5 times; of one camera, and of some in one call."""
-    del quick_compiles
     config = RasterConfig(**{**LIGHT, "pair_capacity": pairs}, occlusion=False)
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
     scene = {name: np.zeros((slots, *shape)) for name, shape in shapes.items()}

@@ -20,8 +20,6 @@ from gsjax.raster.occlude import OPEN, _closed_from, _halve, hidden
 from gsjax.raster.order import depth_order
 from gsjax.raster.project import project
 
-pytestmark = pytest.mark.usefixtures("quick_compiles")
-
 PRESETS = {
     "compat": RasterConfig.compat(**LIGHT),
     "accurate": RasterConfig.accurate(**LIGHT),
@@ -54,6 +52,7 @@ def projected_of(gaussians, camera, config):
     return run(gaussians, camera)
 
 
+@pytest.mark.equal_bits
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize(("layers", "across"), [(0, 1.0), (8, 1.0), (40, 0.3)])
 def test_bit_equal_with_and_without(preset, layers, across):

@@ -16,8 +16,6 @@ from gsjax.sh import sh_basis
 from gsjax.subjects import Subject
 from gsjax.views import prepared
 
-pytestmark = pytest.mark.usefixtures("quick_compiles")
-
 SIZE, BUDGET, BEHIND = 32, 1 / 255, (0.2, 0.5, 0.9)
 CONFIG = RasterConfig(**LIGHT, outputs=("rgb",))
 EXACT = RasterConfig.accurate(**LIGHT, outputs=("rgb",), alpha_cut=1e-7, stop=1e-7)

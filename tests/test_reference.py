@@ -36,8 +36,6 @@ import gsjax
 from gsjax.raster.reference import reference_colors
 from gsjax.rotations import quaternion_to_matrix
 
-pytestmark = pytest.mark.usefixtures("quick_compiles")
-
 BAR = {jnp.float64: 1e-10, jnp.float32: 1e-5}
 BAND = {jnp.float64: 1e-9, jnp.float32: 1e-4}
 NEEDLES = ("needles_1000", "needles_10000")

@@ -12,6 +12,8 @@ from conftest import COMPAT, oracle_data
 
 import gsjax
 
+pytestmark = pytest.mark.as_users
+
 VALUE, DERIVATIVE = 1e-9, 1e-7
 CONFIG = COMPAT.replace(outputs=("rgb", "alpha"), pair_capacity=65536)
 

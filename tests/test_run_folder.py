@@ -24,7 +24,7 @@ from gsjax.train.folder import (
 from gsjax.train.held_out import evaluate_run
 from gsjax.train.run import RunResult, resume_run, start_run
 
-pytestmark = pytest.mark.usefixtures("quick_compiles", "float32")
+pytestmark = pytest.mark.usefixtures("float32")
 
 CONFIG = TrainConfig(
     steps=3,

@@ -43,8 +43,6 @@ from gsjax.train.frames import Batch, draw, make_frames
 from gsjax.train.step import background_of, init_state, make_train_step, targets
 from gsjax.train.tuning import tuned_camera
 
-pytestmark = pytest.mark.usefixtures("quick_compiles")
-
 SLOTS = 96
 PLAIN = TrainConfig(
     steps=100,
@@ -206,6 +204,7 @@ def test_a_step_out_of_the_numbers_is_not_made():
     assert (found[~held] != before[~held]).sum() > 100
 
 
+@pytest.mark.equal_bits
 def test_guards_change_no_bit_where_nothing_is_wrong(monkeypatch):
     start = plain_state()
     wanted, told = run_plain(start, 3)

@@ -50,8 +50,6 @@ from gsjax.viewer.stage import (
     stop_server,
 )
 
-pytestmark = pytest.mark.usefixtures("quick_compiles")
-
 COUNT = 64
 
 

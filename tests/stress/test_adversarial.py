@@ -36,7 +36,7 @@ from gsjax.train.history import read_metrics
 from gsjax.train.run import resume_run, start_run
 from gsjax.train.step import Metrics
 
-pytestmark = pytest.mark.usefixtures("quick_compiles", "float32", "shared_programs")
+pytestmark = pytest.mark.usefixtures("float32", "shared_programs")
 
 STEPS = 24
 MOST = 60  # on 16 tiles: one capacity of pairs does for all

@@ -15,6 +15,8 @@ from gsjax.stress import poison, precision, run
 from gsjax.stress.scenes import changed, host_fields, usual
 from gsjax.stress.types import Case, Measured, worse
 
+pytestmark = pytest.mark.as_users
+
 ROOT = Path(__file__).parents[2]
 SHORT = run.chosen(False)
 # Of the thousand scenes of the full form, those of the largest errors of image and
