@@ -55,7 +55,7 @@ _MANY_MAPPINGS = 30_000
 _MUCH_MEMORY = 2e9  # bytes, of programs alike
 
 
-class _Programs:
+class Programs:
     """How what this process keeps was compiled: "quickly", or as a mark of the test."""
 
     kind = "as_users"
@@ -68,10 +68,10 @@ def _kind(item) -> str:
 
 def _compile(kind: str) -> None:
     """Two kinds of programs round differently, and would be compared."""
-    if kind != _Programs.kind:
+    if kind != Programs.kind:
         jax.clear_caches()
         jax.config.update("jax_disable_most_optimizations", kind != "as_users")
-        _Programs.kind = kind
+        Programs.kind = kind
 
 
 def _with_older_emitters(get_compile_options):
@@ -82,9 +82,11 @@ def _with_older_emitters(get_compile_options):
 
     def get(*args, **kwargs):
         options = get_compile_options(*args, **kwargs)
-        if _Programs.kind == "quickly":
-            older = ("xla_cpu_use_fusion_emitters", False)
-            options.env_option_overrides = [*options.env_option_overrides, older]
+        if Programs.kind == "quickly":
+            options.env_option_overrides += [
+                ("xla_cpu_use_fusion_emitters", False),
+                ("xla_cpu_parallel_codegen_split_count", 1),  # other tests use the rest
+            ]
         return options
 
     return get
@@ -129,6 +131,24 @@ def float32():
     jax.config.update("jax_enable_x64", False)
     yield
     jax.config.update("jax_enable_x64", True)
+
+
+@pytest.fixture(scope="module")
+def shared_programs():
+    """A program for each strategy and shape of the photographs, whosever run it is."""
+    import gsjax.train.fit as fit_module
+
+    compiled, compile_one = {}, fit_module._Run.program
+
+    def program(self, state, frames, raster):
+        extent = np.float32(fit_module.extent_of(self.scene))
+        key = (Programs.kind, self.config, extent, frames.valid is None)
+        self.programs = compiled.setdefault(key, {})
+        return compile_one(self, state, frames, raster)
+
+    fit_module._Run.program = program
+    yield
+    fit_module._Run.program = compile_one
 
 
 needs_two_devices = pytest.mark.skipif(

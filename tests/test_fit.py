@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import on_cpu
-from jax.experimental.compilation_cache import compilation_cache
 from training import (
     EXTENT,
     HEIGHT,
@@ -75,20 +74,7 @@ CONFIGS = {
 }
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _shared_programs(tmp_path_factory):
-    settings = {  # here, and as everywhere else
-        "jax_compilation_cache_dir": (str(tmp_path_factory.mktemp("programs")), None),
-        "jax_persistent_cache_min_compile_time_secs": (0.5, 1.0),
-        "jax_enable_x64": (False, True),
-    }
-    for name, (here, _) in settings.items():
-        jax.config.update(name, here)
-    compilation_cache.reset_cache()
-    yield
-    for name, (_, elsewhere) in settings.items():
-        jax.config.update(name, elsewhere)
-    compilation_cache.reset_cache()
+pytestmark = pytest.mark.usefixtures("float32", "shared_programs")
 
 
 class Log:

@@ -7,7 +7,7 @@ that only the corrections move.
 """
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,6 @@ from conftest import cast
 from training import (
     EXTENT,
     HEIGHT,
-    QUICKLY,
     RASTER,
     SMOOTH,
     VIEWS,
@@ -68,10 +67,8 @@ TUNED = TrainConfig(
     raster=RASTER.replace(pair_capacity=512),
 )
 
-plain_step = jax.jit(
-    make_train_step(PLAIN, EXTENT), donate_argnums=0, compiler_options=QUICKLY
-)
-tuned_step = jax.jit(make_train_step(TUNED, EXTENT), compiler_options=QUICKLY)
+plain_step = jax.jit(make_train_step(PLAIN, EXTENT), donate_argnums=0)
+tuned_step = jax.jit(make_train_step(TUNED, EXTENT))
 
 
 @cache
@@ -153,7 +150,7 @@ def test_mapped_over_seeds_and_scanned_equals_the_loop():
     step = make_train_step(PLAIN, EXTENT)
     seeds = jax.tree.map(lambda *a: jnp.stack(a), *starts)
     mapped = jax.vmap(lambda state: jax.lax.scan(step, state, batches))
-    both = jax.jit(mapped, compiler_options=QUICKLY)(seeds)
+    both = jax.jit(mapped)(seeds)
     means = []
     for index, start in enumerate(starts):
         wanted, told = run_plain(start, steps)
@@ -213,9 +210,7 @@ def test_guards_change_no_bit_where_nothing_is_wrong(monkeypatch):
     monkeypatch.setattr(
         step_module, "_still_numbers", lambda _, params: (jnp.asarray(True), params)
     )
-    unguarded = jax.jit(
-        make_train_step(PLAIN, EXTENT), donate_argnums=0, compiler_options=QUICKLY
-    )
+    unguarded = jax.jit(make_train_step(PLAIN, EXTENT), donate_argnums=0)
     state = copy(start)
     for _ in range(3):
         state, metrics = unguarded(state, plain_batch(state.step))
@@ -232,7 +227,7 @@ def test_the_statistic_is_the_slope_by_a_shift_of_the_projection(report):
     target, _ = targets(batch, behind, jnp.float64)
     config = SMOOTH.replace(outputs=("rgb",))
 
-    @partial(jax.jit, compiler_options=QUICKLY)
+    @jax.jit
     def slopes(gaussians, camera):
         def value(shift):
             view = gsjax.render(gaussians, camera, config, behind, probe=shift)

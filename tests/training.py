@@ -21,11 +21,6 @@ VIEWS, POINTS, WIDTH, HEIGHT = 4, 60, 32, 24
 RASTER = RasterConfig(**{**LIGHT, "pair_capacity": 4096}, occlusion=False)
 # No threshold within reach, so that finite differences are those of the gradient.
 SMOOTH = RASTER.replace(alpha_cut=1e-14, alpha_cap=1 - 1e-9, stop=0, stop_rule="after")
-# Compiling takes longest: with these it takes two thirds.
-QUICKLY = {
-    "xla_backend_optimization_level": 0,
-    "xla_llvm_disable_expensive_passes": True,
-}
 
 
 @cache

@@ -59,22 +59,6 @@ REFUSED = {
 }
 
 
-@pytest.fixture(scope="module")
-def shared_programs():
-    """A program for each strategy and shape of the photographs, whosever run it is."""
-    compiled, compile_one = {}, fit_module._Run.program
-
-    def program(self, state, frames, raster):
-        extent = np.float32(fit_module.extent_of(self.scene))
-        key = (self.config, extent, frames.valid is None)
-        self.programs = compiled.setdefault(key, {})
-        return compile_one(self, state, frames, raster)
-
-    fit_module._Run.program = program
-    yield compiled
-    fit_module._Run.program = compile_one
-
-
 def settings_of(folder, made, strategy, **changes) -> RunSettings:
     data = write_hostile(folder / "data", made)
     return RunSettings(data, CONFIG.replace(strategy=strategy, **changes))
