@@ -37,7 +37,7 @@ pytestmark = pytest.mark.as_users
             jnp.float64,
             marks=pytest.mark.equal_bits,
         ),
-        ({"rungs": 3}, jnp.float32),
+        ({"rungs": 4, "pair_capacity": 2**18}, jnp.float32),
         pytest.param({"devices": 2}, jnp.float32, marks=needs_two_devices),
     ],
     ids=str,

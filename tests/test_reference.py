@@ -108,8 +108,8 @@ def test_float32(kind, preset, report):
     "changes",
     [
         {"tile_size": 4, "chunk_size": 8, "tiles_per_step": 7},
-        {"tile_size": 16, "chunk_size": 1, "tiles_per_step": 1},
-        {"tile_size": 32, "chunk_size": 128, "rungs": 3},
+        {"tile_size": 16, "chunk_size": 1, "tiles_per_step": 1, "rungs": 4},
+        {"tile_size": 32, "chunk_size": 128},
         {"tile_size": 7, "occlusion": False},
         {"antialias": True},
         {"dilation": 0.0},

@@ -121,7 +121,7 @@ def project(
         project_some = jax.checkpoint(partial(some, size))
         return lax.cond(count > 0, project_some, none, components, camera, count)
 
-    # Two sizes: every one more costs a second and more of compiling.
+    # Two sizes: every one more costs seconds of compiling.
     out = on_ladder(count, room, min(config.rungs, 2), run, step=16)
     return out if abs_probe is None else out._replace(probe=abs_probe[order].T)
 

@@ -116,7 +116,7 @@ def _rasterise_local(
         work = schedules.make_work(lists, schedule, steps, chunk, ranks, room)
         return composite(projected, work, schedule, grid, device, config)
 
-    images = on_ladder(schedule.steps, room, config.rungs, blend)
+    images = on_ladder(schedule.steps, room, config.rungs - 2, blend)
     for_steps = schedules.pairs_for_steps(schedule.steps, grid, group, chunk)
     wanted = jnp.maximum(lists.pairs, for_steps)
     images = {name: image[None] for name, image in images.items()}

@@ -51,9 +51,10 @@ class RasterConfig:
         slots. Reported and regrown like ``pair_capacity``.
       occlusion: leave out, before binning, what lies behind pixels that have all
         stopped. Bit-equal; pays where something opaque fills part of the view.
-      rungs: how many sizes, each a quarter of the one before, compositing is compiled
-        for; the smallest that fits is run. Sorting has sizes between them, and from two
-        on there is a small size of projecting.
+      rungs: how many sizes, each a quarter of the one before, sorting is compiled for;
+        the smallest that fits is run. From 2 on there is a small size of projecting,
+        and from 4 on compositing has sizes too, two fewer: each takes seconds to
+        compile, and saves time where a view needs a quarter of its capacity or less.
       devices: how many devices share the tiles; None means all local ones. Within a
         `jax.shard_map` of your own: 1, and ``check_vma=False`` there.
 

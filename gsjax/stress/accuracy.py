@@ -124,7 +124,11 @@ def sizes_of_work(full: bool) -> Measured:
     del full
     wanted = _render(usual(), camera_of(), _EXACT, jnp.asarray(BACKGROUND)).rgb
     count = 0
-    for changes in ({"pair_capacity": 8191}, {"rungs": 3}, {"visible_capacity": SLOTS}):
+    for changes in (
+        {"pair_capacity": 8191},
+        {"rungs": 4, "pair_capacity": 2**18},
+        {"visible_capacity": SLOTS},
+    ):
         config = _EXACT.replace(**changes)
         out = _render(usual(), camera_of(), config, jnp.asarray(BACKGROUND))
         count += unequal(out.rgb, wanted)
