@@ -8,7 +8,7 @@ import gc
 import os
 import signal
 import tempfile
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import jax
@@ -52,52 +52,67 @@ BACKGROUND = np.array([0.2, 0.5, 0.9])
 # Every program is a handful of mappings, of which Linux gives a process 65 530. Where
 # they run out XLA crashes, or hangs, wherever it is.
 _MANY_MAPPINGS = 30_000
-_MUCH_MEMORY = 2e9  # bytes, of programs alike
+_MUCH_MEMORY = 2e9  # bytes: programs that are kept, too
 
 
 class Programs:
-    """How what this process keeps was compiled: "quickly", or as a mark of the test."""
+    """How what this process keeps was compiled: as a mark of the test says, or quickly.
+
+    Attributes:
+      kind: "as_users": as users have it, for bounds that rest on how kernels round.
+        "new_emitters": optimised little. Kernels are those of users otherwise: equal
+        bits whatever the sizes, and the memory that they reserve.
+        "quickly": besides, by XLA's older emitters of kernels, in a third of the time.
+        The same to rounding, which depends on where in an array a number stands.
+    """
 
     kind = "as_users"
+    kinds = ("as_users", "new_emitters")
 
 
-def _kind(item) -> str:
-    marks = (item.get_closest_marker(name) for name in ("equal_bits", "as_users"))
-    return next((mark.name for mark in marks if mark), "quickly")
+OLDER_EMITTERS = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_cpu_parallel_codegen_split_count": 1,  # other tests have the other cores
+}
 
 
-def _compile(kind: str) -> None:
-    """Two kinds of programs round differently, and would be compared."""
-    if kind != Programs.kind:
-        jax.clear_caches()
-        jax.config.update("jax_disable_most_optimizations", kind != "as_users")
-        Programs.kind = kind
+@cache
+def older_emitters() -> dict[str, int]:
+    """`OLDER_EMITTERS` where this XLA knows them, else nothing."""
+    if jax.default_backend() != "cpu":
+        return {}
+    try:
+        jax.jit(lambda x: x + 1, compiler_options=OLDER_EMITTERS)(1.0)
+    except jax.errors.JaxRuntimeError:
+        return {}
+    return OLDER_EMITTERS
 
 
-def _with_older_emitters(get_compile_options):
-    """XLA's older emitters of kernels, for what is compiled quickly: JAX has no setting
-    for them, and XLA's own is for a whole process. They round a number by where in an
-    array it stands.
-    """
+def _compiled_by_kind(get_compile_options):
+    """JAX has no setting for XLA's options, and XLA's own are of a whole process."""
 
     def get(*args, **kwargs):
         options = get_compile_options(*args, **kwargs)
         if Programs.kind == "quickly":
-            options.env_option_overrides += [
-                ("xla_cpu_use_fusion_emitters", False),
-                ("xla_cpu_parallel_codegen_split_count", 1),  # other tests use the rest
-            ]
+            options.env_option_overrides += list(older_emitters().items())
         return options
 
     return get
 
 
-compiler.get_compile_options = _with_older_emitters(compiler.get_compile_options)
+if hasattr(compiler, "get_compile_options"):  # private; without it, tests take longer
+    older_emitters()
+    compiler.get_compile_options = _compiled_by_kind(compiler.get_compile_options)
+
+
+def _kind(item) -> str:
+    marks = (mark.name for mark in item.iter_markers() if mark.name in Programs.kinds)
+    return next(marks, "quickly")
 
 
 def pytest_collection_modifyitems(items):
-    """Modules that take long come first, lest one process waits for the other; in each,
-    those of a kind together.
+    """Modules that take long, or hold tests that are not compiled quickly, come first,
+    lest one process waits for the other; in each, tests of a kind together.
     """
     slow = {item.path for item in items if item.get_closest_marker("long")}
     slow |= {item.path for item in items if _kind(item) != "quickly"}
@@ -107,10 +122,12 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Programs are many, and each runs once: XLA compiles them in a third of the time
-    where it optimises little. What is computed is the same, to rounding.
-    """
-    _compile(_kind(item))
+    """Before any fixture; one of a module is compiled as its first test wants it."""
+    kind = _kind(item)
+    if kind != Programs.kind:  # they round differently, and would be compared
+        jax.clear_caches()
+        jax.config.update("jax_disable_most_optimizations", kind != "as_users")
+        Programs.kind = kind
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -135,7 +152,10 @@ def float32():
 
 @pytest.fixture(scope="module")
 def shared_programs():
-    """A program for each strategy and shape of the photographs, whosever run it is."""
+    """A program for each strategy and shape of the photographs, whosever run it is.
+
+    So `compilations` and `compile_seconds` are of all runs. The programs, to clear.
+    """
     import gsjax.train.fit as fit_module
 
     compiled, compile_one = {}, fit_module._Run.program
@@ -147,7 +167,7 @@ def shared_programs():
         return compile_one(self, state, frames, raster)
 
     fit_module._Run.program = program
-    yield
+    yield compiled
     fit_module._Run.program = compile_one
 
 

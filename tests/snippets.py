@@ -15,7 +15,6 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-QUICK = "--xla_cpu_use_fusion_emitters=false"
 _BLOCK = re.compile(r"^(?:<!-- (\S+) -->\n)?```(\w+)\n((?:.*\n)*?)```$", re.M)
 _TOLD = re.compile(r"^\s*print\(.*\)  # (.*)$")
 
@@ -59,13 +58,16 @@ def run_pages(paths: list[Path], *, claims: str = "", cwd: Path) -> str:
 
     In float32, as for a user; a single page on all cores, if it asks for them.
     """
+    from conftest import older_emitters
+
+    flags = [f"--{name}={value}" for name, value in older_emitters().items()]
     environment = {
         **os.environ,
         "PYTHONPATH": str(ROOT),
         "JAX_ENABLE_X64": "0",
-        # Many programs, each run once: see conftest.py.
+        # Many programs, each run once: compiled quickly, see conftest.py.
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {QUICK}",
+        "XLA_FLAGS": " ".join([os.environ.get("XLA_FLAGS", ""), *flags]),
     }
     done = subprocess.run(
         [sys.executable, "-W", "error::UserWarning", __file__, *map(str, paths)],

@@ -31,6 +31,7 @@ def test_tile_and_chunk_sizes(changes, report):
         assert error <= 2e-5, kind
 
 
+@pytest.mark.as_users
 def test_occlusion(report):
     """It drops work, and only what does not show; also with many in front."""
     for dtype, bar in ((jnp.float32, 5e-7), (jnp.float64, 1e-15)):

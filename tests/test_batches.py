@@ -13,7 +13,7 @@ from pictures import images, largest_difference
 
 import gsjax
 
-pytestmark = pytest.mark.equal_bits
+pytestmark = pytest.mark.new_emitters
 
 
 def test_single_batch_and_vmap(report):

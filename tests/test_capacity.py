@@ -20,7 +20,7 @@ from gsjax.errors import CapacityError
 from gsjax.raster.counts import total_count
 
 
-@pytest.mark.equal_bits
+@pytest.mark.new_emitters
 def test_capacity_of_exactly_the_need():
     gaussians, camera = scene_of("random")
     wanted = images(gaussians, camera)
@@ -39,7 +39,7 @@ def test_capacity_of_exactly_the_need():
     assert out.demand.visible == visible
 
 
-@pytest.mark.equal_bits
+@pytest.mark.new_emitters
 @needs_two_devices
 def test_capacity_over_two_devices():
     """The demand is that of the device with the most, times the devices."""
@@ -75,7 +75,7 @@ def test_each_camera_of_a_batch_has_the_room():
             assert largest_difference(one, alone[i]) <= 1e-6
 
 
-@pytest.mark.equal_bits
+@pytest.mark.new_emitters
 def test_render_exact_regrows():
     gaussians, camera = cast(scene_of("random"), jnp.float32)
     wanted = images(gaussians, camera)

@@ -10,6 +10,8 @@ from gsjax.raster import composite
 from gsjax.raster.alpha import pixel_centres
 from gsjax.raster.composite import Chunk, running_product
 
+pytestmark = pytest.mark.as_users
+
 TILES, SPLATS, TILE = 16, 6, 8
 
 

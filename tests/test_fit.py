@@ -1,7 +1,7 @@
 """The loop of training: the same bits however it is interrupted, grown or resumed.
 
-In float32, as users have it. Runs share their programs through JAX's cache on disk,
-for each call of `fit` compiles its own.
+In float32, as users have it. Runs share their programs (`shared_programs`), for each
+call of `fit` compiles its own.
 """
 
 import time
@@ -120,8 +120,9 @@ def run(config, log=None, **kwargs):
 
 
 @pytest.fixture(scope="module")
-def whole():
-    """The uninterrupted run of each strategy."""
+def whole(shared_programs):
+    """The uninterrupted run of each strategy; they compile what they run."""
+    shared_programs.clear()
     return {name: run(config) for name, config in CONFIGS.items()}
 
 
@@ -187,7 +188,7 @@ def test_killed_and_taken_up_from_the_last_checkpoint(whole, tmp_path):
     assert changed(again.state, whole["adaptive"][0].state) == []
 
 
-@pytest.mark.equal_bits
+@pytest.mark.new_emitters
 @on_cpu
 def test_too_few_pairs_and_slots_are_grown():
     """Until the first edit no size matters; it tells how many slots it wants.

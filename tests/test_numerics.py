@@ -3,8 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from gsjax.numerics import exp_negative
+
+pytestmark = pytest.mark.as_users
 
 
 def test_exponential_of_negative_numbers(report):

@@ -52,7 +52,7 @@ def projected_of(gaussians, camera, config):
     return run(gaussians, camera)
 
 
-@pytest.mark.equal_bits
+@pytest.mark.new_emitters
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize(("layers", "across"), [(0, 1.0), (8, 1.0), (40, 0.3)])
 def test_bit_equal_with_and_without(preset, layers, across):

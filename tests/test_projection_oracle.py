@@ -122,6 +122,7 @@ def test_vector_jacobian_product_agrees(data, report):
         assert max(error, rows) <= DERIVATIVE, name
 
 
+@pytest.mark.as_users
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_colours_of_many_gaussians(degree):
     """In float32 and compiled: some reductions of XLA go wrong for long arrays."""

@@ -201,7 +201,7 @@ def test_a_step_out_of_the_numbers_is_not_made():
     assert (found[~held] != before[~held]).sum() > 100
 
 
-@pytest.mark.equal_bits
+@pytest.mark.new_emitters
 def test_guards_change_no_bit_where_nothing_is_wrong(monkeypatch):
     start = plain_state()
     wanted, told = run_plain(start, 3)

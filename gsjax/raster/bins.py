@@ -197,7 +197,7 @@ def make_lists(
       grid: the tiles of this device.
       device: [] its number.
       capacity: of pairs.
-      rungs: sizes at which to sort, at most.
+      rungs: 2 · rungs − 1 sizes at which to sort, at most.
     """
     ranks = projected.u.shape[0]
     # Nor do the sums over a block wrap.

@@ -1,4 +1,6 @@
-"""Sums of counts, and the lists that they stand for. No derivative is taken here."""
+"""Sums of counts, the lists that they stand for, and what is looked up there. No
+derivative is taken here.
+"""
 
 import jax.numpy as jnp
 from jax import lax

@@ -116,7 +116,8 @@ def _rasterise_local(
         work = schedules.make_work(lists, schedule, steps, chunk, ranks, room)
         return composite(projected, work, schedule, grid, device, config)
 
-    images = on_ladder(schedule.steps, room, config.rungs - 2, blend)
+    # Every size more costs seconds of compiling, and empty steps cost little.
+    images = on_ladder(schedule.steps, room, max(1, config.rungs - 2), blend)
     for_steps = schedules.pairs_for_steps(schedule.steps, grid, group, chunk)
     wanted = jnp.maximum(lists.pairs, for_steps)
     images = {name: image[None] for name, image in images.items()}

@@ -4,7 +4,7 @@ A step is one chunk of K Gaussians for each of G tiles. Tiles are taken in order
 length, so the G tiles of a block need nearly the same number of steps and no tile waits
 for the longest. No derivative is taken here.
 
-Axis legend: T tiles, S steps, G tiles of a step, K Gaussians of a chunk.
+Axis legend: T tiles, S steps, G tiles of a step, K Gaussians of a chunk, R ranks.
 """
 
 from typing import NamedTuple

@@ -45,16 +45,17 @@ class RasterConfig:
       tiles_per_step: tiles composited side by side; None chooses by platform.
       pair_capacity: room for (tile, Gaussian) pairs of a camera; None chooses from
         the sizes. If it is too small, `Render.overflowed` is set and `Render.demand`
-        says what was wanted; `render_exact` regrows. Unused room costs memory, hardly
-        time; in a gradient once for each camera of a batch.
+        says what was wanted; `render_exact` regrows. Unused room costs memory, and
+        a little time; in a gradient once for each camera of a batch.
       visible_capacity: room for Gaussians in view (of each camera); None means all
         slots. Reported and regrown like ``pair_capacity``.
       occlusion: leave out, before binning, what lies behind pixels that have all
         stopped. Bit-equal; pays where something opaque fills part of the view.
-      rungs: how many sizes, each a quarter of the one before, sorting is compiled for;
-        the smallest that fits is run. From 2 on there is a small size of projecting,
-        and from 4 on compositing has sizes too, two fewer: each takes seconds to
-        compile, and saves time where a view needs a quarter of its capacity or less.
+      rungs: how many sizes, each a quarter of the one before, sorting by depth is
+        compiled for; the smallest that fits is run. Sorting pairs has sizes between
+        them; from 2 on there is a small size of projecting, and from 4 on compositing
+        has sizes too, two fewer. Each takes seconds to compile, and saves time where a
+        view needs a quarter of its capacity or less.
       devices: how many devices share the tiles; None means all local ones. Within a
         `jax.shard_map` of your own: 1, and ``check_vma=False`` there.
 

@@ -88,8 +88,7 @@ class TrainConfig:
     exposure_rate: float = 1e-3
     every_eval: int = 0
     every_checkpoint: int = 1000
-    # One size of the work: it compiles in three quarters of the time, and the run
-    # grows its capacities itself.
+    # One size of the work: it compiles faster, and the run grows its capacities itself.
     raster: RasterConfig = field(default_factory=lambda: RasterConfig(rungs=1))
 
     def __post_init__(self):

@@ -45,7 +45,7 @@ class ExactRenderer:
     """
 
     def __init__(self, config: RasterConfig, background: Sequence[float]):
-        # One rung, and no capacity measured first: compiled three times as fast.
+        # One rung, and no capacity measured first: less to compile.
         self.config = config.replace(
             outputs=("rgb", "alpha", "depth"), rungs=1, pair_capacity=_PAIRS
         )
