@@ -16,22 +16,23 @@ import gsjax
 pytestmark = pytest.mark.new_emitters
 
 
-def test_single_batch_and_vmap(report):
-    gaussians, first = cast(scene_of("random"), jnp.float32)
-    second = cast(camera_of(centre=(30.0, 8.0)), jnp.float32)
+@pytest.mark.parametrize(("dtype", "bar"), [(jnp.float32, 1e-6), (jnp.float64, 4e-15)])
+def test_single_batch_and_vmap(dtype, bar, report):
+    gaussians, first = cast(scene_of("random"), dtype)
+    second = cast(camera_of(centre=(30.0, 8.0)), dtype)
     cameras = gsjax.stack_cameras([first, second])
-    background = jnp.asarray(BACKGROUND, jnp.float32)
+    background = jnp.asarray(BACKGROUND, dtype)
     batch = render(gaussians, cameras, COMPAT, background)
     mapped = jax.jit(
         jax.vmap(lambda c, g, b: gsjax.render(g, c, COMPAT, b), (0, None, None))
     )(cameras, gaussians, background)
     for i, camera in enumerate((first, second)):
-        wanted = images(gaussians, camera)
+        wanted = images(gaussians, camera, dtype=dtype)
         for way, out in (("batch", batch), ("vmap", mapped)):
             one = out._replace(**{name: getattr(out, name)[i] for name in ALL})
             error = largest_difference(one, wanted)
-            report(way, error, 1e-6)
-            assert error <= 1e-6, way
+            report(f"{way}, {dtype.__name__}", error, bar)
+            assert error <= bar, way
     assert np.abs(batch.rgb[0] - batch.rgb[1]).max() > 0.1
     assert batch.demand.pairs == mapped.demand.pairs.sum()
     assert batch.demand.visible == mapped.demand.visible.max()

@@ -40,6 +40,11 @@ pytestmark = pytest.mark.as_users
         # Room for so many steps of compositing that there are sizes of it.
         ({"rungs": 4, "pair_capacity": 2**18}, jnp.float32),
         pytest.param({"devices": 2}, jnp.float32, marks=needs_two_devices),
+        pytest.param(
+            {"devices": 2},
+            jnp.float64,
+            marks=[needs_two_devices, pytest.mark.new_emitters],
+        ),
     ],
     ids=str,
 )

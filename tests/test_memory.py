@@ -156,11 +156,7 @@ def test_the_estimate_is_what_xla_reserves(slots, pairs, report):
 @pytest.mark.new_emitters
 @pytest.mark.parametrize(
     ("cameras", "slots", "pairs"),
-    [
-        (1, 4096, 2**17),
-        (4, 4096, 2**17),
-        (4, 2**15, 2**14),
-    ],
+    [(1, 4096, 2**17), (4, 4096, 2**17), (4, 2**15, 2**14)],
 )
 def test_the_estimate_of_gradients_is_what_xla_reserves(cameras, slots, pairs, report):
     """Within 1.5 times; of one camera, and of some in one call."""
