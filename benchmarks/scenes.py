@@ -131,7 +131,7 @@ def of_run(folder: Path) -> Run:
     seen = path_entries(data, "train", max_size=size)
     between = path_entries(data, "interpolate", frames=400, max_size=size)
     return Run(
-        load_scene(run_files(folder).splat, data.scene),
+        load_scene(run_files(folder).splat, data.scene.origin),
         [entry.camera for entry in seen],
         [entry.camera for entry in between],
     )

@@ -103,7 +103,7 @@ def _turn(files: DemoFiles, run: RunSettings, overwrite: bool) -> None:
     data = load_data(run)
     entries = path_entries(data, "orbit", frames=_TURN_FRAMES)
     write_flight(
-        open_subject(files.run, scene=data.scene),
+        open_subject(files.run, origin=data.scene.origin),
         entries,
         files.turntable,
         fps=_TURN_FRAMES / _TURN_SECONDS,

@@ -5,10 +5,10 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from gsjax.gaussians import Gaussians
-from gsjax.io import load
 from gsjax.raster.types import RasterConfig
-from gsjax.scene.types import Scene
 from gsjax.train.folder import (
     background_of,
     finished_splat,
@@ -59,7 +59,7 @@ def splat_file(path: Path) -> Path:
 def open_subject(
     path: Path,
     *,
-    scene: Scene | None = None,
+    origin: np.ndarray | None = None,
     preset: str | None = None,
     background: tuple[float, ...] | None = None,
 ) -> Subject:
@@ -67,8 +67,8 @@ def open_subject(
 
     Args:
       path: a .ply file, or the folder of a run.
-      scene: the dataset of that run: coordinates are then those of its cameras as
-        `load_dataset` gives them, else those of the file.
+      origin: [3] what is subtracted from the file's coordinates, as it is from those
+        of the cameras that `load_dataset` or `load_near_transforms` gives.
       preset: name of the constants to render with; None takes those of the run, for a
         file "compat".
       background: RGB; None takes that of the run, for a file black.
@@ -84,7 +84,5 @@ def open_subject(
         # Opacities were learnt with or without it: no matter of taste.
         config = PRESETS[preset](antialias=config.antialias)
     splat = splat_file(path)
-    reader = (
-        partial(load, splat) if scene is None else partial(load_scene, splat, scene)
-    )
+    reader = partial(load_scene, splat, np.zeros(3) if origin is None else origin)
     return Subject(reader, config, behind if background is None else background)

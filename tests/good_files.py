@@ -94,7 +94,9 @@ def write_good_files(folder: Path) -> None:
         save_photo(folder / f"photo{suffix}", pixels)
     save_photo(folder / "mask.png", pixels[..., 0] // 128 * np.uint8(255))
     state = init_state(gaussians, TrainConfig(sh_degree=0), 1.0, 2)
-    made = save_checkpoint(folder / "checkpoints", state, {"seconds": 0.0})
+    made = save_checkpoint(
+        folder / "checkpoints", state, {"pair_capacity": 64, "seconds": 0.0}
+    )
     made.rename(folder / STEP)
     save_settings(folder, RunSettings(dataset=folder))
     (folder / "eval.json").write_text(json.dumps(EVAL))

@@ -224,7 +224,7 @@ def test_when_slots_run_out_the_best_get_them():
     best = live[np.argsort(-values)[:4]]
     assert_rows_equal(edit.params, free, gaussians.params, best)
     assert edit.wanted == 40
-    assert plan(gaussians, stats_with(live, values), max_gaussians=30).wanted == 30
+    assert plan(gaussians, stats_with(live, values), max_gaussians=30).wanted == 40
 
 
 @pytest.mark.parametrize(("most", "count"), [(18, 18), (16, 16), (7, 16)])
@@ -232,7 +232,7 @@ def test_never_more_than_the_most(most, count):
     gaussians, live = scene_with()
     edit = plan(gaussians, stats_with(live), max_gaussians=most)
     assert edit.active.sum() == count
-    assert edit.wanted == count
+    assert edit.wanted == 32
 
 
 def test_revised_opacity_keeps_the_pair_as_opaque():

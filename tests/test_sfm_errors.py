@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -20,7 +21,7 @@ from corner_room import (
     make_room,
 )
 
-from gsjax import cli
+from gsjax import cli, images
 from gsjax.scene.colmap import load_colmap
 from gsjax.scene.sfm import run_sfm
 from gsjax.scene.sfm_colmap import _watched
@@ -115,6 +116,15 @@ def damaged(folder: Path) -> list[str]:
     return [str(photos)]
 
 
+def huge(folder: Path) -> list[str]:
+    """A few kilobytes that ask for 2.7 GB."""
+    photos = two_photos(folder / "p")
+    data = bytearray(images.encode_png(np.zeros((9, 9, 3), np.uint8)))
+    data[16:24] = struct.pack(">II", 30_000, 30_000)
+    (photos / "huge.png").write_bytes(data)
+    return [str(photos)]
+
+
 def with_file(name: str, content: bytes = b"x"):
     def make(folder: Path) -> list[str]:
         photos = two_photos(folder / "p")
@@ -168,7 +178,11 @@ BAD = {
     "missing": (3, lambda f: [str(f / "none")], "no such folder"),
     "one photo": (3, one_photo, "1 photos"),
     "subfolders": (3, in_subfolders, "subfolders are not searched, 4 photos lie there"),
-    "damaged": (3, damaged, "half.jpg, none.png, text.jpg: cannot be read"),
+    "damaged": (3, damaged, "3 of 5 photos cannot be read; mend or remove: "),
+    "half": (3, damaged, "half.jpg: the image is truncated or damaged"),
+    "empty": (3, damaged, "none.png: the file is empty"),
+    "text": (3, damaged, "text.jpg: starts with b'not an i'"),
+    "huge": (3, huge, "huge.png: declares 30000 × 30000 px"),
     "heic": (3, with_file("IMG_1.HEIC"), ".HEIC photos are not read here; convert"),
     "same name": (3, same_name, "the same name"),
     "image": (3, lambda f: [str(two_photos(f) / "0.jpg")], "is a single image"),
@@ -176,7 +190,7 @@ BAD = {
     "no masks": (3, photos_and("--masks", "nowhere"), "no such folder of masks"),
     "other masks": (3, mask_of((9, 9), "b.png"), "no mask for any photo"),
     "mask size": (3, mask_of((320, 240)), "the mask is 240x320"),
-    "bad mask": (3, mask_of(None), "this mask cannot be read"),
+    "bad mask": (3, mask_of(None), "0.png: the file is empty"),
     "max size": (2, photos_and("--max-size", "3"), "--max-size 3"),
     "frames": (2, photos_and("--frames", "1"), "--frames 1"),
     "seed": (2, photos_and("--seed", "-1"), "--seed"),

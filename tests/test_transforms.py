@@ -8,7 +8,7 @@ import pytest
 
 from gsjax.cameras import look_at
 from gsjax.errors import InputError
-from gsjax.scene.transforms import load_transforms
+from gsjax.scene.transforms import load_near_transforms, load_transforms
 
 PIXELS = {"fl_x": 500.0, "fl_y": 510.0, "cx": 310.0, "cy": 245.0, "w": 640, "h": 480}
 ANGLE = {"camera_angle_x": 0.6911112070083618}
@@ -317,3 +317,31 @@ def test_bad_file_path(tmp_path):
 def test_bad_size(tmp_path, size):
     with pytest.raises(InputError, match=r"size .*is wanted"):
         load_one(tmp_path, **PIXELS, size=size)
+
+
+def test_what_is_far_out_is_brought_near(tmp_path):
+    """Points are seen where they are, to a thousandth of a pixel, at 10⁷ units."""
+    far = np.asarray([1e7, -3e6, 0.0])
+    rng = np.random.default_rng(0)
+    viewmats = [look_at(far + rng.normal(size=3) * 4, far) for _ in range(5)]
+    content = {"frames": [frame(to_opengl(v)) for v in viewmats], **PIXELS}
+    entries, origin = load_near_transforms(put(tmp_path, content))
+    assert (np.abs(origin - far)[:2] < 100).all()
+    assert origin[2] == 0, "axis by axis"
+    points = far + rng.normal(size=(50, 3)) / 2
+    for viewmat, (_, camera) in zip(viewmats, entries):
+        pixels = seen_at(viewmat, camera.K, points)
+        found = seen_at(camera.viewmat, camera.K, np.float32(points - origin))
+        np.testing.assert_allclose(found, pixels, atol=1e-3)
+    alone, origin = load_near_transforms(
+        put(tmp_path, {"frames": content["frames"][:1], **PIXELS})
+    )
+    assert origin.any(), "one camera is enough"
+    assert np.abs(np.asarray(alone[0].camera.viewmat)[:3, 3]).max() < 100
+
+
+def seen_at(viewmat, K, points):
+    """Pixels of points, in the precision of the points."""
+    viewmat, K = (np.asarray(a, points.dtype) for a in (viewmat, K))
+    seen = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
+    return seen[:, :2] / seen[:, 2:]

@@ -8,7 +8,11 @@ from gsjax.cameras import Camera, look_at, make_camera, resize_camera
 from gsjax.errors import InputError
 from gsjax.flights import path_entries
 from gsjax.gaussians import Gaussians
-from gsjax.scene.transforms import load_transforms
+from gsjax.scene.transforms import (
+    CameraEntry,
+    load_near_transforms,
+    load_transforms,
+)
 from gsjax.scene.trials import TRIALS, Trial
 from gsjax.subjects import is_run, open_subject
 from gsjax.train.folder import load_data, load_settings, refined_data, run_files
@@ -32,20 +36,25 @@ def open_trial(
     path = Path(name)
     if name in TRIALS and not path.exists():
         trial = TRIALS[name]()
-        camera = _first(cameras, size) if cameras else _sized(trial.camera, size)
-        return trial._replace(camera=camera)
+        if cameras is None:
+            return trial._replace(camera=_sized(trial.camera, size))
+        entries = load_transforms(cameras, size=size)
+        return trial._replace(camera=_first(cameras, entries))
     if not path.exists():
         raise InputError(
             f"{name}: neither a run nor a .ply file, nor one of {', '.join(TRIALS)}"
         )
-    scene, camera = None, _first(cameras, size) if cameras else None
-    if is_run(path) and camera is None:
+    origin = camera = None
+    if cameras is not None:
+        entries, origin = load_near_transforms(cameras, size=size)
+        camera = _first(cameras, entries)
+    elif is_run(path):
         settings = load_settings(path)
         data = refined_data(load_data(settings), run_files(path))
-        scene = data.scene
+        origin = data.scene.origin
         entries = path_entries(data, "train", max_size=settings.config.max_size)
         camera = _sized(entries[0].camera, size)
-    subject = open_subject(path, scene=scene)
+    subject = open_subject(path, origin=origin)
     gaussians = subject.load()
     if camera is None:
         camera = facing(gaussians, *(size or _SIZE))
@@ -72,8 +81,7 @@ def facing(gaussians: Gaussians, width: int, height: int) -> Camera:
     return make_camera(viewmat=viewmat, K=K, width=width, height=height)
 
 
-def _first(path: Path, size: tuple[int, int] | None) -> Camera:
-    entries = load_transforms(path, size=size)
+def _first(path: Path, entries: list[CameraEntry]) -> Camera:
     if not entries:
         raise InputError(f"{path}: there is no camera in it")
     return entries[0].camera

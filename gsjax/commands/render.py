@@ -72,7 +72,7 @@ class RenderCommand(HeavyCommand):
         start_jax()
         from gsjax.flights import path_entries, write_flight
         from gsjax.scene.dataset import load_dataset
-        from gsjax.scene.transforms import load_transforms
+        from gsjax.scene.transforms import load_near_transforms
         from gsjax.subjects import open_subject
         from gsjax.train.folder import (
             Data,
@@ -93,17 +93,17 @@ class RenderCommand(HeavyCommand):
             data = Data(scene, train=list(range(len(scene.views))), test=[])
         if data is None:
             assert self.cameras is not None, "else it is a run's"
-            entries = load_transforms(self.cameras, size=size)
+            entries, origin = load_near_transforms(self.cameras, size=size)
         else:
             frames = self.frames or 120
             entries = path_entries(
                 data, path, frames=frames, max_size=largest, size=size
             )
-        scene = None if data is None else data.scene
+            origin = data.scene.origin
         if not entries:
             raise UsageError(f"--path {path}: there are no such views")
         subject = open_subject(
-            self.scene, scene=scene, preset=self.preset, background=background
+            self.scene, origin=origin, preset=self.preset, background=background
         )
         subject = subject._replace(budget=budget)
         if movie:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsjax.commands.common import Command, start_jax
+from gsjax.commands.common import Command, UsageError, start_jax
 from gsjax.console import note, say
 
 
@@ -26,15 +26,16 @@ class StressCommand(Command):
     def run(self) -> int:
         start_jax()
         from gsjax import files
-        from gsjax.errors import InputError
         from gsjax.stress import run as stress
 
         if self.json is not None:
             files.refuse_existing([self.json], self.overwrite)
+        if self.markdown is not None:
+            stress.around_marks(self.markdown)  # before minutes go by
         cases = [c for c in stress.chosen(self.full) if self.only in c.name]
         if not cases:
             names = ", ".join(c.name for c in stress.chosen(self.full))
-            raise InputError(f"--only {self.only!r}: no case; there are {names}")
+            raise UsageError(f"--only {self.only!r}: no case; there are {names}")
         results = []
         for result in stress.run_cases(tuple(cases), self.full):
             results.append(result)

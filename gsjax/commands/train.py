@@ -199,6 +199,8 @@ class TrainCommand(HeavyCommand):
                 mcmc=replace(config.mcmc, max_gaussians=self.max_gaussians),
             )
         if self.absgrad:
+            if config.strategy != "adaptive":
+                raise UsageError("--absgrad goes with --strategy adaptive")
             adaptive = replace(config.adaptive, absgrad=True)
             if config.adaptive.threshold == 2e-4:
                 adaptive = replace(adaptive, threshold=8e-4)

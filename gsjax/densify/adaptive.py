@@ -5,7 +5,8 @@ Axis legend: N Gaussians (capacity), B cameras.
 Where the image wants to move a Gaussian, on average over the views that show it,
 there are too few of them: a small one is cloned, a large one split in two. What is
 nearly transparent or too large goes. If there are fewer free slots than candidates,
-those with the largest gradient get them, and the count wanted is reported.
+those with the largest gradient get them, and the count wanted is reported, also
+beyond the most that there may be.
 """
 
 from dataclasses import dataclass
@@ -192,8 +193,7 @@ def _densified(
         active=kept | born,
         cleared=born | split | ~kept,
         opacities_reset=jnp.asarray(False),
-        wanted=remaining
-        + jnp.minimum(jnp.sum(hot, dtype=jnp.int32), room.astype(jnp.int32)),
+        wanted=remaining + jnp.sum(hot, dtype=jnp.int32),
     )
 
 

@@ -127,14 +127,15 @@ def find_files(
     if missing:
         message = (
             f"{source}: {len(missing)} of {len(missing) + len(found)} photographs are "
-            f"missing in {root}, the first: {', '.join(missing[:_SHOWN])}"
+            f"missing in {root}"
         )
         if not skip_missing or not found:
             raise InputError(
-                f"{message}; put them there, or leave them out with skip_missing=True "
-                "(--skip-missing)"
+                f"{message}, the first: {', '.join(missing[:_SHOWN])}; put them there, "
+                "or leave them out with skip_missing=True (--skip-missing)"
             )
-        warnings.warn(f"{message}; left out", UserWarning, stacklevel=3)
+        left = f"{message} and left out: {', '.join(missing)}"
+        warnings.warn(left, UserWarning, stacklevel=3)
     return found
 
 

@@ -30,7 +30,7 @@ def rebase(scene: Scene) -> Scene:
     if not origin.any():
         return scene
     views = tuple(
-        replace(view, viewmat=_shifted(view.viewmat, origin)) for view in scene.views
+        replace(view, viewmat=shifted(view.viewmat, origin)) for view in scene.views
     )
     return replace(
         scene,
@@ -65,8 +65,8 @@ def _spread(positions: np.ndarray, middle: np.ndarray) -> float:
     return float(np.median(np.linalg.norm(positions - middle, axis=1)))
 
 
-def _shifted(viewmat: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """World → camera of coordinates from which ``origin`` was subtracted."""
+def shifted(viewmat: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """[4, 4] world → camera of coordinates from which ``origin`` was subtracted."""
     shifted = viewmat.copy()
     shifted[:3, 3] += viewmat[:3, :3] @ origin
     return shifted

@@ -87,10 +87,10 @@ def _write_pixels(photo: Photograph, lens: _Lens, work: Workshop, dataset: Path)
 
 
 def _read(path: Path, grey: bool = False) -> np.ndarray:
-    pixels = read_upright(path, grey)
-    if pixels is None:
-        raise InputError(f"{path}: this working file has been damaged meanwhile")
-    return pixels
+    try:
+        return read_upright(path, grey)
+    except InputError as error:
+        raise InputError(f"{error}; this working file was whole before") from error
 
 
 def _encoded(pixels: np.ndarray, name: str) -> bytes:

@@ -7,16 +7,17 @@ PNG without EXIF: whatever reads those files sees the same pixels the same way u
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.files import write_file
+from gsjax.files import opened, write_file
 from gsjax.images import encode_png, opencv
 from gsjax.scene.image_files import find_mask
+from gsjax.scene.image_header import check_image
 from gsjax.scene.sfm_colmap import Shot, exif_camera
 
 READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
@@ -109,16 +110,24 @@ def dataset_name(path: Path) -> str:
     return path.name if kept else path.with_suffix(".png").name
 
 
-def read_upright(path: Path, grey: bool = False) -> np.ndarray | None:
-    """[H, W, 3] BGR (or [H, W]) uint8, turned as EXIF says; None if unreadable."""
+def read_upright(path: Path, grey: bool = False) -> np.ndarray:
+    """[H, W, 3] BGR (or [H, W]) uint8, turned as EXIF says.
+
+    Raises:
+      InputError: if the file is no image, truncated, damaged, or declares more pixels
+        than any camera makes, which is found before they are taken.
+    """
     cv2 = opencv()
-    data = np.fromfile(path, np.uint8)
+    with opened(path, "a photograph") as file:
+        data = file.read()
+    check_image(path, data)
     flag = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR
-    try:
-        with silent_libraries():
-            return cv2.imdecode(data, flag) if data.size else None
-    except cv2.error:
-        return None
+    pixels = None
+    with suppress(cv2.error), silent_libraries():
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
+    if pixels is None:
+        raise InputError(f"{path}: damaged: OpenCV does not decode it")
+    return pixels
 
 
 def prepare_photos(
@@ -136,9 +145,10 @@ def prepare_photos(
     pairs = {} if masks is None else find_masks(masks, paths)
     made, bad = [], []
     for number, path in enumerate(paths):
-        pixels = read_upright(path)
-        if pixels is None:
-            bad.append(path)
+        try:
+            pixels = read_upright(path)
+        except InputError as error:
+            bad.append(str(error))
             continue
         height, width = pixels.shape[:2]
         camera, focal = exif_camera(path)
@@ -153,8 +163,8 @@ def prepare_photos(
         made.append(photo._replace(mask=path in pairs))
     if bad:
         raise InputError(
-            f"{_some(bad)}: cannot be read as an image, being damaged or something "
-            "else; mend or remove"
+            f"{len(bad)} of {len(paths)} photos cannot be read; mend or remove: "
+            + "; ".join([*bad[:5], *["…"][: len(bad) - 5]])
         )
     return made
 
@@ -198,8 +208,6 @@ def _mask(
     if path is None:
         return np.full(size, 255, np.uint8)
     mask = read_upright(path, grey=True)
-    if mask is None:
-        raise InputError(f"{path}: this mask cannot be read as an image")
     if mask.shape != full and mask.shape != size:
         raise InputError(
             f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]}, {photo.name} seen "

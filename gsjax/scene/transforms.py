@@ -15,6 +15,7 @@ import numpy as np
 
 from gsjax.cameras import Camera, make_camera
 from gsjax.errors import InputError
+from gsjax.scene.rebase import far_origin, shifted
 from gsjax.scene.transforms_fields import (
     Frame,
     first_number,
@@ -67,30 +68,52 @@ def load_transforms(
       InputError: if the file cannot be read, is no such JSON, or a frame has no
         rigid transform_matrix, no usable intrinsics, no size or an unknown lens.
     """
-    path = Path(path)
+    entries, _ = _load(Path(path), size, near=False)
+    return entries
+
+
+def load_near_transforms(
+    path: str | PathLike[str], *, size: tuple[int, int] | None = None
+) -> tuple[list[CameraEntry], np.ndarray]:
+    """As `load_transforms`, brought near the origin where float32 would be too coarse.
+
+    Returns:
+      The cameras, and what was subtracted from their world's coordinates [3] in
+      float64, and is to be from those of the scene; see `gsjax.scene.rebase`.
+    """
+    return _load(Path(path), size, near=True)
+
+
+def _load(
+    path: Path, size: tuple[int, int] | None, near: bool
+) -> tuple[list[CameraEntry], np.ndarray]:
     if size is not None and not (
         len(size) == 2 and all(isinstance(v, int | np.integer) and v >= 1 for v in size)
     ):
         raise InputError(f"size {size}: (width, height), whole and ≥ 1, is wanted")
+    frames = read_frames(path)
+    poses = [pose_of(frame) for frame in frames]
+    origin = np.zeros(3)
+    if near and poses:
+        centres = [-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat, _ in poses]
+        origin = far_origin(np.stack(centres), np.zeros((0, 3)))
     entries: list[CameraEntry] = []
     used: dict[str, int] = {}
-    scaled, distorted = [], set()
-    for index, frame in enumerate(read_frames(path)):
-        viewmat, factor = pose_of(frame)
-        if factor != 1:
-            scaled.append((index, factor))
+    distorted = set()
+    for index, (frame, (viewmat, _)) in enumerate(zip(frames, poses)):
         distorted.update(_distortion(frame))
-        camera = _camera(frame, viewmat, size)
+        camera = _camera(frame, shifted(viewmat, origin), size)
         entries.append(CameraEntry(_unique_name(frame, index, used), camera))
-    warn_of_scaled(path, scaled)
+    factors = enumerate(factor for _, factor in poses)
+    warn_of_scaled(path, [(index, factor) for index, factor in factors if factor != 1])
     if distorted:
         warnings.warn(
             f"{path}: lens distortion ({', '.join(sorted(distorted))}) is ignored; "
             "images are rendered as an ideal, undistorted lens",
             UserWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
-    return entries
+    return entries, origin
 
 
 # --- intrinsics ---

@@ -29,6 +29,7 @@ CASES: tuple[Case, ...] = (
     *precision.CASES,
     *accuracy.CASES,
 )
+_BAR = r"\|"
 _MARKS = ("<!-- gsjax stress -->", "<!-- /gsjax stress -->")
 
 
@@ -106,9 +107,9 @@ def markdown(told: dict[str, Any]) -> str:
     for row in rows:
         measured, bound, ratio = _cells(row)
         mark = "" if row.good else " **(outside)**"
-        lines.append(
-            f"| {row.name} | {row.claim} | {measured}{mark} | {bound} | {ratio} |"
-        )
+        cells = (row.name, row.claim, measured + mark, bound, ratio)
+        # A bare | would begin another cell.
+        lines.append(f"| {' | '.join(c.replace('|', _BAR) for c in cells)} |")
     for row in rows:
         if not row.good:
             lines += ["", f"{row.name}: {row.error or row.note}."]
@@ -129,12 +130,14 @@ def _result(row: dict[str, Any]) -> Result:
     return Result(**{**fields, "measured": measured})
 
 
-def put_between_marks(path: Path, table: str) -> None:
-    """Replace what stands between the two marks in a Markdown file.
+def around_marks(path: Path) -> tuple[str, str]:
+    """What stands in a Markdown file up to the first mark, and from the second on.
 
     Raises:
-      InputError: if it has no such lines, each once and in order.
+      InputError: if it has no such lines, each once and in order, or is not there.
     """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file to put the table into")
     text = path.read_text(encoding="utf-8")
     before, found, rest = text.partition(_MARKS[0])
     _, closed, after = rest.partition(_MARKS[1])
@@ -143,4 +146,14 @@ def put_between_marks(path: Path, table: str) -> None:
             f"{path}: no place for the table; put the lines {_MARKS[0]} and "
             f"{_MARKS[1]} where it is to go"
         )
-    write_file(path, f"{before}{found}\n{table}\n{closed}{after}".encode())
+    return before + found, closed + after
+
+
+def put_between_marks(path: Path, table: str) -> None:
+    """Replace what stands between the two marks in a Markdown file.
+
+    Raises:
+      InputError: as `around_marks`.
+    """
+    before, after = around_marks(path)
+    write_file(path, f"{before}\n{table}\n{after}".encode())

@@ -7,6 +7,7 @@ kept, so that a file that was damaged later costs one interval, not the run.
 
 import io
 import json
+import math
 import re
 import struct
 import warnings
@@ -64,7 +65,7 @@ def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Pa
     Args:
       folder: created if missing.
       state: of the run.
-      meta: JSON values to keep with it.
+      meta: JSON values to keep with it: ``pair_capacity``, and ``seconds`` of training.
 
     Raises:
       InputError: if it cannot be written; the checkpoints that were there still are.
@@ -140,6 +141,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
         "format": lambda value: value == _FORMAT,
         "step": lambda value: type(value) is int and value >= 0,
         "capacity": lambda value: type(value) is int and value in _lengths(arrays),
+        "pair_capacity": lambda value: type(value) is int and 0 <= value < 2**30,
+        "seconds": lambda value: type(value) in (int, float) and 0 <= value < math.inf,
         "arrays": lambda value: value == sorted(arrays),
     }
     meta = meta if isinstance(meta, dict) else {}

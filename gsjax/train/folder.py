@@ -255,17 +255,18 @@ def finished_splat(folder: Path) -> Path:
     return files.splat
 
 
-def load_scene(path: Path, scene: Scene) -> Gaussians:
-    """Gaussians of a file that `save_scene` wrote, in the scene's coordinates.
+def load_scene(path: Path, origin: np.ndarray) -> Gaussians:
+    """Gaussians of a file, in coordinates from which ``origin`` [3] is subtracted: of
+    one that `save_scene` wrote, those of its dataset.
 
     Raises:
       InputError: as `gsjax.load`.
     """
-    if not np.any(scene.origin):
+    if not np.any(origin):
         return load(path)
     with jax.enable_x64(True):
         wide = load(path)
-        means = np.asarray(wide.params.means, np.float64) - scene.origin
+        means = np.asarray(wide.params.means, np.float64) - origin
         params = wide.params.replace(means=means)  # pyright: ignore
     narrow = jax.tree.map(lambda a: np.asarray(a, np.float32), params)
     return jax.tree.map(jnp.asarray, wide.replace(params=narrow))  # pyright: ignore

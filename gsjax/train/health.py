@@ -91,8 +91,8 @@ class Health:
         if self.bad >= (_MAX_BAD_STEPS if fault == _LOST else self._limit):
             raise DivergedError(
                 f"{fault} in {self.bad} steps running, up to step {int(metrics.step)}; "
-                "lower the learning rates, or look for a photograph or a pose that is "
-                "off"
+                "look for a photograph or a pose that is off, or train anew with lower "
+                "rates (TrainConfig.rates)"
             )
 
     def _fault(self, metrics: Metrics) -> str | None:

@@ -50,7 +50,7 @@ def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
             f"no {which} views in this run; evaluate the others with --views "
             f"{'train' if which == 'test' else 'test'}"
         )
-    gaussians = load_scene(finished_splat(folder), data.scene)
+    gaussians = load_scene(finished_splat(folder), data.scene.origin)
     scene = subset(data.scene, chosen)
     before = subset(given.scene, chosen).views
     photos = load_photos(before, settings.config.max_size)

@@ -38,6 +38,7 @@ class Reporter:
         self.rate_from = (done, 0.0)
         self.rate = float("nan")
         self.compiled: list[float] = []  # seconds by then, after each compilation
+        self.most, self.full = config.max_gaussians, False
 
     def phase(self, text: str) -> None:
         """Say that something begins that takes a while."""
@@ -50,6 +51,7 @@ class Reporter:
         self.psnr = _smoothed(self.psnr, float(metrics.psnr))
         if [progress.compile_seconds] != self.compiled[-1:]:
             self.compiled.append(progress.compile_seconds)
+        self.tell_if_full(int(metrics.wanted))
         now, step = time.monotonic(), int(metrics.step)
         if self.bar is not None:
             self.bar.update(1)
@@ -72,6 +74,15 @@ class Reporter:
         note(
             f"step {step}/{self.steps}: {told}, {_clock(progress.seconds)} gone, {left}"
         )
+
+    def tell_if_full(self, wanted: int) -> None:
+        """Say once that there are to be more Gaussians than there may be."""
+        if wanted > self.most and not self.full:
+            self.full = True
+            note(
+                f"{wanted:,} Gaussians are wanted, {self.most:,} is the most "
+                "(--max-gaussians): those that lack most come first"
+            )
 
     def left(self, step: int) -> float:
         """Seconds to come, about: a step takes as long as it has pixels, and where

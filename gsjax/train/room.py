@@ -71,8 +71,9 @@ def _steps_of_program(step: int, config: TrainConfig) -> int:
 
 
 def with_slots(state: TrainState, wanted: int, config: TrainConfig) -> TrainState:
-    """``state``, with more slots if it will soon have too few for ``wanted``."""
-    capacity = state.gaussians.capacity
+    """``state``, with more slots if it will soon have too few for ``wanted``, as far
+    as there may be so many."""
+    capacity, wanted = state.gaussians.capacity, min(wanted, config.max_gaussians)
     if _SLOT_MARGIN * wanted <= capacity:
         return state
     most = capacity_bucket(config.max_gaussians)

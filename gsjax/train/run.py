@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -9,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.console import note
-from gsjax.errors import InputError
+from gsjax.errors import DivergedError, InputError
 from gsjax.evaluation import Summary
 from gsjax.files import make_folder
 from gsjax.scene.photos import load_photos
@@ -35,7 +36,14 @@ from gsjax.train.folder import (
 )
 from gsjax.train.footprint import check_memory
 from gsjax.train.history import keep_steps, read_metrics, write_curves
-from gsjax.train.sitting import Sitting, Start, evaluate, hooks_of, save_result
+from gsjax.train.sitting import (
+    Sitting,
+    Start,
+    evaluate,
+    hooks_of,
+    save_result,
+    saved_text,
+)
 from gsjax.train.step import TrainState
 
 
@@ -83,7 +91,7 @@ def start_run(
     Raises:
       InputError: if the folder holds a run and ``overwrite`` is not set, or files that
         are not a run's, or what is read or written fails.
-      DivergedError: as `fit`; the last checkpoint is kept.
+      DivergedError: as `fit`; the last good checkpoint is kept, and its scene.
     """
     files = run_files(folder)
     names = dict.fromkeys((*files, *run_files(folder, "train")))
@@ -163,6 +171,28 @@ def _photographs(sitting: Sitting) -> list[Photo]:
 def _train(
     sitting: Sitting, photos: list[Photo], state: TrainState, watch: Watch | None
 ) -> RunResult:
+    try:
+        return _trained(sitting, photos, state, watch)
+    except Exception as error:
+        _keep_last(sitting, error)
+        raise
+
+
+def _keep_last(sitting: Sitting, error: Exception) -> None:
+    """Of a run that an error cut short, leave the scene of the last checkpoint."""
+    files = sitting.files
+    with suppress(Exception):  # the error that is told is the first
+        start = _last_checkpoint(files, sitting.config, sitting.scene)
+        assert start.state is not None
+        save_result(sitting, start.state)
+        note(f"the scene of step {start.step} is kept: {files.splat}")
+    if not isinstance(error, DivergedError):  # else it would only do so again
+        note(saved_text(files))
+
+
+def _trained(
+    sitting: Sitting, photos: list[Photo], state: TrainState, watch: Watch | None
+) -> RunResult:
     config, files, scene = sitting.config, sitting.files, sitting.scene
     start = sitting.start
     for path in (files.metrics, files.held_out):
@@ -179,7 +209,8 @@ def _train(
             hooks=hooks,
         )
         # Within, so that Ctrl-C does not cut it in two either.
-        save_result(sitting, result)
+        sitting.save(result.state, result.pair_capacity, result.progress)
+        save_result(sitting, result.state)
         finished = int(result.state.step) >= config.steps and not hooks.stop()
     summary = evaluate(sitting, result, photos) if finished else None
     sitting.measured.write()

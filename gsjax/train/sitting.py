@@ -130,17 +130,13 @@ def hooks_of(sitting: Sitting) -> Iterator[Hooks]:
             sitting.metrics.write()
 
 
-def save_result(sitting: Sitting, result: FitResult) -> None:
-    """What a run leaves behind whether or not it came to its end."""
+def save_result(sitting: Sitting, state: TrainState) -> None:
+    """The scene of a run as it is by now, and its cameras where they were learnt."""
     files, scene = sitting.files, sitting.data.scene
-    try:
-        sitting.save(result.state, result.pair_capacity, result.progress)
-        save_scene(files.splat, result.gaussians, scene, overwrite=True)
-        cameras = sitting.cameras(result.state)
-        if cameras is not scene:
-            save_cameras(files.cameras, cameras)
-    except InputError as error:
-        raise InputError(f"{error}: {saved_text(files)}") from error
+    save_scene(files.splat, state.gaussians, scene, overwrite=True)
+    cameras = sitting.cameras(state)
+    if cameras is not scene:
+        save_cameras(files.cameras, cameras)
 
 
 def _any_to_measure(sitting: Sitting) -> bool:

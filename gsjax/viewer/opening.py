@@ -70,7 +70,8 @@ def open_exhibit(
             scene = refined_data(load_data(settings), run_files(path)).scene
         except InputError as error:
             note(f"warning: without cameras: {one_line(error)}")
-    subject = open_subject(path, scene=scene, preset=preset)
+    origin = None if scene is None else scene.origin
+    subject = open_subject(path, origin=origin, preset=preset)
     gaussians = subject.load()
     frusta = [] if scene is None else frusta_of(scene.views)
     renderer = ExactRenderer(subject.config, subject.background)

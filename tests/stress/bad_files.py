@@ -325,6 +325,8 @@ BAD = {
     "zip format": Bad(STEP, meta("format", 99), "format 99; 1 is wanted"),
     "zip step": Bad(STEP, meta("step", 1e999), "meta.json: step inf"),
     "zip capacity": Bad(STEP, meta("capacity", 10**12), "capacity 1000000000000"),
+    "zip pairs": Bad(STEP, meta("pair_capacity", "many"), "pair_capacity 'many'"),
+    "zip seconds": Bad(STEP, meta("seconds", 1e999), "seconds inf"),
     "zip arrays": Bad(
         STEP, entries(lambda e: e.pop(first_array(e))), "meta.json: arrays"
     ),

@@ -27,6 +27,7 @@ from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import CapacityError, DivergedError, InputError
 from gsjax.raster.types import RasterConfig
+from gsjax.subjects import splat_file
 from gsjax.train.checkpoint import load_checkpoint
 from gsjax.train.config import TrainConfig
 from gsjax.train.folder import RunSettings
@@ -133,7 +134,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("change", FAULTS, ids=lambda change: change.__name__)
 def test_a_diverging_run_is_stopped_and_what_was_good_is_kept(
-    change, tmp_path, monkeypatch
+    change, tmp_path, monkeypatch, capsys
 ):
     """After step 11 something happens; half of so short a run is time enough."""
     settings = settings_of(tmp_path, harmless(), "mcmc")
@@ -154,6 +155,15 @@ def test_a_diverging_run_is_stopped_and_what_was_good_is_kept(
     assert good.step == 10  # and not 20, though that was due
     for name, array in good.arrays.items():
         assert not name.startswith(".gaussians.params") or np.isfinite(array).all()
+    # And as a scene, which every command takes.
+    told = capsys.readouterr().err
+    assert f"the scene of step 10 is kept: {run / 'splat.ply'}" in told
+    scene = gsjax.load(splat_file(run))
+    active = good.arrays[".gaussians.active"]
+    np.testing.assert_array_equal(
+        scene.params.means[scene.active], good.arrays[".gaussians.params.means"][active]
+    )
+    assert evaluate_run(run, which="train").views > 0
 
 
 def metrics_of(step, **changes) -> Metrics:
@@ -204,23 +214,32 @@ def test_a_run_that_would_not_fit_does_not_start(tmp_path, monkeypatch):
         assert start_run(settings, run).finished
 
 
-def test_a_run_that_outgrows_the_memory_is_saved(tmp_path, monkeypatch):
-    """And ends, once it may, as if nothing had been."""
+@pytest.mark.parametrize(
+    "error", [CapacityError("too much"), MemoryError("too much")], ids=repr
+)
+def test_a_run_that_outgrows_the_memory_is_saved(error, tmp_path, monkeypatch, capsys):
+    """And ends, once it may, as if nothing had been; nobody foresees a MemoryError,
+    which costs the steps since the last checkpoint.
+    """
+    step = 12 if isinstance(error, CapacityError) else 10
     whole = start_run(settings_of(tmp_path, harmless(), "mcmc"), tmp_path / "whole")
     compile_one, calls = fit_module._Run.program, []
 
     def program(self, *sizes):
         calls.append(1)
         if len(calls) == 13:
-            raise CapacityError("too much")
+            raise error
         return compile_one(self, *sizes)
 
     monkeypatch.setattr(fit_module._Run, "program", program)
     run = tmp_path / "run"
-    with pytest.raises(CapacityError, match="too much"):
+    with pytest.raises(type(error), match="too much"):
         start_run(settings_of(tmp_path / "again", harmless(), "mcmc"), run)
     kept = sorted(path.name for path in (run / "checkpoints").iterdir())
-    assert kept == ["step_000000010.npz", "step_000000012.npz"]
+    assert kept == [f"step_{n:09d}.npz" for n in sorted({10, step})]
+    told = capsys.readouterr().err
+    assert f"the scene of step {step} is kept" in told
+    assert f"step {step} is saved; go on with --resume" in told
     assert resume_run(run).finished
     splats = (f.read_bytes() for f in (run / "splat.ply", whole.files.splat))
     assert len(set(splats)) == 1
@@ -397,6 +416,9 @@ def test_a_full_disk_loses_nothing(share, saved, train, whole, tmp_path, monkeyp
         code, told = train(run)
     assert code == 3
     assert "No space left on device; free some space" in told[-1]
+    if share:  # else the run could not even begin
+        step = {0: "no step", 1: "step 10", 2: f"step {20 if share < 0.8 else STEPS}"}
+        assert f"{step[saved]} is saved" in told[-2]
     assert not list(run.rglob("*.tmp"))
     kept = sorted(run.glob("checkpoints/*"))
     assert len(kept) == saved

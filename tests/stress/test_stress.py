@@ -1,6 +1,7 @@
 """The short form of `gsjax stress`, a test a case, and fuzzing on top of it."""
 
 import json
+import re
 from pathlib import Path
 
 import jax
@@ -93,7 +94,7 @@ def raising(full: bool) -> Measured:
 
 
 FAKE = {
-    "well": Case("a/well", "share", 1.0, found(0.25, "of 4")),
+    "well": Case("a/well", "share |α|", 1.0, found(0.25, "of 4")),
     "none": Case("b/none", "count", 0, found(0), "px"),
     "over": Case("c/over", "share", 1.0, found(1.5)),
     "nan": Case("d/nan", "share", 1.0, found(np.nan)),
@@ -133,7 +134,7 @@ def test_exit_codes(monkeypatch, capsys):
     assert stress(monkeypatch, "well full known", "--full") == 1
     assert len(capsys.readouterr().out.splitlines()) == 4
     assert stress(monkeypatch, "well over", "--only", "a/") == 0
-    assert stress(monkeypatch, "well over", "--only", "z") == 3
+    assert stress(monkeypatch, "well over", "--only", "z") == 2
     assert "there are a/well, c/over" in capsys.readouterr().err
 
 
@@ -156,15 +157,20 @@ def test_json_and_markdown(monkeypatch, tmp_path, capsys):
     assert text.startswith("# before\n<!-- gsjax stress -->\n| case |")
     assert text.endswith("\n<!-- /gsjax stress -->\nafter\n")
     assert "old" not in text
-    assert "| a/well | share | 0.25 | 1 | 4 × |" in text
+    assert r"| a/well | share \|α\| | 0.25 | 1 | 4 × |" in text
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {6}
     assert "| b/none | count | 0 px | 0 px | exact |" in text
     assert "nan **(outside)**" in text
     capsys.readouterr()
     assert stress(monkeypatch, "well", *args) == 3
     assert "exists; pass --overwrite" in capsys.readouterr().err
     page.write_text("no marks")
-    assert stress(monkeypatch, "well", "--markdown", str(page)) == 3
-    assert "no place for the table" in capsys.readouterr().err
+    for where, told in ((page, "no place for the table"), (tmp_path / "x", "no such")):
+        assert stress(monkeypatch, "well", "--markdown", str(where)) == 3
+        output = capsys.readouterr()
+        assert told in output.err
+        assert output.out == "", "found before anything is measured"
 
 
 def test_the_table_of_the_readme_is_that_of_the_results():
