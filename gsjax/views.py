@@ -13,8 +13,9 @@ from gsjax.console import note, progress, say
 from gsjax.errors import InputError
 from gsjax.files import make_folder, refuse_existing, write_file
 from gsjax.gaussians import Gaussians, capacity_bucket
+from gsjax.memory import available, size_text
 from gsjax.planning.plan import plan
-from gsjax.raster.render import exact_config, render_exact
+from gsjax.raster.render import exact_config, render_estimate, render_exact
 from gsjax.raster.types import RasterConfig, Render
 from gsjax.scene.transforms import CameraEntry
 from gsjax.subjects import Subject
@@ -108,10 +109,20 @@ def rendered(
             fitted = exact_config(gaussians, camera, config).pair_capacity or 1
             roomy = capacity_bucket(int(_MARGIN * fitted))
             config = config.replace(pair_capacity=roomy)
+        if index == 0:
+            _tell_memory(gaussians, camera, config)
         view = render_exact(gaussians, camera, config, behind)
         wanted = capacity_bucket(int(view.demand.capacity))
         config = config.replace(pair_capacity=max(config.pair_capacity or 1, wanted))
         yield view
+
+
+def _tell_memory(gaussians: Gaussians, camera: Camera, config: RasterConfig) -> None:
+    bases, size = gaussians.params.sh.shape[1], (camera.width, camera.height)
+    estimate = render_estimate(gaussians.capacity, bases, size, config)
+    free = available()
+    told = "" if free is None else f"; {size_text(free)} is free"
+    note(f"memory: about {size_text(estimate.total)} a view{told}")
 
 
 def _targets(folder: Path, name: str, kinds: Sequence[str], npy: bool) -> list[_Target]:

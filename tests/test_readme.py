@@ -10,8 +10,9 @@ import gsjax
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 # What the snippets claim in their comments.
 CLAIMS = """
-assert np.isfinite(value) and all(np.isfinite(g).all() for g in gradient.values())
-assert np.abs(gradient["means"]).max() > 0 and image.rgb.std() > 0.05
+gradient = jax.tree.leaves((by_params, by_camera.viewmat, by_camera.K))
+assert np.isfinite(value) and all(np.isfinite(g).all() for g in gradient)
+assert all(np.abs(g).max() > 0 for g in gradient) and image.rgb.std() > 0.05
 assert images.shape == (3, 48, 64, 3) and images.std() > 0.05
 np.testing.assert_allclose(mapped, images, atol=1e-6)
 assert of_features.shape == (n, 8) and np.abs(of_features).max() > 0

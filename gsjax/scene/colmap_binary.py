@@ -136,31 +136,33 @@ def _name(data: _Data, where: str) -> str:
 def read_points(path: Path) -> ColmapPoints:
     """Points of a points3D.bin, sorted by id; of the tracks only the length."""
     data = _Data(path, _POINT.itemsize, "points")
-    starts = _point_starts(data)
-    data.finish("points")
     raw = np.frombuffer(data.bytes, np.uint8)
     fields = {name: np.empty((data.count, *s), kind) for name, kind, *s in _FIELDS}
     for first in range(0, data.count, _PIECE):
-        piece = slice(first, first + _PIECE)
+        piece = range(first, min(first + _PIECE, data.count))
+        starts = _point_starts(data, piece)
         # A gather of the fixed part of records: [·, 51] bytes.
-        rows = raw[starts[piece, None] + np.arange(_POINT.itemsize)].view(_POINT)[:, 0]
+        rows = raw[starts[:, None] + np.arange(_POINT.itemsize)].view(_POINT)[:, 0]
         for name, field in fields.items():
-            field[piece] = rows[name]
+            field[piece.start : piece.stop] = rows[name]
+    data.finish("points")
     # Sorting copies: what was read must not be held as well.
-    del data, raw, starts
+    del data, raw
     identities, xyz, rgb, errors, lengths = fields.values()
     lengths = lengths.view(np.int64)
     return sorted_points(str(path), ColmapPoints(identities, xyz, rgb, errors, lengths))
 
 
-def _point_starts(data: _Data) -> np.ndarray:
-    """[M] where each record starts: a chain of lengths, walked in plain Python."""
+def _point_starts(data: _Data, piece: range) -> np.ndarray:
+    """Where each record of a piece starts, which follows those read before: a chain of
+    lengths, walked in plain Python.
+    """
     content, size = data.bytes, data.size
     unpack, fixed, length_at = _COUNT.unpack_from, _POINT.itemsize, _POINT.itemsize - 8
-    starts = np.empty(data.count, np.int64)
+    starts = []
     at = data.offset
-    for index in range(data.count):
-        starts[index] = at
+    for index in piece:
+        starts.append(at)
         end = at + fixed
         if end <= size:
             end += _TRACK_BYTES * unpack(content, at + length_at)[0]
@@ -169,4 +171,4 @@ def _point_starts(data: _Data) -> np.ndarray:
             raise data.truncated(end - at, f"point {index}")
         at = end
     data.offset = at
-    return starts
+    return np.asarray(starts, np.int64)

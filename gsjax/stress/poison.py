@@ -79,11 +79,23 @@ def traces(scene: Gaussians, spoilt: list[int], value: float) -> dict[str, list[
     wanted, wanted_slopes = usual_gradients(without)
     difference = unequal(images[:3], (wanted.rgb, wanted.alpha, wanted.depth))
     difference += unequal(slopes.params, wanted_slopes.params)
+    difference += unequal(slopes.background, wanted_slopes.background)
+    difference += _beyond_rounding(slopes.camera, wanted_slopes.camera)
     return {
         "not finite": [not_finite(images), not_finite(slopes)],
         "seen": [s for s in spoilt if not np.isfinite(value) and not unseen[s]],
         "traces": [difference, int((~unseen).sum())],
     }
+
+
+def _beyond_rounding(found: Camera, wanted: Camera) -> int:
+    """Slopes of a camera, sums over all that is seen, that differ by more than the
+    order of the terms of a sum can do; not finite ones are counted elsewhere.
+    """
+    pairs = zip(jax.tree.leaves(found), jax.tree.leaves(wanted))
+    return sum(
+        int(np.sum(np.abs(a - b) > 1e-5 * np.abs(b).max(initial=1))) for a, b in pairs
+    )
 
 
 def _sweep(full: bool) -> Iterator[tuple[float, int, dict, dict]]:
