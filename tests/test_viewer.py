@@ -3,6 +3,7 @@
 import base64
 import contextlib
 import json
+import logging
 import re
 import shutil
 import socket
@@ -511,6 +512,20 @@ def test_where_nothing_can_be_listened_on():
         server = open_server("127.0.0.1", port)
     assert server.get_port() > port
     stop_server(server)
+
+
+def test_who_connects_and_goes_costs_no_line(monkeypatch, caplog):
+    """As Chromium does before it asks, in case it will want more than one."""
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    logger = logging.getLogger("websockets.server")
+    monkeypatch.setattr(logger, "filters", [])  # those of earlier servers
+    told: list[logging.LogRecord] = []
+    logger.addFilter(lambda record: told.append(record) is None)
+    server = open_server("127.0.0.1", 8790)
+    socket.create_connection(("127.0.0.1", server.get_port())).close()
+    wait_for(lambda: told)
+    stop_server(server)
+    assert caplog.records == []
 
 
 def test_a_training_is_shown_by_copies_of_its_own():
