@@ -37,14 +37,19 @@ def program(text: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def commands(text: str) -> list[list[str]]:
-    """Arguments of every ``gsjax …`` in ```sh blocks, as they can be typed."""
+def typed(text: str) -> list[list[str]]:
+    """Words of every command in ```sh blocks, as they can be typed."""
     found = []
     for _, code in blocks(text, "sh"):
         for line in code.replace("\\\n", " ").splitlines():
             parts = re.split(r"&&|\||;", line)
             found += [shlex.split(part, comments=True) for part in parts]
-    return [words[1:] for words in found if words and words[0] == "gsjax"]
+    return [words for words in found if words]
+
+
+def commands(text: str) -> list[list[str]]:
+    """Arguments of every ``gsjax …`` among them."""
+    return [words[1:] for words in typed(text) if words[0] == "gsjax"]
 
 
 def mentions(text: str) -> list[list[str]]:

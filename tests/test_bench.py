@@ -98,6 +98,17 @@ def test_what_is_allowed_for_bands_holds(view):
     assert error.max() > 0.005
 
 
+@pytest.mark.parametrize("behind", [BEHIND, np.zeros(3)])
+def test_where_nothing_is_the_background_may_be_rounded(view, behind):
+    scene, camera, _ = view
+    found = pixelwise.dense(scene, camera, behind, np.array([[10**4, 10**4]]))
+    np.testing.assert_array_equal(found.picture, [behind])
+    error = np.abs(np.float32(behind) - behind).max()
+    bound = pixelwise.allowed(found, scene, camera, EXACT, degree=1, dtype="float32")
+    assert error <= bound <= 1e-3
+    assert (error > 0) == behind.any()
+
+
 def row(ms: float, error: float, knob: str = "cut", inside: bool = True) -> dict:
     return {
         "scene": "x", "knob": knob, "value": "1", "forward ms": ms, "gradient ms": 3.0,

@@ -28,6 +28,14 @@ def test_python_blocks_run(tmp_path):
     assert (tmp_path / "scene.ply").exists()
 
 
+def test_linked_files_are_there():
+    links = [
+        link for link in re.findall(r"\]\(([^)\s#]+)", README) if "://" not in link
+    ]
+    assert len(links) > 30
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
 def test_presets_are_as_in_the_table():
     presets = [gsjax.RasterConfig.compat(), gsjax.RasterConfig.accurate()]
     presets.append(gsjax.RasterConfig.fast())

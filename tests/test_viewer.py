@@ -2,8 +2,8 @@
 
 import base64
 import contextlib
-import itertools
 import json
+import logging
 import re
 import shutil
 import socket
@@ -13,7 +13,6 @@ import sys
 import threading
 import time
 import urllib.request
-from pathlib import Path
 
 import cv2
 import jax
@@ -256,18 +255,21 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 @pytest.fixture
 def pictures_of_page(tmp_path):
-    """A function: pictures [H, W, 3] of a page in Chromium, one after another."""
+    """A function: pictures [H, W, 3] of a page in Chromium, one after another.
+
+    What is sent to it is a script, which the page runs before the next.
+    """
     from websockets.sync.client import connect
 
     profile, browsers = tmp_path / "profile", []
 
-    def look(page: Path):
+    def look(url: str, size: str = "500,400"):
         browsers.append(
             subprocess.Popen(
                 [CHROMIUM, "--headless", "--no-sandbox", "--use-angle=swiftshader",
                  "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
                  "--remote-debugging-port=0", f"--user-data-dir={profile}",
-                 "--window-size=500,400", page.as_uri()],
+                 f"--window-size={size}", url],
                 stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             )
         )  # fmt: skip
@@ -277,12 +279,17 @@ def pictures_of_page(tmp_path):
         targets = json.loads(urllib.request.urlopen(address, timeout=30).read())
         (target,) = (one for one in targets if one["type"] == "page")
         with connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
-            for number in itertools.count():
-                ask = {"id": number, "method": "Page.captureScreenshot"}
-                socket.send(json.dumps(ask))
-                answer = json.loads(socket.recv(timeout=60))
-                data = base64.b64decode(answer["result"]["data"])
-                yield cv2.imdecode(np.frombuffer(data, np.uint8), 1)[..., ::-1]
+
+            def told(method: str, **params) -> dict:
+                socket.send(json.dumps({"id": 0, "method": method, "params": params}))
+                return json.loads(socket.recv(timeout=60))["result"]
+
+            while True:
+                data = base64.b64decode(told("Page.captureScreenshot")["data"])
+                picture = cv2.imdecode(np.frombuffer(data, np.uint8), 1)[..., ::-1]
+                script = yield picture
+                if script is not None:
+                    told("Runtime.evaluate", expression=script)
 
     yield look
     for browser in browsers:
@@ -316,7 +323,7 @@ def test_a_page_from_a_disk_shows_what_is_before(tmp_path, capsys, pictures_of_p
     assert cli.main(["view", str(ply), "--html", str(out)]) == 0
     capsys.readouterr()
     # The page loads and sorts its splats in workers, in its own time.
-    pictures, deadline = pictures_of_page(out), time.monotonic() + 120
+    pictures, deadline = pictures_of_page(out.as_uri()), time.monotonic() + 120
     shell, core = 0.0, 1.0
     while (shell < 0.02 or core > 0.01 * shell) and time.monotonic() < deadline:
         red, green, blue = np.moveaxis(next(pictures).astype(float), -1, 0)
@@ -327,6 +334,81 @@ def test_a_page_from_a_disk_shows_what_is_before(tmp_path, capsys, pictures_of_p
 
 
 # --- live ---
+
+
+ORANGE, BLUE = np.array([0.9, 0.5, 0.1]), np.array([0.1, 0.3, 0.9])
+
+
+def orange_but_blue_from(eye) -> gsjax.Gaussians:
+    """A ball: orange where SH are of degree 0, and with degree 1 blue from there."""
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(1000, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    x, y, z = (direction - eye).T / np.linalg.norm(direction - eye, axis=1)
+    sh = np.zeros((1000, 4, 3))
+    sh[:, 0] = rgb_to_dc(ORANGE)
+    sh[:, 1:] = np.stack([-y, z, -x], -1)[..., None] * (BLUE - ORANGE) / 0.4886025
+    return gsjax.make_gaussians(
+        means=direction,
+        quats=np.tile([1.0, 0, 0, 0], (1000, 1)),
+        log_scales=np.full((1000, 3), np.log(0.1)),
+        logit_opacities=np.full(1000, 6.0),
+        sh=sh,
+    )
+
+
+def share_of(color, page) -> float:
+    """Of the pixels: those of about this colour."""
+    return float((np.abs(page - 255 * color).max(-1) < 40).mean())
+
+
+def first_with(color, pictures) -> np.ndarray:
+    """The first of them with much of this colour: the browser takes its time."""
+    end = time.monotonic() + 60
+    for page in pictures:
+        if share_of(color, page) > 0.1:
+            return page
+        assert time.monotonic() < end, f"{color} is not seen"
+    raise AssertionError("no picture")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_a_browser_shows_the_splats_and_then_our_own_picture(
+    tmp_path, pictures_of_page
+):
+    """`gsjax view PLY`, and a click on *Render*, which shows what viser cannot."""
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    from gsjax.viewer.opening import open_exhibit
+    from gsjax.viewer.window import Window
+
+    eye = eye_of_gaussians(orange_but_blue_from(np.zeros(3)), UPS["-y"]).position
+    gsjax.save(tmp_path / "a.ply", orange_but_blue_from(eye))
+    exhibit = open_exhibit(tmp_path / "a.ply").exhibit
+    exhibit.renderer.config = exhibit.renderer.config.replace(**LIGHT)
+    window = Window(exhibit, port=8590)
+    try:
+        pictures = pictures_of_page(window.url, "900,600")
+        splats = first_with(ORANGE, pictures)
+        assert share_of(BLUE, splats) < 0.01
+        (session,) = window.sessions.values()
+        session.height.value = "270"
+        pictures.send(
+            "[...document.querySelectorAll('button')]"
+            ".find((button) => button.textContent.trim() == 'Render').click()"
+        )
+        shown = first_with(BLUE, pictures)
+        eye, width = session.client.camera, round(270 * session.client.camera.aspect)
+        camera = camera_of(eye.wxyz, eye.position, eye.fov, width, 270)
+        ours = picture(exhibit.renderer(exhibit.gaussians, camera), "rgb")[0]
+    finally:
+        window.close()
+    ours = cv2.resize(ours, shown.shape[1::-1]).astype(float)
+    # The panel lies over a part of the ball; half of its pixels are seen at least.
+    ball = np.abs(ours - 255 * BLUE).max(-1) < 40
+    assert 0.1 < ball.mean() < 0.9
+    assert np.median(np.abs(shown - ours)[ball]) < 4
+    assert np.median(np.abs(splats - ours)[ball]) > 40
 
 
 CAMERA = {
@@ -430,6 +512,20 @@ def test_where_nothing_can_be_listened_on():
         server = open_server("127.0.0.1", port)
     assert server.get_port() > port
     stop_server(server)
+
+
+def test_who_connects_and_goes_costs_no_line(monkeypatch, caplog):
+    """As Chromium does before it asks, in case it will want more than one."""
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    logger = logging.getLogger("websockets.server")
+    monkeypatch.setattr(logger, "filters", [])  # those of earlier servers
+    told: list[logging.LogRecord] = []
+    logger.addFilter(lambda record: told.append(record) is None)
+    server = open_server("127.0.0.1", 8790)
+    socket.create_connection(("127.0.0.1", server.get_port())).close()
+    wait_for(lambda: told)
+    stop_server(server)
+    assert caplog.records == []
 
 
 def test_a_training_is_shown_by_copies_of_its_own():

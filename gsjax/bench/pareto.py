@@ -32,6 +32,7 @@ _EXACT = RasterConfig.accurate(
     devices=1,
 )
 _PIXELS = 48
+_LEAST = 1e-30
 
 
 class Point(NamedTuple):
@@ -118,7 +119,7 @@ def pareto(trial: Trial, settings: Sequence[Point], repeats: int = 5) -> list[di
     rows = []
     for index, (point, run) in enumerate(zip(settings, runs)):
         at = errors[index][pixels[:, 1], pixels[:, 0]]
-        nearest = int(np.argmax(at / bounds[index]))
+        nearest = int(np.argmax(at / np.maximum(bounds[index], _LEAST)))
         mean = float(np.mean((run.rgb - exact.rgb) ** 2))
         rows.append(
             {
@@ -128,7 +129,7 @@ def pareto(trial: Trial, settings: Sequence[Point], repeats: int = 5) -> list[di
                 "forward ms": ms[0][index],
                 "gradient ms": ms[1][index],
                 "max": float(errors[index].max()),
-                "psnr": -10 * np.log10(max(mean, 1e-30)),
+                "psnr": -10 * np.log10(max(mean, _LEAST)),
                 "gradient": _relative(run.grads, exact.grads),
                 "at worst": float(at[nearest]),
                 "bound": float(bounds[index][nearest]),

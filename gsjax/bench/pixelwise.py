@@ -16,7 +16,7 @@ from gsjax.gaussians import Gaussians, with_sh_degree
 from gsjax.raster.reference import reference_colors, reference_project
 from gsjax.raster.types import RasterConfig
 
-# What rounding may do, as a share of the range of the colours.
+# What rounding may do, as a share of the largest colour.
 ROUNDING = {"float32": 1e-4, "float64": 1e-9}
 _SEEN = 1e-14
 # Depths nearer than so many units of the last place of their terms may change places.
@@ -32,6 +32,7 @@ class Dense(NamedTuple):
       colors: [N, 3].
       near: [N] depth below which the next splat could be taken for the one in front.
       spread: [P] range of the colours there, of the channel with the largest.
+      largest: [P] of the colours there, the background's among them.
       picture: [P, 3] rgb.
     """
 
@@ -40,6 +41,7 @@ class Dense(NamedTuple):
     colors: np.ndarray
     near: np.ndarray
     spread: np.ndarray
+    largest: np.ndarray
     picture: np.ndarray
 
 
@@ -72,9 +74,10 @@ def dense(
     high = np.maximum(np.where(there, colors[:, None], -np.inf).max(0), behind)
     weight, left = _weights(alpha)
     picture = weight.T @ colors + left[:, None] * behind
-    swappable = np.where(near[:-1] > depth[order][1:], 1.0, 0.0)
+    swappable = np.append(np.where(near[:-1] > depth[order][1:], 1.0, 0.0), 0)
     spread = (high - low).max(axis=1)
-    return Dense(order, alpha, colors, np.append(swappable, 0), spread, picture)
+    largest = np.maximum(np.abs(low), np.abs(high)).max(axis=1)
+    return Dense(order, alpha, colors, swappable, spread, largest, picture)
 
 
 def _weights(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -110,7 +113,7 @@ def allowed(
     if config.stop_rule == "before":
         most = config.stop / np.maximum(1 - kept.max(axis=0), 1e-16)
     stop = np.where(left <= config.stop * (1 + 1e-3), np.minimum(most, 1), 0)
-    total = spread * (cap + cut + stop + ROUNDING[dtype])
+    total = spread * (cap + cut + stop) + ROUNDING[dtype] * found.largest
     if dtype == "float32":
         following = np.append(alpha[1:], np.zeros_like(alpha[:1]), axis=0)
         total = total + spread * (found.near[:, None] * weight * following).sum(axis=0)

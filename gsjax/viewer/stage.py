@@ -5,6 +5,7 @@ Cameras have OpenCV axes, in gsjax as in viser; fields of view are vertical, rad
 
 import contextlib
 import errno
+import logging
 import socket
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -100,6 +101,7 @@ def open_server(host: str, port: int) -> Any:
     viser = require_viser()
     try:
         free = _free_port(host, port)
+        logging.getLogger("websockets.server").addFilter(_asked_something)
         with quiet():
             return viser.ViserServer(host=host, port=free, label="gsjax", verbose=False)
     except (OSError, UnicodeError) as error:
@@ -107,6 +109,12 @@ def open_server(host: str, port: int) -> Any:
             f"{host}:{port}: cannot be listened on: {error}; 127.0.0.1 is this machine "
             "for itself, 0.0.0.0 for others too"
         ) from error
+
+
+def _asked_something(record: logging.LogRecord) -> bool:
+    """Not who connects and goes without a word, as Chromium does; viser says the
+    same, but only once a first has asked."""
+    return record.getMessage() != "opening handshake failed"
 
 
 def _free_port(host: str, port: int) -> int:
