@@ -33,6 +33,12 @@ class Rates(NamedTuple):
     sh_dc: float = 2.5e-3
     sh_rest: float = 1.25e-4
 
+    def times(self, factor: float) -> "Rates":
+        """All of them, multiplied."""
+        first, last = self.means
+        rest = (factor * rate for rate in self[1:])
+        return Rates((factor * first, factor * last), *rest)
+
 
 def means_rate(rates: Rates, fraction: Array, extent: float | Array) -> Array:
     """Rate of the means at ``fraction`` (0 to 1) of the run."""

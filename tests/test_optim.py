@@ -111,3 +111,11 @@ def test_without_gradient_nothing_moves(garbage):
         assert (after[~dead] != before[~dead]).all()
         for moment in (moments.mu, moments.nu):
             assert (getattr(moment, name)[dead] == 0).all()
+
+
+def test_times_multiplies_every_rate():
+    rates = Rates().times(3.0)
+    for found, one in zip(jax.tree.leaves(rates), jax.tree.leaves(Rates())):
+        assert found == pytest.approx(3 * one)
+    assert rates._fields == Rates()._fields
+    assert isinstance(rates.means, tuple)
