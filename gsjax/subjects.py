@@ -11,9 +11,9 @@ from gsjax.gaussians import Gaussians
 from gsjax.raster.types import RasterConfig
 from gsjax.train.folder import (
     background_of,
-    finished_splat,
     load_scene,
     load_settings,
+    saved_splat,
 )
 
 PRESETS = {
@@ -53,7 +53,7 @@ def splat_file(path: Path) -> Path:
     if not is_run(path):
         return path
     load_settings(path)
-    return finished_splat(path)
+    return saved_splat(path)
 
 
 def open_subject(

@@ -528,9 +528,9 @@ def watched_fit(gaussians, controlled, key):
 # split are drawn from the Gaussian in all three directions, and would else
 # be born behind the camera. Adam *forgets* faster, $\beta_2$ = 0.95 and not 0.999: a
 # new Gaussian has moments of zero, while the count of steps from which Adam corrects
-# for that is one for all. With 0.999 its first steps come out up to six times too long,
-# and at our rates it is thrown out of the picture; with 0.95 it is 1.1 times. Opacities
-# are *not reset*: 700 steps have no time to recover.
+# for that is one for all. With 0.999 its first steps come out up to three times too
+# long, and at our rates it is thrown out of the picture; with 0.95 it is 1.1 times.
+# Opacities are *not reset*: 700 steps have no time to recover.
 #
 # Four fits, each for three seeds:
 #
@@ -581,14 +581,14 @@ print(
 
 # %%
 assert capped[few_even] > 2 * capped[many_even]  # too few: at the cap,
-assert pulls[few_even] > 3 * pulls[many_even]  # and pulled at
+assert pulls[few_even] > 6 * pulls[many_even]  # and pulled at
 assert floored[many_even] < 0.05  # a good start has none at the floor,
-assert floored[many_bad] > 0.4  # a bad one half of all,
+assert floored[many_bad] > 0.5  # a bad one most,
 assert floored[grown] < 0.15  # and control few
 assert all(each[3][0] == FEW and each[3][-1] == MANY for each in watched[grown])
 assert watched[grown][0][0] > watched[many_bad][-1][0] + 2  # worst of three, best
-assert medians[grown] > medians[many_bad] + 4
-assert medians[many_even] > medians[grown] + 4  # a good start is better still
+assert medians[grown] > medians[many_bad] + 5
+assert medians[many_even] > medians[grown] + 6  # a good start is better still
 
 # %% [markdown]
 # The widths of all three seeds. Each Gaussian counts twice, with its narrow and with
@@ -625,7 +625,7 @@ plt.show()
 
 # %% [markdown]
 # Of 8 Gaussians from an even spread a third end at the cap, and the picture pulls at
-# them ten times as hard as at 60: too few. Of 60 from the bad start most stay at
+# them many times as hard as at 60: too few. Of 60 from the bad start most stay at
 # the floor. They are drawn, as dots and needles a pixel wide, but what describes the
 # picture is the others.
 #
@@ -634,7 +634,8 @@ plt.show()
 # picture pulls: what is small is cloned, what is large is split, and the new
 # Gaussians inherit a width that is at work. The number is the same in the end, the
 # start as bad, and the result about 8 dB better. Each edit costs some dB at first,
-# which the next steps win back.
+# which the next steps win back. It has more at the cap, children of wide ones: the cap
+# is a sign of too few beside a fit of more, and not by itself.
 #
 # It is no better than a good start: 60 from an even spread, which here one knows to be
 # right, are better by another 11 dB. Control is for where one does not know.
@@ -690,8 +691,8 @@ print(
 # - Twenty times the Gaussians buy about 20 dB. Those of a good fit overlap heavily:
 #   they work as sums of many soft contributions and not as tiles of a mosaic.
 # - Where the last decibels count, use `RasterConfig.accurate`.
-# - Look at the widths. Many at the cap: too few Gaussians. Many at the floor: a start
-#   that was too narrow, and will not recover. Density control is a start from few that
-#   adds where the picture pulls; where a good start is known, that is better.
+# - Look at the widths. Many at the cap may be too few Gaussians. Many at the floor: a
+#   start that was too narrow, and will not recover. Density control is a start from few
+#   that adds where the picture pulls; where a good start is known, that is better.
 # - The settings of size and speed (tiles, chunks, capacity, devices) leave the picture
 #   alone. Under `jit` the capacity is fixed: look at `overflowed` or at `demand`.

@@ -63,6 +63,7 @@ def test_render_writes_what_render_exact_gives(scene, tmp_path, capsys):
     said = capsys.readouterr()
     assert said.out.splitlines() == [str(out / f"view {i}.png") for i in (0, 1)]
     assert "views 2/2" in said.err
+    assert re.search(r"memory: about \d+ MB a view", said.err)
     names = sorted(path.name for path in out.iterdir())
     assert names == ["view 0.npy", "view 0.png", "view 1.npy", "view 1.png"]
     gaussians = gsjax.load(scene / "scene.ply")

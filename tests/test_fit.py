@@ -103,7 +103,9 @@ class Log:
         assert progress.metrics.step == state.step
         self.saved.append(int(state.step))
         if self.folder:
-            save_checkpoint(self.folder, state, {"pair_capacity": pair_capacity})
+            save_checkpoint(
+                self.folder, state, {"pair_capacity": pair_capacity, "seconds": 0.0}
+            )
 
     def measure(self, state, progress):
         assert progress.metrics.step == state.step
@@ -164,12 +166,14 @@ def test_stopped_and_taken_up_again(whole, strategy, stop_at, tmp_path):
     config, (wanted, full) = CONFIGS[strategy], whole[strategy]
     first, log = run(config, Log(stop_at))
     assert int(first.state.step) == stop_at
-    saved = save_checkpoint(tmp_path, first.state, {"pairs": first.pair_capacity})
+    saved = save_checkpoint(
+        tmp_path, first.state, {"pair_capacity": first.pair_capacity, "seconds": 0.0}
+    )
     found = load_latest(saved.parent)
     template = empty_state(config, EXTENT, VIEWS, found.meta["capacity"])
     state = restore(found, template)
     assert changed(state, first.state) == []
-    second, rest = run(config, state=state, pair_capacity=found.meta["pairs"])
+    second, rest = run(config, state=state, pair_capacity=found.meta["pair_capacity"])
     assert changed(second.state, wanted.state) == []
     names = ("step", "loss", "psnr", "gaussians", "wanted", "pairs", "capacity")
     assert log.told(*names) + rest.told(*names) == full.told(*names)

@@ -43,3 +43,11 @@ def test_a_bar_on_a_terminal(monkeypatch, capsys):
     reporter.close()
     assert "100/100" in told
     assert "0:00 left, loss" in told
+
+
+def test_that_there_may_be_no_more_is_said_once(capsys):
+    reporter = Reporter(CONFIG)
+    for wanted in (CONFIG.max_gaussians, *[CONFIG.max_gaussians + 1] * 2):
+        reporter.tell_if_full(wanted)
+    (told,) = capsys.readouterr().err.splitlines()
+    assert f"{CONFIG.max_gaussians + 1:,} Gaussians are wanted" in told

@@ -168,7 +168,7 @@ def test_the_same_options_again_go_on(made, monkeypatch):
     """They are the run's own: what the shell's history holds, and --resume."""
     data, run = made / "data", made / "again"
     options = ["--preset", "fast", "--steps", "2", "--max-gaussians", "40"]
-    options += ["--absgrad", "--test-images", "0.png"]
+    options += ["--antialias", "--test-images", "0.png"]
     trained = []
 
     def train(settings, folder, **_):

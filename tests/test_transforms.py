@@ -77,8 +77,11 @@ def test_scaled_rotation_is_divided_out(tmp_path):
     matrix = to_opengl(wanted)
     matrix[:3, :3] *= 2.5
     path = put(tmp_path, {"frames": [frame(matrix)] * 2, **PIXELS})
-    with pytest.warns(UserWarning, match=r"2 frames are scaled, .*0 \(× 2\.5\)"):
+    with pytest.warns(
+        UserWarning, match=r"2 frames are scaled, .*0 \(× 2\.5\)"
+    ) as told:
         entries = load_transforms(path)
+    assert told[0].filename == __file__, "who asked is who is told"
     viewmat = np.asarray(entries[0].camera.viewmat)
     np.testing.assert_allclose(viewmat, wanted, atol=1e-6)
 

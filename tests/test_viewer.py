@@ -259,8 +259,7 @@ def pictures_of_page(tmp_path):
 
     What is sent to it is a script, which the page runs before the next.
     """
-    from websockets.sync.client import connect
-
+    client = pytest.importorskip("websockets.sync.client", reason="needs viser")
     profile, browsers = tmp_path / "profile", []
 
     def look(url: str, size: str = "500,400"):
@@ -278,7 +277,7 @@ def pictures_of_page(tmp_path):
         address = f"http://127.0.0.1:{port.read_text().split()[0]}/json"
         targets = json.loads(urllib.request.urlopen(address, timeout=30).read())
         (target,) = (one for one in targets if one["type"] == "page")
-        with connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
+        with client.connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
 
             def told(method: str, **params) -> dict:
                 socket.send(json.dumps({"id": 0, "method": method, "params": params}))
@@ -364,7 +363,7 @@ def share_of(color, page) -> float:
 
 def first_with(color, pictures) -> np.ndarray:
     """The first of them with much of this colour: the browser takes its time."""
-    end = time.monotonic() + 60
+    end = time.monotonic() + 120
     for page in pictures:
         if share_of(color, page) > 0.1:
             return page
@@ -562,7 +561,7 @@ def test_a_training_is_shown_by_copies_of_its_own():
     np.testing.assert_array_equal(shown(), second)
     browser = Browser(viewer.window.url)
     wait_for(lambda: viewer.window.watched)
-    viewer.due = time.monotonic() + 60
+    viewer.due = time.monotonic() + 120
     after(3)  # too early again
     np.testing.assert_array_equal(shown(), second)
     viewer.due = 0.0

@@ -70,8 +70,12 @@ def dense(
     near = depth[order] + _ULPS * np.finfo(np.float32).eps * size
     behind = np.asarray(background, np.float64)
     there = (alpha > _SEEN)[..., None]
-    low = np.minimum(np.where(there, colors[:, None], np.inf).min(0), behind)
-    high = np.maximum(np.where(there, colors[:, None], -np.inf).max(0), behind)
+    low = np.minimum(
+        np.where(there, colors[:, None], np.inf).min(0, initial=np.inf), behind
+    )
+    high = np.maximum(
+        np.where(there, colors[:, None], -np.inf).max(0, initial=-np.inf), behind
+    )
     weight, left = _weights(alpha)
     picture = weight.T @ colors + left[:, None] * behind
     swappable = np.append(np.where(near[:-1] > depth[order][1:], 1.0, 0.0), 0)
@@ -84,7 +88,7 @@ def _weights(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """α T [N, P], and the T that is left [P]."""
     after = np.cumprod(1 - alpha, axis=0)
     before = np.concatenate([np.ones_like(after[:1]), after[:-1]])
-    return alpha * before, after[-1]
+    return alpha * before, np.prod(1 - alpha, axis=0)
 
 
 def allowed(

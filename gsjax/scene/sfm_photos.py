@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.files import opened, write_file
+from gsjax.files import read_bytes, write_file
 from gsjax.images import encode_png, opencv
 from gsjax.scene.image_files import find_mask
 from gsjax.scene.image_header import check_image
@@ -118,8 +118,7 @@ def read_upright(path: Path, grey: bool = False) -> np.ndarray:
         than any camera makes, which is found before they are taken.
     """
     cv2 = opencv()
-    with opened(path, "a photograph") as file:
-        data = file.read()
+    data = read_bytes(path, "a photograph")
     check_image(path, data)
     flag = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR
     pixels = None
@@ -164,7 +163,7 @@ def prepare_photos(
     if bad:
         raise InputError(
             f"{len(bad)} of {len(paths)} photos cannot be read; mend or remove: "
-            + "; ".join([*bad[:5], *["…"][: len(bad) - 5]])
+            + "; ".join([*bad[:5], *["…"] * (len(bad) > 5)])
         )
     return made
 

@@ -125,14 +125,14 @@ def pose_of(frame: Frame) -> tuple[np.ndarray, float]:
 
 
 def warn_of_scaled(path: Path, scaled: list[tuple[int, float]]) -> None:
-    """Warn, on behalf of the caller's caller, of frames with a scale divided out."""
+    """Warn, on behalf of who called the caller's caller, of scales divided out."""
     if scaled:
         first = ", ".join(f"{index} (× {scale:.6g})" for index, scale in scaled[:5])
         warnings.warn(
             f"{path}: the rotations of {len(scaled)} frames are scaled, the first: "
             f"{first}; the scale is divided out",
             UserWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

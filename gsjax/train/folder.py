@@ -236,11 +236,11 @@ def save_scene(
         save(path, gaussians.replace(params=params), overwrite=overwrite)  # pyright: ignore
 
 
-def finished_splat(folder: Path) -> Path:
-    """The Gaussians of a run that has come to its end.
+def saved_splat(folder: Path) -> Path:
+    """The Gaussians that a run has left: of its end, or of where it was stopped.
 
     Raises:
-      InputError: if it has not, with how far it is.
+      InputError: if it has left none yet, with how far it is.
     """
     files = run_files(folder)
     if not files.splat.exists():

@@ -18,12 +18,12 @@ from gsjax.train.fit import subset
 from gsjax.train.folder import (
     RunFiles,
     background_of,
-    finished_splat,
     load_data,
     load_scene,
     load_settings,
     refined_data,
     run_files,
+    saved_splat,
 )
 from gsjax.train.health import is_seen
 from gsjax.train.refined import refined_photos
@@ -50,7 +50,7 @@ def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
             f"no {which} views in this run; evaluate the others with --views "
             f"{'train' if which == 'test' else 'test'}"
         )
-    gaussians = load_scene(finished_splat(folder), data.scene.origin)
+    gaussians = load_scene(saved_splat(folder), data.scene.origin)
     scene = subset(data.scene, chosen)
     before = subset(given.scene, chosen).views
     photos = load_photos(before, settings.config.max_size)

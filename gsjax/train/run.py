@@ -188,6 +188,8 @@ def _keep_last(sitting: Sitting, error: Exception) -> None:
         note(f"the scene of step {start.step} is kept: {files.splat}")
     if not isinstance(error, DivergedError):  # else it would only do so again
         note(saved_text(files))
+    elif not any(files.checkpoints.glob("step_*.npz")):
+        note("no checkpoint was due before that (--checkpoint-every): nothing is kept")
 
 
 def _trained(

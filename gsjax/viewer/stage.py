@@ -114,7 +114,9 @@ def open_server(host: str, port: int) -> Any:
 def _asked_something(record: logging.LogRecord) -> bool:
     """Not who connects and goes without a word, as Chromium does; viser says the
     same, but only once a first has asked."""
-    return record.getMessage() != "opening handshake failed"
+    error = record.exc_info[1] if record.exc_info else None
+    silent = isinstance(getattr(error, "__cause__", None), EOFError)
+    return not (silent and record.getMessage() == "opening handshake failed")
 
 
 def _free_port(host: str, port: int) -> int:

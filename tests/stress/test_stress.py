@@ -184,4 +184,6 @@ def test_the_table_of_the_readme_is_that_of_the_results():
     worst = [rows[f"scenes/{n}"]["more"]["worst seed"] for n in ("image", "gradient")]
     assert tuple(worst) == WORST
     for case in run.CASES:
-        assert rows[case.name]["good"] or case.known, case.name
+        row = rows[case.name]
+        assert row["good"] or case.known, case.name
+        assert (row["claim"], row["bound"]) == (case.claim, case.bound), case.name
