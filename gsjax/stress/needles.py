@@ -259,6 +259,7 @@ CASES = (
         "largest |Δα|",
         1e-3,
         alpha_error(10_000, 10_000),
+        full_only=True,
         known="a direction known to 2^-24 is off by 1e-3 px, 10000 px away",
     ),
     Case("needles/gradient at 1000 px", "relative, 99 % point", 5e-3, gradient_error),

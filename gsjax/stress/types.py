@@ -32,7 +32,7 @@ class Case:
       measure: ``full`` → `Measured`; over more where ``full`` is set.
       unit: of the value.
       full_only: left out of the short form, for its time.
-      known: why it is outside its bound today and so left out of the short form.
+      known: why it is outside its bound in the full form, on some machines or all.
     """
 
     name: str
