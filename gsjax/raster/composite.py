@@ -31,12 +31,12 @@ _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
 def running_product(alpha: Array) -> tuple[Array, Array]:
     """(Π over all K, Π over those before k [G, K, P]) of 1 − alpha [G, K, P]."""
-    return _running(_pass, jnp.ones_like(alpha[:, :1]), alpha)
+    return _running(_pass, _pass_both, jnp.ones_like(alpha[:, :1]), alpha)
 
 
 def _running_sum(values: Array) -> tuple[Array, Array]:
     """(Σ over all K, Σ over those before k [G, K, P]) of values [G, K, P]."""
-    return _running(jnp.add, jnp.zeros_like(values[:, :1]), values)
+    return _running(jnp.add, _add_both, jnp.zeros_like(values[:, :1]), values)
 
 
 def _pass(product: Array, alpha: Array) -> Array:
@@ -44,8 +44,22 @@ def _pass(product: Array, alpha: Array) -> Array:
     return jnp.where(alpha < 0.5, product - product * alpha, product * (1 - alpha))
 
 
+def _pass_both(product: Array, first: Array, second: Array) -> Array:
+    """T (1 − α) (1 − β), which rounds T once: what both take is α + β − αβ."""
+    both = first + second * (1 - first)
+    product = jnp.where(both < 0.5, product, product * (1 - first))
+    return _pass(product, jnp.where(both < 0.5, both, second))
+
+
+def _add_both(total: Array, first: Array, second: Array) -> Array:
+    return total + first + second
+
+
 def _running(
-    add: Callable[[Array, Array], Array], none: Array, values: Array
+    add: Callable[[Array, Array], Array],
+    add_both: Callable[[Array, Array, Array], Array],
+    none: Array,
+    values: Array,
 ) -> tuple[Array, Array]:
     """(What all K come to, what those before k come to [G, K, P]), from ``none`` on.
 
@@ -60,7 +74,7 @@ def _running(
     so_far, before = none, []
     for first, second in zip(parts[::2], parts[1::2]):
         before.append(so_far)
-        so_far = add(add(so_far, first), second)
+        so_far = add_both(so_far, first, second)
     pairs = values.reshape(groups, -1, 2, pixels)
     first = lax.concatenate(before, 1)[:, :, None]
     is_first = lax.broadcasted_iota(jnp.int32, pairs.shape, 2) == 0
