@@ -54,17 +54,17 @@ def test_one_half_is_crossed_once():
 
 @pytest.mark.usefixtures("float32")
 @pytest.mark.parametrize(
-    ("largest", "bound"), [(0.004, 2.0), (0.2, 2.7), (0.6, 3.1), (1.0, 2.8)]
+    ("largest", "bound"), [(0.004, 1.3), (0.2, 1.9), (0.6, 2.7), (1.0, 2.7)]
 )
-def test_product_rounds_once_a_factor(largest, bound):
-    """The error of 32 factors, in roundings, is that of one rounding each."""
+def test_product_rounds_once_for_two_factors(largest, bound):
+    """The error of 32 factors, in roundings, is that of 16 roundings or little more."""
     alpha = np.random.default_rng(1).uniform(0, largest, (50, 32, 40))
     alpha = alpha.astype(np.float32)
     total, before = jax.jit(running_product)(alpha)
     exact = np.cumprod(1 - alpha.astype(np.float64), 1)
     for found, wanted in ((total, exact[:, -1]), (before[:, 1:], exact[:, :-1])):
         relative = np.abs(np.asarray(found) / wanted - 1)
-        assert relative.max() < 32 * 2.0**-24
+        assert relative.max() < 16 * 2.0**-24
         assert np.sqrt(np.mean(relative**2)) < bound * 2.0**-24
 
 

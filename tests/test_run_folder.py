@@ -189,3 +189,12 @@ def test_the_same_options_again_go_on(made, monkeypatch):
     assert cli.main(["train", str(data), "-o", str(run), "--resume"]) == 130
     assert trained == ["started", "gone on with", "gone on with"]
     assert cli.main([*args, "--seed", "1", "--resume"]) == 2
+
+
+def test_a_run_that_stopped_early_is_told_as_one(made, capsys):
+    assert cli.main(["eval", str(made / "run"), "--views", "train"]) == 0
+    assert "not at its end" not in capsys.readouterr().err
+    config = json.loads((made / "run" / "config.json").read_text())
+    change(made / "run" / "config.json", train={**config["train"], "steps": 8})
+    assert cli.main(["eval", str(made / "run"), "--views", "train"]) == 0
+    assert "not at its end: step 3 of 8 is" in capsys.readouterr().err

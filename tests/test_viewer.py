@@ -561,7 +561,7 @@ def test_a_training_is_shown_by_copies_of_its_own():
     np.testing.assert_array_equal(shown(), second)
     browser = Browser(viewer.window.url)
     wait_for(lambda: viewer.window.watched)
-    viewer.due = time.monotonic() + 120
+    viewer.due = time.monotonic() + 60
     after(3)  # too early again
     np.testing.assert_array_equal(shown(), second)
     viewer.due = 0.0

@@ -8,7 +8,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from gsjax.commands.common import HeavyCommand, start_jax
-from gsjax.console import decibels, say
+from gsjax.console import decibels, note, say
 
 
 @dataclass(kw_only=True)
@@ -24,11 +24,19 @@ class EvalCommand(HeavyCommand):
 
     def run(self) -> int:
         start_jax()
-        from gsjax.train.folder import run_files
+        from gsjax.train.checkpoint import latest_step
+        from gsjax.train.folder import load_settings, run_files
         from gsjax.train.held_out import evaluate_run
 
         summary = evaluate_run(self.folder, which=self.views)
         files = run_files(self.folder, self.views)
+        steps = load_settings(self.folder).config.steps
+        saved = latest_step(files.checkpoints)
+        if saved is not None and saved < steps:
+            note(
+                f"this run is not at its end: step {saved:,} of {steps:,} is its last "
+                "checkpoint"
+            )
         told = json.loads(files.eval.read_text(encoding="utf-8"))
         if self.json:
             say(json.dumps(told, indent=2))

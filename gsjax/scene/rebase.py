@@ -67,6 +67,6 @@ def _spread(positions: np.ndarray, middle: np.ndarray) -> float:
 
 def shifted(viewmat: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """[4, 4] world → camera of coordinates from which ``origin`` was subtracted."""
-    shifted = viewmat.copy()
-    shifted[:3, 3] += viewmat[:3, :3] @ origin
-    return shifted
+    moved = viewmat.copy()
+    moved[:3, 3] += viewmat[:3, :3] @ origin
+    return moved

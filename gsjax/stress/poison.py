@@ -1,8 +1,10 @@
 """Poison in every number of the parameters, the camera and the background.
 
 The law: images and gradients stay finite; what is not a number vanishes; and what is
-not seen leaves no trace, so that images and the gradients by each Gaussian are those,
-bit for bit, of the scene in which it does not exist.
+not seen leaves no trace, so that images and the gradients by each Gaussian and by the
+background are those, bit for bit, of the scene in which it does not exist. Gradients by
+the camera are sums over all Gaussians, whose order may change: those are held to the
+rounding of such sums.
 """
 
 from collections.abc import Iterator

@@ -29,7 +29,6 @@ CASES: tuple[Case, ...] = (
     *precision.CASES,
     *accuracy.CASES,
 )
-_BAR = r"\|"
 _MARKS = ("<!-- gsjax stress -->", "<!-- /gsjax stress -->")
 
 
@@ -108,8 +107,8 @@ def markdown(told: dict[str, Any]) -> str:
         measured, bound, ratio = _cells(row)
         mark = "" if row.good else " **(outside)**"
         cells = (row.name, row.claim, measured + mark, bound, ratio)
-        # A bare | would begin another cell.
-        lines.append(f"| {' | '.join(c.replace('|', _BAR) for c in cells)} |")
+        escaped = (cell.replace("|", r"\|") for cell in cells)  # a bare | ends a cell
+        lines.append(f"| {' | '.join(escaped)} |")
     for row in rows:
         if not row.good:
             lines += ["", f"{row.name}: {row.error or row.note}."]

@@ -94,6 +94,12 @@ def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Pa
     return path
 
 
+def latest_step(folder: Path) -> int | None:
+    """Of the last checkpoint in the folder, by its name; None where there is none."""
+    names = _files(folder)
+    return int(names[-1].stem.removeprefix("step_")) if names else None
+
+
 def _files(folder: Path) -> list[Path]:
     names = sorted(folder.glob("step_*.npz"))
     return [path for path in names if re.fullmatch(r"step_\d{9}\.npz", path.name)]

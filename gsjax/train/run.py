@@ -15,7 +15,7 @@ from gsjax.evaluation import Summary
 from gsjax.files import make_folder
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
-from gsjax.train.checkpoint import load_latest, restore
+from gsjax.train.checkpoint import latest_step, load_latest, restore
 from gsjax.train.config import TrainConfig
 from gsjax.train.fit import (
     Progress,
@@ -188,7 +188,7 @@ def _keep_last(sitting: Sitting, error: Exception) -> None:
         note(f"the scene of step {start.step} is kept: {files.splat}")
     if not isinstance(error, DivergedError):  # else it would only do so again
         note(saved_text(files))
-    elif not any(files.checkpoints.glob("step_*.npz")):
+    elif latest_step(files.checkpoints) is None:
         note("no checkpoint was due before that (--checkpoint-every): nothing is kept")
 
 

@@ -11,7 +11,7 @@ from gsjax.errors import InputError
 from gsjax.evaluation import Summary, summarise
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
-from gsjax.train.checkpoint import save_checkpoint
+from gsjax.train.checkpoint import latest_step, save_checkpoint
 from gsjax.train.config import TrainConfig
 from gsjax.train.fit import FitResult, Hooks, Progress, extent_of, subset
 from gsjax.train.folder import Data, RunFiles, save_scene
@@ -169,9 +169,8 @@ def evaluate(
 
 def saved_text(files: RunFiles) -> str:
     """From where a run that was cut short can be gone on with."""
-    kept = sorted(files.checkpoints.glob("step_*.npz"))
-    if kept:
-        step = int(kept[-1].stem.removeprefix("step_"))
+    step = latest_step(files.checkpoints)
+    if step is not None:
         return f"step {step} is saved; go on with --resume"
     if files.config.exists():
         return "no step is saved yet; --resume starts from the beginning"
