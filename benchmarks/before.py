@@ -1,0 +1,99 @@
+"""Claim: held-out views are as good as before in half the time.
+
+``python benchmarks/before.py COMMIT DATASET [IMAGE …]`` trains on the photographs of
+the demo as `gsjax demo` does, and on DATASET with `--preset fast`, the named images
+held out (else every 8th), both with the code of COMMIT and with that which is here, in
+processes that have nothing compiled. Kept is after how many seconds a PSNR of the
+held-out views was passed: compiling counts, measuring and loading do not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import measure
+
+ROOT = Path(__file__).parents[1]
+# As `gsjax demo`, but for measuring on the way.
+DEMO = """
+import sys
+from pathlib import Path
+from gsjax import demo
+from gsjax.commands.common import start_jax
+start_jax()
+usual = demo.demo_config
+demo.demo_config = lambda *given: usual(*given).replace(every_eval=20)
+demo.run_demo(Path(sys.argv[1]), demo.DemoSettings(), overwrite=False)
+"""
+
+
+def code_of(commit: str, folder: Path) -> Path:
+    """The package as it was then, in the folder."""
+    packed = subprocess.run(
+        ["git", "archive", commit, "gsjax"], cwd=ROOT, check=True, capture_output=True
+    )
+    folder.mkdir()
+    subprocess.run(["tar", "-x", "-C", folder], input=packed.stdout, check=True)
+    return folder
+
+
+def trained(code: Path, arguments: list[str], run: Path) -> list[dict]:
+    """What one run with that code came to, measurement by measurement."""
+    cold = {"JAX_ENABLE_COMPILATION_CACHE": "false", "PYTHONPATH": str(code)}
+    command = [sys.executable, *arguments]
+    subprocess.run(command, check=True, cwd=code, env={**os.environ, **cold})
+    lines = (run / "held_out.jsonl").read_text().splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def passed(found: list[dict], psnr: float) -> float:
+    """Seconds until it was."""
+    return next(row["seconds"] for row in found if row["psnr"] >= psnr)
+
+
+def compared(scene: str, before: list[dict], now: list[dict]) -> list[dict]:
+    """Seconds to the last three whole decibels that both come to."""
+    most = int(min(max(row["psnr"] for row in found) for found in (before, now)))
+    rows = []
+    for psnr in range(most - 2, most + 1):
+        old, new = passed(before, psnr), passed(now, psnr)
+        row = {"scene": scene, "psnr": psnr, "seconds before": old, "seconds": new}
+        rows.append({**row, "ratio": new / old})
+    return rows
+
+
+def main(commit: str, dataset: Path, held_out: list[str]) -> None:
+    """Measure and save."""
+    options = ["-m", "gsjax.cli", "train", str(dataset.resolve())]
+    options += ["--preset", "fast", "--eval-every", "50"]
+    if held_out:
+        options += ["--test-images", *held_out]
+    rows, curves = [], {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        codes = {"before": code_of(commit, folder / "code"), "now": ROOT}
+        for state, code in codes.items():
+            demo, run = folder / f"demo_{state}", folder / f"run_{state}"
+            turned = ["-c", DEMO, str(demo)]
+            curves[f"demo {state}"] = trained(code, turned, demo / "run")
+            arguments = [*options, "-o", str(run)]
+            curves[f"{dataset.name} {state}"] = trained(code, arguments, run)
+    for scene in ("demo", dataset.name):
+        rows += compared(scene, curves[f"{scene} before"], curves[f"{scene} now"])
+    more = {"commit": commit, "held out": held_out, "curves": curves}
+    measure.save("before", rows, claim=__doc__, **more)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("commit")
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("images", nargs="*")
+    given = parser.parse_args()
+    main(given.commit, given.dataset, given.images)
