@@ -7,9 +7,6 @@ from starting Python to the turntable. PSNR and SSIM are of the five held-out vi
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -18,25 +15,24 @@ import measure
 
 from gsjax.demo import demo_files
 from gsjax.train.folder import run_files
+from gsjax.train.history import read_metrics
 
 
 def main() -> None:
     """Measure and save."""
-    cold = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"}
     with tempfile.TemporaryDirectory() as folder:
         files = demo_files(Path(folder) / "demo")
-        command = [sys.executable, "-m", "gsjax.cli", "demo", "-o", f"{folder}/demo"]
         begun = time.perf_counter()
-        subprocess.run(command, check=True, env=cold)
+        measure.run_cold(["-m", "gsjax.cli", "demo", "-o", f"{folder}/demo"])
         seconds = time.perf_counter() - begun
         found = json.loads(run_files(files.run).eval.read_text())
-        logged = run_files(files.run).metrics.read_text().splitlines()[-1]
+        logged = read_metrics(run_files(files.run).metrics)[-1]
         turntable = files.turntable.stat().st_size
     row = {
         "seconds": seconds,
         "psnr": found["psnr"],
         "ssim": found["ssim"],
-        **{k: json.loads(logged)[k] for k in ("gaussians", "compile_seconds")},
+        **{k: logged[k] for k in ("gaussians", "compile_seconds")},
         "turntable bytes": turntable,
     }
     measure.save("demo", [row], claim=__doc__)

@@ -1,7 +1,10 @@
-"""Where results go; timing is `gsjax.timing`."""
+"""Where results go, and cold processes; timing is `gsjax.timing`."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 from gsjax import files
@@ -10,6 +13,15 @@ from gsjax.timing import machine as machine
 from gsjax.timing import time_ms as time_ms
 
 RESULTS = Path(__file__).with_name("results")
+
+
+def run_cold(arguments: list[str], code: Path | None = None) -> None:
+    """Python in a process that has nothing compiled, with the package in ``code``."""
+    changes = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+    if code is not None:
+        changes["PYTHONPATH"] = str(code)
+    command = [sys.executable, *arguments]
+    subprocess.run(command, check=True, cwd=code, env={**os.environ, **changes})
 
 
 def save(name: str, rows: list[dict], **more) -> None:

@@ -6,9 +6,6 @@ another, each in a kernel of its own that has nothing compiled.
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -19,16 +16,11 @@ NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
 def main() -> None:
     """Measure and save."""
-    cold = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"}
     rows = []
     for path in sorted(NOTEBOOKS.glob("*.ipynb")):
         options = ["-q", "-W", "default", "-p", "no:cacheprovider", "--nbmake", "-n0"]
         begun = time.perf_counter()
-        subprocess.run(
-            [sys.executable, "-m", "pytest", *options, "--timeout=900", str(path)],
-            check=True,
-            env=cold,
-        )
+        measure.run_cold(["-m", "pytest", *options, "--timeout=900", str(path)])
         rows.append({"notebook": path.stem, "seconds": time.perf_counter() - begun})
     measure.save("notebooks", rows, claim=__doc__)
 

@@ -11,9 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -22,6 +19,8 @@ import numpy as np
 
 from gsjax import files, images
 from gsjax.curves import Series, curves
+from gsjax.train.folder import run_files
+from gsjax.train.history import read_metrics
 
 EVERY = 50
 STRATEGIES = ("mcmc", "adaptive")
@@ -31,19 +30,13 @@ def train(
     dataset: Path, held_out: list[str], strategy: str, steps: int | None, run: Path
 ) -> None:
     """One run, from a cold start."""
-    program = [sys.executable, "-m", "gsjax.cli", "train", str(dataset), "-o", str(run)]
+    program = ["-m", "gsjax.cli", "train", str(dataset), "-o", str(run)]
     options = ["--preset", "fast", "--strategy", strategy, "--eval-every", str(EVERY)]
     if steps is not None:
         options += ["--steps", str(steps)]
     if held_out:
         options += ["--test-images", *held_out]
-    cold = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
-    subprocess.run([*program, *options], check=True, env={**os.environ, **cold})
-
-
-def lines(path: Path) -> list[dict]:
-    """Of a `.jsonl`."""
-    return [json.loads(line) for line in path.read_text().splitlines()]
+    measure.run_cold([*program, *options])
 
 
 def kept(path: Path, held_out: list[str], new: list[str]) -> list[dict]:
@@ -67,8 +60,8 @@ def main(
         for strategy in strategies:
             run = Path(folder) / strategy
             train(dataset, held_out, strategy, steps, run)
-            found = lines(run / "held_out.jsonl")
-            logged = lines(run / "metrics.jsonl")[-1]
+            found = read_metrics(run_files(run).held_out)
+            logged = read_metrics(run_files(run).metrics)[-1]
             last = {key: logged[key] for key in ("compilations", "compile_seconds")}
             rows += [{"strategy": strategy + more, **record} for record in found]
             rows[-1] |= {**last, "date": machine["date"]}

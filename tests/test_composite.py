@@ -56,8 +56,8 @@ def test_one_half_is_crossed_once():
 @pytest.mark.parametrize(
     ("largest", "bound"), [(0.004, 1.3), (0.2, 1.9), (0.6, 2.7), (1.0, 2.7)]
 )
-def test_product_rounds_once_for_two_factors(largest, bound):
-    """The error of 32 factors, in roundings, is that of 16 roundings or little more."""
+def test_product_rounds_less_than_once_a_factor(largest, bound):
+    """The error of 32 factors, in roundings: two small ones round once together."""
     alpha = np.random.default_rng(1).uniform(0, largest, (50, 32, 40))
     alpha = alpha.astype(np.float32)
     total, before = jax.jit(running_product)(alpha)

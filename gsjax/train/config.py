@@ -279,9 +279,8 @@ def _fast() -> TrainConfig:
         levels=(Level(0.0, 2), Level(0.25, 1)),
         sh_degree=1,
         sh_every=500,
-        # Those of the papers are for 30 000 steps. With a nineteenth of them, about
-        # √19 times as much gets farther, and sooner: a step of Adam is one rate long,
-        # and noise adds up as the root of their number.
+        # Those of the papers are for 30 000 steps. So many times more than here, 19,
+        # are a walk √19 times as long, and rates of about √19 make up for it.
         rates=Rates().times(4.0),
         # Edits set a run back for a while: few, and early enough to settle after.
         adaptive=AdaptiveSettings(
