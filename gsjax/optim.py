@@ -14,6 +14,7 @@ from gsjax.gaussians import GaussianParams
 
 Array = jax.Array
 _ADAM = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-15)
+_COOLING_FROM = 0.6  # of the run
 
 
 class Rates(NamedTuple):
@@ -22,8 +23,10 @@ class Rates(NamedTuple):
     Attributes:
       means: at the first and the last step, log-linear between, both above 0 or
         equal; times the extent of the scene.
-      log_scales, quats, logit_opacities: constant.
+      log_scales, quats, logit_opacities: of each number.
       sh_dc, sh_rest: of degree 0, and of all above.
+      cooling: share of all but the means' that is left at the last step: constant to
+        60 % of the run, log-linear from there; 1 is constant throughout.
     """
 
     means: tuple[float, float] = (1.6e-4, 1.6e-6)
@@ -32,12 +35,13 @@ class Rates(NamedTuple):
     logit_opacities: float = 0.05
     sh_dc: float = 2.5e-3
     sh_rest: float = 1.25e-4
+    cooling: float = 1.0
 
     def times(self, factor: float) -> "Rates":
-        """All of them, multiplied."""
+        """All rates, multiplied; the cooling as it was."""
         first, last = self.means
-        rest = (factor * rate for rate in self[1:])
-        return Rates((factor * first, factor * last), *rest)
+        rest = (factor * rate for rate in self[1:-1])
+        return Rates((factor * first, factor * last), *rest, self.cooling)
 
 
 def means_rate(rates: Rates, fraction: Array, extent: float | Array) -> Array:
@@ -47,6 +51,12 @@ def means_rate(rates: Rates, fraction: Array, extent: float | Array) -> Array:
     if first == last:  # (0, 0) holds the means where they are
         return extent * first * jnp.ones_like(fraction)
     return extent * first * (last / first) ** fraction
+
+
+def cooled(rates: Rates, fraction: Array) -> Array:
+    """Share of the rates but the means' that is left at ``fraction`` of the run."""
+    late = (jnp.clip(fraction, 0, 1) - _COOLING_FROM) / (1 - _COOLING_FROM)
+    return rates.cooling ** jnp.maximum(late, 0)
 
 
 def init_moments(params: GaussianParams) -> optax.ScaleByAdamState:
@@ -74,13 +84,14 @@ def adam_step(
     updates, moments = _ADAM.update(grads, moments)  # pyright: ignore
     bases = params.sh.shape[-2]
     by_band = jnp.where(jnp.arange(bases) == 0, rates.sh_dc, rates.sh_rest)
+    share = cooled(rates, fraction)
     rate = GaussianParams(
         **{
             "means": means_rate(rates, fraction, extent),
-            "quats": rates.quats,
-            "log_scales": rates.log_scales,
-            "logit_opacities": rates.logit_opacities,
-            "sh": by_band[:, None],
+            "quats": share * rates.quats,
+            "log_scales": share * rates.log_scales,
+            "logit_opacities": share * rates.logit_opacities,
+            "sh": share * by_band[:, None],
         }
     )
     moved = jax.tree.map(

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from gsjax.gaussians import GaussianParams
-from gsjax.optim import Rates, adam_step, init_moments, means_rate
+from gsjax.optim import Rates, adam_step, cooled, init_moments, means_rate
 
 COUNT, EXTENT, STEPS = 5, 3.0, 7
-RATES = Rates(means=(2e-3, 5e-5), quats=3e-3)
+RATES = Rates(means=(2e-3, 5e-5), quats=3e-3, cooling=0.2)
 SHAPES = {
     "means": (3,),
     "quats": (4,),
@@ -35,9 +35,10 @@ def rate_of(name, fraction):
         first, last = RATES.means
         logs = (1 - fraction) * np.log(first) + fraction * np.log(last)
         return EXTENT * np.exp(logs)
+    share = 1 if fraction < 0.6 else 0.2 ** ((fraction - 0.6) / 0.4)
     if name == "sh":
-        return np.where(np.arange(9) == 0, RATES.sh_dc, RATES.sh_rest)[:, None]
-    return getattr(RATES, name)
+        return share * np.where(np.arange(9) == 0, RATES.sh_dc, RATES.sh_rest)[:, None]
+    return share * getattr(RATES, name)
 
 
 def test_is_plain_adam():
@@ -86,6 +87,14 @@ def test_schedule_of_the_means():
         assert held == pytest.approx(rate * EXTENT)
 
 
+def test_schedule_of_the_others():
+    """Constant, then log-linear to the share that is left; exactly 1 without cooling."""
+    fractions = jnp.asarray([0.0, 0.3, 0.6, 0.8, 1.0, 1.5])
+    wanted = [1.0, 1.0, 1.0, np.sqrt(0.2), 0.2, 0.2]
+    np.testing.assert_allclose(cooled(RATES, fractions), wanted, rtol=1e-6)
+    assert (cooled(Rates(), fractions) == 1).all()
+
+
 @pytest.mark.parametrize("garbage", [0.0, -1.5, np.nan, np.inf, 1e30])
 def test_without_gradient_nothing_moves(garbage):
     """Inactive slots: gradient and moments are zero, the contents anything."""
@@ -114,8 +123,8 @@ def test_without_gradient_nothing_moves(garbage):
 
 
 def test_times_multiplies_every_rate():
-    rates = Rates().times(3.0)
-    for found, one in zip(jax.tree.leaves(rates), jax.tree.leaves(Rates())):
+    rates = RATES.times(3.0)
+    assert rates.cooling == RATES.cooling
+    for found, one in zip(jax.tree.leaves(rates[:-1]), jax.tree.leaves(RATES[:-1])):
         assert found == pytest.approx(3 * one)
-    assert rates._fields == Rates()._fields
     assert isinstance(rates.means, tuple)
