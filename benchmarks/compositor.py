@@ -26,16 +26,17 @@ import numpy as np  # noqa: E402
 import scenes  # noqa: E402
 import yardstick  # noqa: E402
 from jax import lax  # noqa: E402
-from jax.sharding import Mesh, PartitionSpec  # noqa: E402
+from jax.sharding import Mesh, NamedSharding, PartitionSpec  # noqa: E402
 
 from gsjax.raster import bins, schedules  # noqa: E402
 from gsjax.raster.alpha import alphas, pixel_centres  # noqa: E402
-from gsjax.raster.composite import (  # noqa: E402
-    composite,
-    gather_chunks,
+from gsjax.raster.blend import (  # noqa: E402
+    parts_of,
+    rows_of,
     running_product,
     splats_of,
 )
+from gsjax.raster.composite import composite, corners, take_rows  # noqa: E402
 from gsjax.raster.order import depth_order  # noqa: E402
 from gsjax.raster.project import conics_of, project  # noqa: E402
 
@@ -46,7 +47,8 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     devices = jax.local_device_count()
     grid = bins.make_grid(camera.width, camera.height, config.tile_size, devices)
     group = schedules.tiles_per_step(config, grid, jax.default_backend())
-    room = -(-config.pair_capacity // devices)
+    pairs, chunk = -(-config.pair_capacity // devices), config.chunk_size
+    steps = schedules.step_capacity(pairs, grid, group, chunk)
     mesh = Mesh(np.array(jax.local_devices()), ("tiles",))
     index = jnp.arange(devices, dtype=jnp.int32)
 
@@ -75,33 +77,27 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
 
     def bin_local(device, projected):
         spans = bins.row_spans(projected, grid, device)
-        lists = bins.make_lists(projected, spans, grid, device, room)
-        schedule = schedules.make_schedule(lists.length, grid, group, config.chunk_size)
-        return lists, schedule
-
-    def work_of(lists, schedule, ranks):
-        count = schedules.step_capacity(room, grid, group, config.chunk_size)
-        steps = schedules.make_steps(lists, schedule, count)
-        chunk = config.chunk_size
-        return schedules.make_work(lists, schedule, steps, chunk, ranks, count)
+        lists = bins.make_lists(projected, spans, grid, device, pairs)
+        return lists, schedules.make_schedule(lists, grid, group, chunk, steps)
 
     def composite_local(device, projected, lists, schedule):
-        ranks = projected.u.shape[0]
-        work = work_of(lists, schedule, ranks)
-        return composite(projected, work, schedule, grid, device, config)
+        return composite(projected, lists, schedule, device, grid, steps, config)
 
     def count_local(device, projected, lists, schedule):
         """[steps] each: evaluations made, and those of them that change the image."""
-        ranks = projected.u.shape[0]
-        work = work_of(lists, schedule, ranks)
-        chunks = gather_chunks(projected, work, schedule.tiles, grid, device, config)
+        rows = rows_of(projected, config)
+        unrolled = schedules.make_steps(schedule, steps)
+        none = projected.u.shape[0]
+        work = schedules.make_work(lists, schedule, unrolled, chunk, none, steps)
         pixels = pixel_centres(grid.tile, projected.u.dtype)
 
         def step(carried, inputs):
-            first, live, chunk = inputs
+            first, live, block, ranks = inputs
+            corner = corners(schedule.tiles[block], grid, device, rows)
+            splats = parts_of(take_rows(rows, ranks), config).splats
             carried = jnp.where(first, 1, carried)
             go = live & jnp.any(carried > config.stop)
-            alpha = alphas(splats_of(chunk), pixels, config)
+            alpha = alphas(splats_of(splats, corner), pixels, config)
             total, before = running_product(alpha)
             reached = carried[:, None] * before
             if config.stop_rule == "before":
@@ -110,13 +106,16 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
             return carried * total, (go * alpha.size, go * jnp.sum(blended))
 
         open_ = jnp.ones((group, pixels.shape[1]), projected.u.dtype)
-        return lax.scan(step, open_, (work.first, work.live, chunks))[1]
+        inputs = (work.first, work.live, work.block, work.ranks)
+        return lax.scan(step, open_, inputs)[1]
 
     binning = jax.jit(spread(bin_local, False))
     counting = jax.jit(spread(count_local, False, True, True))
     spread_composite = spread(composite_local, False, True, True)
     compositing = jax.jit(spread_composite)
+    # On every device beforehand, as within one program.
     projected = projected_of(gaussians, camera)
+    projected = jax.device_put(projected, NamedSharding(mesh, PartitionSpec()))
     lists, schedule = binning(projected)
     image = compositing(projected, lists, schedule)
     cotangent = jax.random.normal(jax.random.key(0), image["sums"].shape)

@@ -26,15 +26,19 @@ def time_ms(function: Callable[[], Any], repeats: int = 9) -> list[float]:
 def interleaved(
     functions: Mapping[str, Callable[[], Any]], repeats: int = 9
 ) -> dict[str, float]:
-    """Median ms of each function, all taken in turn: A B C A B C …
+    """Median ms of each function, all taken in turn, in a new order each round: A B C
+    C A B …
 
-    So that a drift of a shared machine falls on all of them and ratios hold.
+    So that a drift of a shared machine, and what one leaves in the caches for the next,
+    fall on all of them and ratios hold.
     """
     for function in functions.values():
         jax.block_until_ready(function())
     times: dict[str, list[float]] = {name: [] for name in functions}
+    rng = np.random.default_rng(0)
     for _ in range(repeats):
-        for name, function in functions.items():
+        for place in rng.permutation(len(functions)):
+            name, function = list(functions.items())[place]
             start = time.perf_counter()
             jax.block_until_ready(function())
             times[name].append(1e3 * (time.perf_counter() - start))

@@ -12,6 +12,7 @@ from conftest import ALL, BACKGROUND, COMPAT, COUNT, camera_of, cast, render, sc
 from pictures import images, largest_difference
 
 import gsjax
+from gsjax.raster.batches import any_of_batch, least_of_batch
 
 pytestmark = pytest.mark.new_emitters
 
@@ -54,3 +55,59 @@ def test_a_batch_of_one(report):
     report("batch of one", error, 1e-6)
     assert error <= 1e-6
     assert batch.demand == wanted.demand
+
+
+@pytest.mark.parametrize(("dtype", "bar"), [(jnp.float32, 1e-6), (jnp.float64, 4e-15)])
+@pytest.mark.parametrize("config", [COMPAT, COMPAT.replace(chunk_size=3, stop=0.3)])
+def test_a_derivative_changes_no_image(config, dtype, bar, report):
+    """With one the lists are gone through in another way; see `composite`."""
+    gaussians, camera = cast(scene_of("random"), dtype)
+    background = jnp.asarray(BACKGROUND, dtype)
+
+    def picture(params):
+        view = gsjax.render(
+            gaussians.replace(params=params), camera, config, background
+        )
+        return view._replace(demand=None, overflowed=None, radii=None)
+
+    @jax.jit
+    def both(params):
+        return picture(params), jax.jvp(picture, (params,), (params,))[0]
+
+    plain, derived = both(gaussians.params)
+    error = largest_difference(derived, plain)
+    report(f"stop {config.stop}, {dtype.__name__}", error, bar)
+    assert error <= bar
+    assert np.abs(plain.rgb).max() > 0.1
+
+
+def test_a_batch_decides_as_one():
+    """By the flag that any has, and the least index; alone, by its own."""
+    for flags in ([False, True, False], [False, False]):
+        found = jax.vmap(any_of_batch)(jnp.asarray(flags))
+        np.testing.assert_array_equal(found, [any(flags)] * len(flags))
+        for flag in flags:
+            assert any_of_batch(jnp.asarray(flag)) == flag
+    index = jnp.asarray([3, 1, 2])
+    np.testing.assert_array_equal(jax.vmap(least_of_batch)(index), [1, 1, 1])
+    assert least_of_batch(index[0]) == 3
+
+
+def test_a_batch_takes_one_branch():
+    """What a batch decides as one is a branch still, where `lax.cond` takes both."""
+    taken = []
+
+    def count(x):
+        jax.debug.callback(lambda: taken.append(1))
+        return x + 1
+
+    @jax.vmap
+    def one(x):
+        return jax.lax.cond(any_of_batch(x > 5), count, lambda x: x, x)
+
+    for x, wanted in (([1.0, 2.0], False), ([1.0, 9.0], True)):
+        taken.clear()
+        out = one(jnp.asarray(x))
+        jax.effects_barrier()
+        assert bool(taken) == wanted
+        np.testing.assert_array_equal(out, np.asarray(x) + wanted)

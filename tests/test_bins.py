@@ -198,10 +198,10 @@ def test_schedule_covers_every_chunk_once():
     """Steps hold each pair exactly once, blocks in order, front to back."""
     chunk, group = 8, 4
     grid, _, lists = lists_of("random", 8)
-    schedule = schedules.make_schedule(jnp.asarray(lists.length), grid, group, chunk)
     room = schedules.step_capacity(CAPACITY, grid, group, chunk)
     lists = jax.tree.map(jnp.asarray, lists)
-    steps = schedules.make_steps(lists, schedule, room)
+    schedule = schedules.make_schedule(lists, grid, group, chunk, room)
+    steps = schedules.make_steps(schedule, room)
     work = schedules.make_work(lists, schedule, steps, chunk, COUNT, room)
     ranks, block = np.asarray(work.ranks), np.asarray(work.block)
     live, first = np.asarray(work.live), np.asarray(work.first)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from gsjax import RasterConfig
-from gsjax.raster import composite
 from gsjax.raster.alpha import pixel_centres
-from gsjax.raster.composite import Chunk, running_product
+from gsjax.raster.blend import Chunk, Parts, blend_chunk, running_product
 
 pytestmark = pytest.mark.as_users
 
@@ -23,15 +22,15 @@ def blend(alpha, carried):
     config = RasterConfig(outputs=("rgb", "median_depth"), tile_size=TILE)
     one = jnp.ones((TILES, SPLATS, 1), alpha.dtype)
     flat = jnp.zeros((TILES, SPLATS, 5), alpha.dtype)
-    chunk = Chunk(
+    parts = Parts(
         splats=jnp.concatenate([flat, alpha[..., None]], -1),
         channels=one,
-        corner=jnp.zeros((TILES, 2), alpha.dtype),
         depth=one,
         probe=None,
     )
+    chunk = Chunk(parts, corner=jnp.zeros((TILES, 2), alpha.dtype))
     pixels = pixel_centres(TILE, alpha.dtype)
-    left, out = composite._blend(carried, chunk, pixels=pixels, config=config)
+    left, out = blend_chunk(carried, chunk, pixels, config)
     return left, out["median"]
 
 

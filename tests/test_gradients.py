@@ -22,7 +22,7 @@ from conftest import (
 
 import gsjax
 from gsjax.raster.alpha import alphas, pixel_centres
-from gsjax.raster.composite import (
+from gsjax.raster.blend import (
     channel_sums,
     running_product,
     transmittance,
@@ -253,6 +253,19 @@ def test_features(report):
     error = abs(slope - (ahead - behind)) / abs(slope)
     report("features", error, 1e-10)
     assert error <= 1e-10
+
+
+@pytest.mark.parametrize("names", [("sh",), ("means", "viewmat"), ("background",)])
+def test_gradients_by_some_are_those_by_all(names, report):
+    """What is not differentiated by is left out, and changes nothing."""
+    point = base_point()
+    some = {name: point[name] for name in names}
+    by_some = jax.jit(jax.grad(lambda some: loss({**point, **some}, COMPAT)))(some)
+    for name, wanted in gradient(point, COMPAT).items():
+        if name in names:
+            error = np.linalg.norm(by_some[name] - wanted) / np.linalg.norm(wanted)
+            report(name, error, 1e-12)
+            assert error <= 1e-12, name
 
 
 def test_gradients_of_a_batch_are_the_sum(report):

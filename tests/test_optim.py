@@ -88,7 +88,7 @@ def test_schedule_of_the_means():
 
 
 def test_schedule_of_the_others():
-    """Constant, then log-linear to the share that is left; exactly 1 without cooling."""
+    """Constant, then log-linear to the share left; exactly 1 without cooling."""
     fractions = jnp.asarray([0.0, 0.3, 0.6, 0.8, 1.0, 1.5])
     wanted = [1.0, 1.0, 1.0, np.sqrt(0.2), 0.2, 0.2]
     np.testing.assert_allclose(cooled(RATES, fractions), wanted, rtol=1e-6)

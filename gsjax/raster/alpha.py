@@ -104,8 +104,7 @@ def collect_absolute(
 
     As the gradient by ``probe`` [G, K, 2] comes Σ over pixels of |∂L/∂mean|.
     """
-    slopes = _slopes_by_mean(*lax.stop_gradient((alpha, splats)), pixels, config)
-    return _collect(alpha, slopes, probe)
+    return _collect(alpha, splats, probe, pixels, config)
 
 
 def _slopes_by_mean(alpha, splats, pixels, config) -> tuple[Array, Array]:
@@ -116,21 +115,22 @@ def _slopes_by_mean(alpha, splats, pixels, config) -> tuple[Array, Array]:
     return free * (inv_sx * y1 - inv_sy * slope * y2), free * inv_sy * y2
 
 
-@jax.custom_vjp
-def _collect(alpha: Array, slopes: tuple[Array, Array], probe: Array) -> Array:
+@partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _collect(alpha, splats, probe, pixels, config) -> Array:
     """``alpha``; the probe receives the sums of |slope · cotangent|."""
-    del slopes, probe
+    del splats, probe, pixels, config
     return alpha
 
 
-def _collect_forward(alpha, slopes, probe):
+def _collect_forward(alpha, splats, probe, pixels, config):
     del probe
-    return alpha, slopes
+    return alpha, _slopes_by_mean(alpha, splats, pixels, config)
 
 
-def _collect_backward(slopes, cotangent):
+def _collect_backward(pixels, config, slopes, cotangent):
+    del pixels, config
     sums = [jnp.sum(jnp.abs(slope * cotangent), -1) for slope in slopes]
-    return cotangent, jax.tree.map(jnp.zeros_like, slopes), jnp.stack(sums, -1)
+    return cotangent, None, jnp.stack(sums, -1)
 
 
 _collect.defvjp(_collect_forward, _collect_backward)

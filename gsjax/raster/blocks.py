@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from gsjax.raster.batches import any_of_batch
 from gsjax.raster.types import Array
 
 T = TypeVar("T")
@@ -62,7 +63,7 @@ def by_blocks(
         return jnp.pad(a, fill).reshape(blocks, block, *a.shape[1:])
 
     def one(part):
-        return lax.cond(jnp.any(part[0]), run, skip, *part)
+        return lax.cond(any_of_batch(jnp.any(part[0])), run, skip, *part)
 
     out = lax.map(one, jax.tree.map(split, (needed, inputs)))
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:size], out)

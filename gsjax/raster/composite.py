@@ -1,251 +1,184 @@
 """Front-to-back compositing of sorted tile lists, chunk by chunk.
 
-    C = Σ_k c_k α_k T_k,   T_k = Π_{j<k} (1 − α_j)
-
 Axis legend: S steps, G tiles of a step, K Gaussians of a chunk, P pixels of a tile,
-C channels (colour, then depth where asked for, then ones, whose sum is alpha).
+C channels, R ranks.
 
-How it is laid out, and why (measured on two cores): α is one elementwise kernel, and
-its derivative one matrix product (`gsjax.raster.alpha`). The sums over colours are
-matrix products both ways, each with its operands as XLA wants them. What is left is the
-running product. Chunks are recomputed in the backward pass instead of kept. A chunk
-behind pixels that have all stopped is skipped, in both directions, by `lax.cond`.
+There are two ways through the lists, and both blend the same chunks in the same order
+(`gsjax.raster.blend`). Where no derivative is taken, a block of tiles goes on for as
+long as there are chunks and pixels that have not stopped, and each chunk is gathered
+when it is due: nothing is kept, and nothing is paid for room. Loops of unknown length
+have no transpose, so where a derivative is taken the steps are a `lax.scan` over all
+there is room for, with the chunks gathered ahead. There chunks are recomputed in the
+backward pass instead of kept, and those behind pixels that have all stopped are
+skipped, in both directions, by `lax.cond`.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
+from jax.custom_batching import sequential_vmap
+from jax.custom_derivatives import SymbolicZero
 
-from gsjax.raster.alpha import alphas, collect_absolute, pixel_centres
-from gsjax.raster.bins import Grid, tile_origins
-from gsjax.raster.schedules import Schedule, Work
+from gsjax.raster.alpha import pixel_centres
+from gsjax.raster.batches import any_of_batch
+from gsjax.raster.bins import Grid, Lists, tile_origins
+from gsjax.raster.blend import Chunk, blend_chunk, parts_of, rows_of
+from gsjax.raster.ladder import on_ladder
+from gsjax.raster.schedules import (
+    Schedule,
+    Work,
+    make_steps,
+    make_work,
+    ranks_at,
+)
 from gsjax.raster.types import Array, Projected, RasterConfig
 
-_einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
+T = TypeVar("T")
 
 
-def running_product(alpha: Array) -> tuple[Array, Array]:
-    """(Π over all K, Π over those before k [G, K, P]) of 1 − alpha [G, K, P]."""
-    return _running(_pass, _pass_both, jnp.ones_like(alpha[:, :1]), alpha)
-
-
-def _running_sum(values: Array) -> tuple[Array, Array]:
-    """(Σ over all K, Σ over those before k [G, K, P]) of values [G, K, P]."""
-    return _running(jnp.add, _add_both, jnp.zeros_like(values[:, :1]), values)
-
-
-def _pass(product: Array, alpha: Array) -> Array:
-    """T (1 − α): as T − T α where that rounds less; from a half on 1 − α is exact."""
-    return jnp.where(alpha < 0.5, product - product * alpha, product * (1 - alpha))
-
-
-def _pass_both(product: Array, first: Array, second: Array) -> Array:
-    """T (1 − α) (1 − β), which rounds T once: what both take is α + β − αβ."""
-    both = first + second * (1 - first)
-    product = jnp.where(both < 0.5, product, product * (1 - first))
-    return _pass(product, jnp.where(both < 0.5, both, second))
-
-
-def _add_both(total: Array, first: Array, second: Array) -> Array:
-    return total + first + second
-
-
-def _running(
-    add: Callable[[Array, Array], Array],
-    add_both: Callable[[Array, Array, Array], Array],
-    none: Array,
-    values: Array,
-) -> tuple[Array, Array]:
-    """(What all K come to, what those before k come to [G, K, P]), from ``none`` on.
-
-    Two at a time, and what the first of them comes to then for all K at once: each turn
-    is a kernel to be compiled and called.
-    """
-    groups, size, pixels = values.shape
-    values = jnp.pad(values, ((0, 0), (0, size % 2), (0, 0)))
-    # By `lax.split`, whose transpose is one concatenation; that of slices would be a
-    # sum of padded arrays.
-    parts = lax.split(values, [1] * values.shape[1], axis=1)
-    so_far, before = none, []
-    for first, second in zip(parts[::2], parts[1::2]):
-        before.append(so_far)
-        so_far = add_both(so_far, first, second)
-    pairs = values.reshape(groups, -1, 2, pixels)
-    first = lax.concatenate(before, 1)[:, :, None]
-    is_first = lax.broadcasted_iota(jnp.int32, pairs.shape, 2) == 0
-    both = jnp.where(is_first, first, add(first, pairs[:, :, :1]))
-    return so_far[:, 0], both.reshape(values.shape)[:, :size]
-
-
-@jax.custom_jvp
-def transmittance(alpha: Array) -> tuple[Array, Array]:
-    """As `running_product`, for alpha < 1, with its derivative as a running *sum*.
-
-    dT_k = −T_k Σ_{j<k} dα_j / (1 − α_j). The transpose of a sum costs half of what
-    that of a product does; tested against plain differentiation. The division is
-    safe because α is capped below 1.
-    """
-    return running_product(alpha)
-
-
-@transmittance.defjvp
-def _transmittance_jvp(primals, tangents):
-    (alpha,), (d_alpha,) = primals, tangents
-    total, before = transmittance(alpha)
-    summed, sums = _running_sum(d_alpha / (1 - alpha))
-    return (total, before), (-total * summed, -before * sums)
-
-
-class Chunk(NamedTuple):
-    """What is blended in a step; all steps together have a leading axis S.
-
-    Attributes:
-      splats: [G, K, 6] rows of u, v, inv_sx, slope, inv_sy, opacity; see `Projected`.
-      channels: [G, K, C] rows of what is summed.
-      corner: [G, 2] upper left corners of the tiles, px.
-      depth: [G, K, 1], or None where no median is asked for.
-      probe: [G, K, 2] zeros that collect the absolute gradient, or None.
-    """
-
-    splats: Array
-    channels: Array
-    corner: Array
-    depth: Array | None
-    probe: Array | None
-
-
-def gather_chunks(
-    projected: Projected, work: Work, tiles: Array, grid: Grid, device: Array, config
-) -> Chunk:
-    """The chunks of all steps, ahead of the loop.
-
-    So that the transpose is one scatter-add and not one a step; and by rows, so that a
-    Gaussian is in one place of memory. Null ranks read zeros, and so have opacity 0.
-    """
-
-    def take(columns):
-        table = jnp.pad(jnp.stack(columns, -1), ((0, 1), (0, 0)))
-        return _take_rows(table, work.ranks)
-
-    outputs = config.outputs
-    channels = list(projected.colors) if "rgb" in outputs else []
-    channels += [projected.depth] if "depth" in outputs else []
-    corner = tile_origins(grid, tiles[work.block], device)
-    return Chunk(
-        splats=take(
-            [
-                projected.u,
-                projected.v,
-                projected.inv_sx,
-                projected.slope,
-                projected.inv_sy,
-                projected.opacity,
-            ]
-        ),
-        channels=take([*channels, jnp.ones_like(projected.u)]),
-        corner=jnp.stack(corner, -1).astype(projected.u.dtype),
-        depth=take([projected.depth]) if "median_depth" in outputs else None,
-        probe=None if projected.probe is None else take(projected.probe),
-    )
-
-
-def splats_of(chunk: Chunk) -> tuple[Array, ...]:
-    """[G, K] each: inv_sx, slope, inv_sy, opacity, and the mean's x, y relative to the
-    corner of the tile.
-
-    Behind a barrier: else every kernel would pick the columns from the rows by itself.
-    """
-    columns = lax.optimization_barrier(jnp.moveaxis(chunk.splats, -1, 0))
-    u, v, *kept = (part[0] for part in lax.split(columns, [1] * 6))
-    x, y = u - chunk.corner[:, None, 0], v - chunk.corner[:, None, 1]
-    return *kept, x, y
-
-
-@jax.custom_jvp
-def channel_sums(weight: Array, channels: Array) -> Array:
-    """Σ_k weight [G, K, P] · channels [G, K, C], as [G, C, P].
-
-    The rule is the plain one but for the order of axes: XLA's products are faster where
-    the rows of the left operand are what is summed over, here channels [G, C, K], and
-    [G, K, C] in the transpose.
-    """
-    columns = lax.optimization_barrier(jnp.swapaxes(channels, 1, 2))
-    return _einsum("gck,gkp->gcp", columns, weight)
-
-
-@channel_sums.defjvp
-def _channel_sums_jvp(primals, tangents):
-    (weight, channels), (d_weight, d_channels) = primals, tangents
-    by_weight = _einsum("gkp,gkc->gcp", d_weight, channels)
-    by_channels = _einsum("gkp,gkc->gcp", weight, d_channels)
-    return channel_sums(weight, channels), by_weight + by_channels
-
-
-def _blend(
-    carried: Array, chunk: Chunk, pixels: np.ndarray, config: RasterConfig
-) -> tuple[Array, dict[str, Array]]:
-    """Blend one chunk behind the transmittance ``carried`` [G, P].
-
-    Returns:
-      The transmittance behind the chunk *as if nothing stopped* (what has fallen to
-      the limit never rises again, so it still tells who has stopped), and the sums
-      to add: "sums" [G, C, P], "median" [G, P] where asked for.
-    """
-    splats = splats_of(chunk)
-    alpha = alphas(splats, pixels, config)
-    if chunk.probe is not None:
-        alpha = collect_absolute(alpha, splats, pixels, chunk.probe, config)
-    # A cap of 1 needs the rule that does not divide.
-    product = transmittance if config.alpha_cap < 1 else running_product
-    total, before = product(alpha)
-    reached = lax.stop_gradient(carried[:, None] * before)
-    behind = lax.stop_gradient(reached * (1 - alpha))
-    blended = (behind if config.stop_rule == "before" else reached) > config.stop
-    # What is carried stands outside: its derivative then needs no sum over Gaussians.
-    sums = channel_sums(jnp.where(blended, alpha * before, 0), chunk.channels)
-    out = {"sums": carried[:, None] * sums}
-    if chunk.depth is not None:
-        # The last that more than half reaches, if less is left behind all. By their
-        # number: rounding may let more reach one than the one before it.
-        number = jnp.sum(reached > 0.5, axis=1, dtype=jnp.int32, keepdims=True)
-        last = lax.broadcasted_iota(jnp.int32, reached.shape, 1) == number - 1
-        half = last & (carried * total <= 0.5)[:, None] & blended
-        out["median"] = jnp.sum(jnp.where(half, chunk.depth, 0), axis=1)
-    return carried * total, out
-
-
+@partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6))
 def composite(
     projected: Projected,
-    work: Work,
+    lists: Lists,
     schedule: Schedule,
-    grid: Grid,
     device: Array,
+    grid: Grid,
+    room: int,
     config: RasterConfig,
 ) -> dict[str, Array]:
     """Images of one device's tiles, before the background.
+
+    Args:
+      projected: [R].
+      lists: of the tiles.
+      schedule: of the lists.
+      device: [] its number.
+      grid: its tiles.
+      room: steps there is room for where a derivative is taken.
+      config: static settings.
 
     Returns:
       "sums" [T, C, P]: colour, depth where asked for, alpha; "median" [T, P] where
       asked for. T in the grid's order.
     """
-    blocks, group = schedule.tiles.shape
-    dtype = projected.u.dtype
-    pixels = pixel_centres(grid.tile, dtype)
-    count = pixels.shape[1]
-    chunks = gather_chunks(projected, work, schedule.tiles, grid, device, config)
+    del room
 
-    nothing = {"sums": jnp.zeros((group, chunks.channels.shape[-1], count), dtype)}
-    if chunks.depth is not None:
-        nothing["median"] = jnp.zeros((group, count), dtype)
+    # Under `jax.vmap` one after another: side by side each would wait for the longest,
+    # and every turn of a loop copy the images of all.
+    @sequential_vmap
+    def one(projected, lists, schedule, device):
+        return _by_blocks(projected, lists, schedule, device, grid, config)
+
+    return one(projected, lists, schedule, device)
+
+
+@partial(composite.defjvp, symbolic_zeros=True)
+def _composite_jvp(grid, room, config, primals, tangents):
+    """Of the steps, by what is differentiated alone."""
+    leaves, tree = jax.tree.flatten(primals)
+    slopes = tree.flatten_up_to(tangents)
+    moving = [i for i, s in enumerate(slopes) if not isinstance(s, SymbolicZero)]
+
+    def by_moving(*values):
+        some = dict(zip(moving, values))
+        every = [some.get(i, leaf) for i, leaf in enumerate(leaves)]
+        projected, lists, schedule, device = jax.tree.unflatten(tree, every)
+        return _by_steps(projected, lists, schedule, device, grid, room, config)
+
+    return jax.jvp(by_moving, [leaves[i] for i in moving], [slopes[i] for i in moving])
+
+
+def _by_blocks(
+    projected: Projected,
+    lists: Lists,
+    schedule: Schedule,
+    device: Array,
+    grid: Grid,
+    config: RasterConfig,
+) -> dict[str, Array]:
+    """`composite` by loops that are as long as need be."""
+    config = config.replace(absgrad=False)
+    rows = rows_of(projected, config)
+    pixels = pixel_centres(grid.tile, rows.dtype)
+    blocks, group = schedule.tiles.shape
+    nothing = _nothing(rows, group, pixels.shape[1], config)
+    none = projected.u.shape[0]
+
+    def of_block(block, images):
+        tile = schedule.tiles[block]
+        corner = corners(tile, grid, device, rows)
+
+        def ranks_of(level):
+            return ranks_at(lists, schedule, tile, level, config.chunk_size, none)
+
+        def more(state):
+            level, _, carried, _ = state
+            left = level < schedule.levels[block]
+            return left & jnp.any(carried > config.stop)
+
+        def advance(state):
+            level, ranks, carried, image = state
+            chunk = Chunk(parts_of(take_rows(rows, ranks), config), corner)
+            carried, added = blend_chunk(carried, chunk, pixels, config)
+            image = jax.tree.map(jnp.add, image, added)
+            # From one turn to the next: within one, XLA would look up the rank of a
+            # row again for every number in it.
+            return level + 1, ranks_of(level + 1), carried, image
+
+        first = jnp.int32(0)
+        start = (first, ranks_of(first), jnp.ones_like(nothing["sums"][:, 0]), nothing)
+        *_, image = lax.while_loop(more, advance, start)
+        return jax.tree.map(lambda all_, one: all_.at[block].set(one), images, image)
+
+    used = jnp.sum(schedule.levels > 0, dtype=jnp.int32)
+    images = {k: jnp.zeros((blocks, *v.shape), v.dtype) for k, v in nothing.items()}
+    images = lax.fori_loop(0, used, of_block, images)
+    return _in_grid_order(images, schedule, grid)
+
+
+def _by_steps(
+    projected: Projected,
+    lists: Lists,
+    schedule: Schedule,
+    device: Array,
+    grid: Grid,
+    room: int,
+    config: RasterConfig,
+) -> dict[str, Array]:
+    """`composite` by steps of a known number, whose derivative can be taken."""
+    steps = make_steps(schedule, room)
+
+    def of_size(size):
+        ranks = projected.u.shape[0]
+        work = make_work(lists, schedule, steps, config.chunk_size, ranks, size)
+        rows = rows_of(projected, config)
+        return _scan(rows, work, schedule, device, grid, config)
+
+    # Every size more costs seconds of compiling, and empty steps cost little.
+    return on_ladder(schedule.steps, room, max(1, config.rungs - 2), of_size)
+
+
+def _scan(
+    rows: Array,
+    work: Work,
+    schedule: Schedule,
+    device: Array,
+    grid: Grid,
+    config: RasterConfig,
+) -> dict[str, Array]:
+    pixels = pixel_centres(grid.tile, rows.dtype)
+    blocks, group = schedule.tiles.shape
+    nothing = _nothing(rows, group, pixels.shape[1], config)
+    # Ahead of the loop, so that the transpose is one scatter-add and not one a step.
+    tile, parts = schedule.tiles[work.block], parts_of(rows, config)
+    chunks = Chunk(take_rows(parts, work.ranks), corners(tile, grid, device, rows))
 
     # In the branch as well: what the backward pass recomputes there is compiled
     # together with what uses it, and nothing but the inputs crosses the `cond`.
-    blend = jax.checkpoint(partial(_blend, pixels=pixels, config=config))
+    blend = jax.checkpoint(partial(blend_chunk, pixels=pixels, config=config))
 
     def skip(carried, _):
         return carried, nothing
@@ -260,7 +193,7 @@ def composite(
         carried, image = carry
         first, live, block, chunk = inputs
         carried = jnp.where(first, 1, carried)
-        go = live & jnp.any(lax.stop_gradient(carried) > config.stop)
+        go = any_of_batch(live & jnp.any(carried > config.stop))
         carried, added = advance(go, carried, chunk)
 
         def add(image, more):
@@ -269,19 +202,41 @@ def composite(
         return (carried, jax.tree.map(add, image, added)), None
 
     # One block more than there is: steps that are not live name it.
-    image = {k: jnp.zeros((blocks + 1, *v.shape), dtype) for k, v in nothing.items()}
-    init = (jnp.ones((group, count), dtype), image)
+    images = {k: jnp.zeros((blocks + 1, *v.shape), v.dtype) for k, v in nothing.items()}
+    init = (jnp.ones_like(nothing["sums"][:, 0]), images)
     steps = (work.first, work.live, work.block, chunks)
-    (_, image), _ = lax.scan(step, init, steps)
-    places = _places(schedule, grid)
-    return {
-        name: _take_rows(value.reshape(-1, *value.shape[2:]), places)
-        for name, value in image.items()
-    }
+    (_, images), _ = lax.scan(step, init, steps)
+    return _in_grid_order(images, schedule, grid)
 
 
-def _take_rows(table: Array, rows: Array) -> Array:
-    return table.at[rows].get(mode="promise_in_bounds")
+def take_rows(rows: T, index: Array) -> T:
+    """Of every array those rows; all there."""
+    return jax.tree.map(lambda a: a.at[index].get(mode="promise_in_bounds"), rows)
+
+
+def corners(tile: Array, grid: Grid, device: Array, rows: Array) -> Array:
+    """[..., 2] upper left corners of the tiles, px."""
+    return jnp.stack(tile_origins(grid, tile, device), -1).astype(rows.dtype)
+
+
+def _nothing(
+    rows: Array, group: int, pixels: int, config: RasterConfig
+) -> dict[str, Array]:
+    """What a chunk adds that is not blended."""
+    parts = parts_of(rows, config)
+    channels = parts.channels.shape[-1]
+    nothing = {"sums": jnp.zeros((group, channels, pixels), rows.dtype)}
+    if parts.depth is not None:
+        nothing["median"] = jnp.zeros((group, pixels), rows.dtype)
+    return nothing
+
+
+def _in_grid_order(
+    images: dict[str, Array], schedule: Schedule, grid: Grid
+) -> dict[str, Array]:
+    """[blocks, G, ...] as [T, ...]."""
+    flat = {name: v.reshape(-1, *v.shape[2:]) for name, v in images.items()}
+    return take_rows(flat, _places(schedule, grid))
 
 
 def _places(schedule: Schedule, grid: Grid) -> Array:

@@ -6,6 +6,7 @@ from typing import TypeVar
 import jax.numpy as jnp
 from jax import lax
 
+from gsjax.raster.batches import least_of_batch
 from gsjax.raster.types import Array
 
 T = TypeVar("T")
@@ -17,8 +18,9 @@ def on_ladder(
 ) -> T:
     """``run(size)`` with the smallest of full, full / step, … that holds ``wanted``.
 
-    Every size is compiled and one is run (`lax.switch`; under `jax.vmap` all are, and
-    one is picked). What ``run`` returns must have the same shapes for every size.
+    Every size is compiled and one is run (`lax.switch`; under `jax.vmap` the largest
+    that any of the batch wants). What ``run`` returns must have the same shapes for
+    every size.
 
     Args:
       wanted: [] count, int or float.
@@ -32,5 +34,6 @@ def on_ladder(
         sizes.append(-(-sizes[-1] // step))
     if len(sizes) == 1:
         return run(full)
-    index = sum((wanted <= size).astype(jnp.int32) for size in sizes[1:])
+    fits = [(wanted <= size).astype(jnp.int32) for size in sizes[1:]]
+    index = least_of_batch(sum(fits, start=jnp.int32(0)))
     return lax.switch(index, [lambda size=size: run(size) for size in sizes])

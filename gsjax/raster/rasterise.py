@@ -17,7 +17,6 @@ from gsjax.gaussians import capacity_bucket
 from gsjax.raster import bins, schedules
 from gsjax.raster.composite import composite
 from gsjax.raster.counts import COUNT_LIMIT
-from gsjax.raster.ladder import on_ladder
 from gsjax.raster.occlude import hidden
 from gsjax.raster.types import Array, Demand, Projected, RasterConfig
 
@@ -103,21 +102,13 @@ def _rasterise_local(
     is hidden.
     """
     device = device[0]
-    ranks = projected.u.shape[0]
     chunk = config.chunk_size
     group = schedules.tiles_per_step(config, grid, jax.default_backend())
     spans = bins.row_spans(geometry, grid, device)
     lists = bins.make_lists(geometry, spans, grid, device, capacity, config.rungs)
-    schedule = schedules.make_schedule(lists.length, grid, group, chunk)
     room = schedules.step_capacity(capacity, grid, group, chunk)
-    steps = schedules.make_steps(lists, schedule, room)
-
-    def blend(room):
-        work = schedules.make_work(lists, schedule, steps, chunk, ranks, room)
-        return composite(projected, work, schedule, grid, device, config)
-
-    # Every size more costs seconds of compiling, and empty steps cost little.
-    images = on_ladder(schedule.steps, room, max(1, config.rungs - 2), blend)
+    schedule = schedules.make_schedule(lists, grid, group, chunk, room)
+    images = composite(projected, lists, schedule, device, grid, room, config)
     for_steps = schedules.pairs_for_steps(schedule.steps, grid, group, chunk)
     wanted = jnp.maximum(lists.pairs, for_steps)
     images = {name: image[None] for name, image in images.items()}

@@ -23,21 +23,22 @@ class Schedule(NamedTuple):
 
     Attributes:
       tiles: [blocks, G]; places past the last tile hold T, whose list is empty.
-      levels: [blocks] steps of each block.
-      steps: [] their sum, saturating.
+      levels: [blocks] steps of each block, none of them rising; 0 if there is no room.
+      start: [T] where the lists begin.
+      steps: [] how many are wanted, saturating.
     """
 
     tiles: Array
     levels: Array
+    start: Array
     steps: Array
 
 
 class Steps(NamedTuple):
-    """Which chunk of which block each step is, [S] each, and where lists begin, [T]."""
+    """Which chunk of which block each step is, [S] each."""
 
     block: Array
     level: Array
-    start: Array
 
 
 class Work(NamedTuple):
@@ -64,14 +65,26 @@ def tiles_per_step(config: RasterConfig, grid: Grid, platform: str) -> int:
     return max(1, min(chosen, grid.tiles))
 
 
-def make_schedule(length: Array, grid: Grid, group: int, chunk: int) -> Schedule:
-    """Tiles by falling length, in blocks of ``group``, ``chunk`` Gaussians a step."""
+def make_schedule(
+    lists: Lists, grid: Grid, group: int, chunk: int, room: int
+) -> Schedule:
+    """Tiles by falling length, in blocks of ``group``, ``chunk`` Gaussians a step.
+
+    Nothing is to be done if there are more than ``room`` steps, or the lists did not
+    fit.
+    """
     blocks = -(-grid.tiles // group)
-    order = argsort_descending(length)
+    order = argsort_descending(lists.length)
     padding = jnp.full(blocks * group - grid.tiles, grid.tiles, jnp.int32)
     tiles = jnp.concatenate([order, padding]).reshape(blocks, group)
-    levels = -(-take(length, tiles[:, 0]) // chunk)
-    return Schedule(tiles, levels, total_count(levels)[0])
+    levels = -(-take(lists.length, tiles[:, 0]) // chunk)
+    steps, _ = total_count(levels)
+    return Schedule(
+        tiles=tiles,
+        levels=jnp.where(lists.fit & (steps <= room), levels, 0),
+        start=running_total(lists.length) - lists.length,
+        steps=steps,
+    )
 
 
 def step_capacity(capacity: int, grid: Grid, group: int, chunk: int) -> int:
@@ -93,16 +106,24 @@ def pairs_for_steps(steps: Array, grid: Grid, group: int, chunk: int) -> Array:
     return jnp.where(huge, 2**31 - 1, jnp.where(huge, 0, wanted).astype(jnp.int32))
 
 
-def make_steps(lists: Lists, schedule: Schedule, room: int) -> Steps:
-    """Unroll the schedule into ``room`` steps; all past the last block if they do not
-    fit, or the lists did not.
+def ranks_at(
+    lists: Lists, schedule: Schedule, tile: Array, level: Array, chunk: int, none: int
+) -> Array:
+    """[..., G, K] ranks of a chunk of the tiles [..., G], its ``level`` [...]; ``none``
+    where there is none.
     """
-    fits = lists.fit & (schedule.steps <= room)
-    levels = jnp.where(fits, schedule.levels, 0)
-    ends = running_total(levels)
+    offset = level[..., None, None] * chunk + lax.iota(jnp.int32, chunk)
+    inside = offset < take(lists.length, tile)[..., None]
+    position = take(schedule.start, tile)[..., None] + offset
+    return jnp.where(inside, take(lists.ranks, position), none)
+
+
+def make_steps(schedule: Schedule, room: int) -> Steps:
+    """Unroll the schedule into ``room`` steps; past the last, past the last block."""
+    ends = running_total(schedule.levels)
     block = owners(ends, room)
-    level = lax.iota(jnp.int32, room) - take(ends - levels, block)
-    return Steps(block, level, running_total(lists.length) - lists.length)
+    level = lax.iota(jnp.int32, room) - take(ends - schedule.levels, block)
+    return Steps(block, level)
 
 
 def make_work(
@@ -110,14 +131,10 @@ def make_work(
 ) -> Work:
     """What the first ``room`` of the steps composite."""
     block, level = steps.block[:room], steps.level[:room]
-    live = block < schedule.levels.shape[0]
     tile = schedule.tiles.at[block].get(mode="fill", fill_value=lists.length.shape[0])
-    offset = level[:, None, None] * chunk + lax.iota(jnp.int32, chunk)
-    inside = live[:, None, None] & (offset < take(lists.length, tile)[..., None])
-    position = take(steps.start, tile)[..., None] + offset
     return Work(
-        ranks=jnp.where(inside, take(lists.ranks, position), ranks),
+        ranks=ranks_at(lists, schedule, tile, level, chunk, ranks),
         block=block,
         first=level == 0,
-        live=live,
+        live=block < schedule.levels.shape[0],
     )

@@ -7,7 +7,7 @@ import numpy as np
 from gsjax.gaussians import make_gaussians
 from gsjax.numerics import in_float64
 from gsjax.raster.alpha import alphas
-from gsjax.raster.composite import running_product
+from gsjax.raster.blend import running_product
 from gsjax.raster.counts import total_count
 from gsjax.raster.reference import reference_render
 from gsjax.raster.render import render
