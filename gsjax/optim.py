@@ -40,8 +40,11 @@ class Rates(NamedTuple):
     def times(self, factor: float) -> "Rates":
         """All rates, multiplied; the cooling as it was."""
         first, last = self.means
-        rest = (factor * rate for rate in self[1:-1])
-        return Rates((factor * first, factor * last), *rest, self.cooling)
+        others = self._fields[1:-1]
+        return self._replace(
+            means=(factor * first, factor * last),
+            **{name: factor * getattr(self, name) for name in others},
+        )
 
 
 def means_rate(rates: Rates, fraction: Array, extent: float | Array) -> Array:
