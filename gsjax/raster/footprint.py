@@ -18,8 +18,8 @@ from gsjax.raster.types import RasterConfig
 _PAIRS = "for (tile, Gaussian) pairs"
 _GAUSSIANS, _PICTURES = "for projected Gaussians", "for pictures"
 
-# Numbers of a Gaussian in a chunk beside its channels: rank, place, ellipse, opacity;
-# and how many more the backward pass makes of it.
+# Where gradients are taken, numbers of a Gaussian in a chunk beside its channels: rank,
+# place, ellipse, opacity; and how many more the backward pass makes of it.
 _IN_CHUNK, _IN_CHUNK_LEARNT = 7, 8
 _IN_LISTS = 4  # of a pair, while it is sorted
 # Of a Gaussian beside its own numbers, as all stages come to; with gradients; and what
@@ -62,17 +62,16 @@ def render_estimate(
     rows = group * schedules.step_capacity(share, grid, group, config.chunk_size)
     channels = 1 + 3 * ("rgb" in config.outputs) + ("depth" in config.outputs)
     numbers, in_chunk = 11 + 3 * bases, _IN_CHUNK + channels
-    of_pairs, of_gaussians = config.chunk_size * in_chunk, _PROJECTED + numbers
+    pairs, of_gaussians = _IN_LISTS * 4 * share, _PROJECTED + numbers
     if gradients:  # of one camera; of the others there is what is kept for it
-        of_pairs += config.tile_size**2
-        of_pairs += config.chunk_size * (in_chunk + _IN_CHUNK_LEARNT)
+        in_step = config.chunk_size * (2 * in_chunk + _IN_CHUNK_LEARNT)
+        pairs += width * rows * (in_step + config.tile_size**2)
         of_gaussians = _PROJECTED_LEARNT + 3 * numbers
-    pairs = width * rows * of_pairs
     gaussians = seen * of_gaussians
     each = devices * (_OF_PIXEL_LEARNT if gradients else _OF_PIXEL)
     pixels = size[0] * size[1] * cameras * (each + (_BLURRED if gradients else 0))
     parts = {
-        _PAIRS: devices * (pairs + _IN_LISTS * 4 * share),
+        _PAIRS: devices * pairs,
         _GAUSSIANS: devices * width * gaussians,
         _PICTURES: pixels * width // 4,
     }
