@@ -35,10 +35,10 @@ def interleaved(
     for function in functions.values():
         jax.block_until_ready(function())
     times: dict[str, list[float]] = {name: [] for name in functions}
-    rng = np.random.default_rng(0)
+    rng, calls = np.random.default_rng(0), list(functions.items())
     for _ in range(repeats):
-        for place in rng.permutation(len(functions)):
-            name, function = list(functions.items())[place]
+        for place in rng.permutation(len(calls)):
+            name, function = calls[place]
             start = time.perf_counter()
             jax.block_until_ready(function())
             times[name].append(1e3 * (time.perf_counter() - start))

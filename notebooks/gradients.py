@@ -157,7 +157,7 @@ keys = jax.random.split(jax.random.key(0), SEEDS)
 fitting = compiler.submit(jax.jit(jax.vmap(fit)), starts, keys)
 
 # %% [markdown]
-# **All cameras at once.** A camera is a pytree; `vmap` maps over its arrays as over
+# **All cameras in one call.** A camera is a pytree; `vmap` maps over its arrays as over
 # anything else.
 
 
@@ -369,7 +369,7 @@ assert len({round(value, 4) for value in quality}) == SEEDS
 scenes
 
 # %% [markdown]
-# ## 3. All cameras at once
+# ## 3. All cameras in one call
 #
 # The pictures above came from `vmap` over 16 cameras. One by one they are the same.
 

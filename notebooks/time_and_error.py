@@ -142,7 +142,7 @@ print("\n".join(planned.lines()))
 # %% [markdown]
 # ## The bill
 #
-# The time is the median of calls in turn, A B C A B C, so that a busy machine is unfair
+# The time is the median of calls in turn, A B C C A B, so that a busy machine is unfair
 # to none of them.
 
 # %%

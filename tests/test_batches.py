@@ -4,6 +4,8 @@ A batch renders them in turn; XLA fuses the projection of another program differ
 (a few units in the last place).
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,6 +59,34 @@ def test_a_batch_of_one(report):
     assert batch.demand == wanted.demand
 
 
+def test_a_mapped_camera_that_sees_nothing(report):
+    """Beside one that sees much: sizes and branches are those that do for both."""
+    gaussians, camera = cast(scene_of("random"), jnp.float32)
+    config = COMPAT.replace(rungs=4, pair_capacity=2**16)
+    away = dataclasses.replace(camera, viewmat=camera.viewmat.at[2].multiply(-1))
+    cameras = gsjax.stack_cameras([camera, away])
+
+    @jax.jit
+    def pictures_and_slopes(cameras, gaussians):
+        def brightness(params):
+            scene = gaussians.replace(params=params)
+            view = jax.vmap(lambda c: gsjax.render(scene, c, config))(cameras)
+            return jnp.sum(view.rgb), view
+
+        return jax.grad(brightness, has_aux=True)(gaussians.params)
+
+    slopes, view = pictures_and_slopes(cameras, gaussians)
+    alone, wanted = pictures_and_slopes(gsjax.stack_cameras([camera]), gaussians)
+    assert not view.overflowed.any()
+    assert (view.alpha[1] == 0).all()
+    np.testing.assert_array_equal(view.demand.visible, [wanted.demand.visible[0], 0])
+    pairs = [(view.rgb[0], wanted.rgb[0]), *zip(*map(jax.tree.leaves, (slopes, alone)))]
+    for found, one in pairs:
+        error = float(jnp.linalg.norm(found - one) / jnp.linalg.norm(one))
+        report("with one that sees nothing", error, 1e-5)
+        assert error <= 1e-5
+
+
 @pytest.mark.parametrize(("dtype", "bar"), [(jnp.float32, 1e-6), (jnp.float64, 4e-15)])
 @pytest.mark.parametrize("config", [COMPAT, COMPAT.replace(chunk_size=3, stop=0.3)])
 def test_a_derivative_changes_no_image(config, dtype, bar, report):
@@ -75,6 +105,7 @@ def test_a_derivative_changes_no_image(config, dtype, bar, report):
         return picture(params), jax.jvp(picture, (params,), (params,))[0]
 
     plain, derived = both(gaussians.params)
+    np.testing.assert_array_equal(derived.median_depth, plain.median_depth)
     error = largest_difference(derived, plain)
     report(f"stop {config.stop}, {dtype.__name__}", error, bar)
     assert error <= bar

@@ -268,6 +268,19 @@ def test_gradients_by_some_are_those_by_all(names, report):
             assert error <= 1e-12, name
 
 
+def test_what_no_derivative_is_taken_by_is_left_out():
+    """The program of a gradient by colours has fewer products than that by all."""
+    point = base_point()
+
+    def products(names):
+        some = {name: point[name] for name in names}
+        slope = jax.grad(lambda some: loss({**point, **some}, COMPAT))
+        return str(jax.make_jaxpr(slope)(some)).count("dot_general")
+
+    by_colour, by_all = products(["sh"]), products(LEAVES)
+    assert 0 < by_colour < by_all
+
+
 def test_gradients_of_a_batch_are_the_sum(report):
     """One call with two cameras, and `jax.vmap` over them, against two calls."""
     point = base_point()

@@ -37,7 +37,7 @@ pytestmark = pytest.mark.as_users
             jnp.float64,
             marks=pytest.mark.new_emitters,
         ),
-        # Room for so many steps of compositing that there are sizes of it.
+        # Room for so many pairs that there are sizes of what sorts them.
         ({"rungs": 4, "pair_capacity": 2**18}, jnp.float32),
         pytest.param({"devices": 2}, jnp.float32, marks=needs_two_devices),
         pytest.param(

@@ -28,11 +28,14 @@ def _as_one(decide: Callable[[Array], Array]) -> Callable[[Array], Array]:
     return same
 
 
+_any, _least = _as_one(jnp.any), _as_one(jnp.min)
+
+
 def any_of_batch(flag: Array) -> Array:
     """Whether any of the batch has it [] bool."""
-    return _as_one(jnp.any)(flag)
+    return _any(flag)
 
 
 def least_of_batch(index: Array) -> Array:
     """The smallest of the batch []."""
-    return _as_one(jnp.min)(index)
+    return _least(index)

@@ -126,33 +126,24 @@ class Chunk(NamedTuple):
     corner: Array
 
 
-def rows_of(projected: Projected, config: RasterConfig) -> Array:
-    """Table [R + 1, W] of what is blended; the last row is zeros, so opacity 0.
+def tables_of(projected: Projected, config: RasterConfig) -> Parts:
+    """Tables [R + 1, ...] of what is blended; the last row is zeros, so opacity 0.
 
-    By rows, and in one table: a Gaussian is in one place of memory then, and looked up
-    once.
+    By rows, so that a Gaussian is in one place of memory; each kind by itself, so that
+    one can have a derivative and another none.
     """
     p, outputs = projected, config.outputs
-    columns = [p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity]
-    columns += list(p.colors) if "rgb" in outputs else []
-    columns += [p.depth] if "depth" in outputs else []
-    columns += [jnp.ones_like(p.u)]
-    columns += [p.depth] if "median_depth" in outputs else []
-    columns += list(p.probe) if config.absgrad and p.probe is not None else []
-    return jnp.pad(jnp.stack(columns, -1), ((0, 1), (0, 0)))
 
+    def table(columns):
+        return jnp.pad(jnp.stack(columns, -1), ((0, 1), (0, 0)))
 
-def parts_of(rows: Array, config: RasterConfig) -> Parts:
-    """The columns of `rows_of` by what they are."""
-    widths = [1 if "median_depth" in config.outputs else 0, 2 if config.absgrad else 0]
-    channels = rows.shape[-1] - 6 - sum(widths)
-    parts = lax.split(rows, [6, channels, *widths], axis=rows.ndim - 1)
-    splats, channels, depth, probe = parts
+    channels = list(p.colors) if "rgb" in outputs else []
+    channels += [p.depth] if "depth" in outputs else []
     return Parts(
-        splats,
-        channels,
-        depth=depth if depth.shape[-1] else None,
-        probe=probe if probe.shape[-1] else None,
+        splats=table([p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity]),
+        channels=table([*channels, jnp.ones_like(p.u)]),
+        depth=table([p.depth]) if "median_depth" in outputs else None,
+        probe=None if p.probe is None else table(list(p.probe)),
     )
 
 

@@ -25,7 +25,7 @@ from jax.custom_derivatives import SymbolicZero
 from gsjax.raster.alpha import pixel_centres
 from gsjax.raster.batches import any_of_batch
 from gsjax.raster.bins import Grid, Lists, tile_origins
-from gsjax.raster.blend import Chunk, blend_chunk, parts_of, rows_of
+from gsjax.raster.blend import Chunk, Parts, blend_chunk, tables_of
 from gsjax.raster.ladder import on_ladder
 from gsjax.raster.schedules import (
     Schedule,
@@ -100,16 +100,18 @@ def _by_blocks(
     config: RasterConfig,
 ) -> dict[str, Array]:
     """`composite` by loops that are as long as need be."""
-    config = config.replace(absgrad=False)
-    rows = rows_of(projected, config)
+    tables = tables_of(projected._replace(probe=None), config)
+    # In one table, a Gaussian is looked up once.
+    columns, tree = jax.tree.flatten(tables)
+    rows, widths = lax.concatenate(columns, 1), [part.shape[1] for part in columns]
     pixels = pixel_centres(grid.tile, rows.dtype)
     blocks, group = schedule.tiles.shape
-    nothing = _nothing(rows, group, pixels.shape[1], config)
+    nothing = _nothing(tables, group, pixels.shape[1])
     none = projected.u.shape[0]
 
     def of_block(block, images):
         tile = schedule.tiles[block]
-        corner = corners(tile, grid, device, rows)
+        corner = corners(tile, grid, device, rows.dtype)
 
         def ranks_of(level):
             return ranks_at(lists, schedule, tile, level, config.chunk_size, none)
@@ -121,7 +123,8 @@ def _by_blocks(
 
         def advance(state):
             level, ranks, carried, image = state
-            chunk = Chunk(parts_of(take_rows(rows, ranks), config), corner)
+            parts = lax.split(take_rows(rows, ranks), widths, axis=2)
+            chunk = Chunk(jax.tree.unflatten(tree, parts), corner)
             carried, added = blend_chunk(carried, chunk, pixels, config)
             image = jax.tree.map(jnp.add, image, added)
             # From one turn to the next: within one, XLA would look up the rank of a
@@ -154,27 +157,28 @@ def _by_steps(
     def of_size(size):
         ranks = projected.u.shape[0]
         work = make_work(lists, schedule, steps, config.chunk_size, ranks, size)
-        rows = rows_of(projected, config)
-        return _scan(rows, work, schedule, device, grid, config)
+        tables = tables_of(projected, config)
+        return _scan(tables, work, schedule, device, grid, config)
 
     # Every size more costs seconds of compiling, and empty steps cost little.
     return on_ladder(schedule.steps, room, max(1, config.rungs - 2), of_size)
 
 
 def _scan(
-    rows: Array,
+    tables: Parts,
     work: Work,
     schedule: Schedule,
     device: Array,
     grid: Grid,
     config: RasterConfig,
 ) -> dict[str, Array]:
-    pixels = pixel_centres(grid.tile, rows.dtype)
+    dtype = tables.splats.dtype
+    pixels = pixel_centres(grid.tile, dtype)
     blocks, group = schedule.tiles.shape
-    nothing = _nothing(rows, group, pixels.shape[1], config)
+    nothing = _nothing(tables, group, pixels.shape[1])
     # Ahead of the loop, so that the transpose is one scatter-add and not one a step.
-    tile, parts = schedule.tiles[work.block], parts_of(rows, config)
-    chunks = Chunk(take_rows(parts, work.ranks), corners(tile, grid, device, rows))
+    corner = corners(schedule.tiles[work.block], grid, device, dtype)
+    chunks = Chunk(take_rows(tables, work.ranks), corner)
 
     # In the branch as well: what the backward pass recomputes there is compiled
     # together with what uses it, and nothing but the inputs crosses the `cond`.
@@ -214,20 +218,17 @@ def take_rows(rows: T, index: Array) -> T:
     return jax.tree.map(lambda a: a.at[index].get(mode="promise_in_bounds"), rows)
 
 
-def corners(tile: Array, grid: Grid, device: Array, rows: Array) -> Array:
+def corners(tile: Array, grid: Grid, device: Array, dtype) -> Array:
     """[..., 2] upper left corners of the tiles, px."""
-    return jnp.stack(tile_origins(grid, tile, device), -1).astype(rows.dtype)
+    return jnp.stack(tile_origins(grid, tile, device), -1).astype(dtype)
 
 
-def _nothing(
-    rows: Array, group: int, pixels: int, config: RasterConfig
-) -> dict[str, Array]:
+def _nothing(tables: Parts, group: int, pixels: int) -> dict[str, Array]:
     """What a chunk adds that is not blended."""
-    parts = parts_of(rows, config)
-    channels = parts.channels.shape[-1]
-    nothing = {"sums": jnp.zeros((group, channels, pixels), rows.dtype)}
-    if parts.depth is not None:
-        nothing["median"] = jnp.zeros((group, pixels), rows.dtype)
+    dtype = tables.channels.dtype
+    nothing = {"sums": jnp.zeros((group, tables.channels.shape[1], pixels), dtype)}
+    if tables.depth is not None:
+        nothing["median"] = jnp.zeros((group, pixels), dtype)
     return nothing
 
 

@@ -1,9 +1,10 @@
 """How much memory a render takes, worked out from its sizes alone.
 
 Not measured but counted, and then held against what XLA says of its programs and what
-processes came to: jax 0.10.2, one and two CPU devices. What binning and compositing
-take goes with the pairs, what the loss takes with the pixels, and both are shared by
-the devices; what projection takes goes with the Gaussians, and each has its own.
+processes came to: jax 0.10.2, one and two CPU devices. What binning and the gradient of
+compositing take goes with the pairs, what the loss takes with the pixels, and both are
+shared by the devices; what projection takes goes with the Gaussians, and each has its
+own. Without a gradient, compositing takes what a step of its loops does.
 
 Axis legend: P pixels of a tile, K Gaussians of a chunk, C channels.
 """
@@ -22,6 +23,7 @@ _GAUSSIANS, _PICTURES = "for projected Gaussians", "for pictures"
 # place, ellipse, opacity; and how many more the backward pass makes of it.
 _IN_CHUNK, _IN_CHUNK_LEARNT = 7, 8
 _IN_LISTS = 4  # of a pair, while it is sorted
+_IN_STEP = 3  # of a Gaussian at a pixel, while a chunk is blended
 # Of a Gaussian beside its own numbers, as all stages come to; with gradients; and what
 # is kept of it for another camera.
 _PROJECTED, _PROJECTED_LEARNT, _KEPT = 42, 60, 32
@@ -62,7 +64,9 @@ def render_estimate(
     rows = group * schedules.step_capacity(share, grid, group, config.chunk_size)
     channels = 1 + 3 * ("rgb" in config.outputs) + ("depth" in config.outputs)
     numbers, in_chunk = 11 + 3 * bases, _IN_CHUNK + channels
-    pairs, of_gaussians = _IN_LISTS * 4 * share, _PROJECTED + numbers
+    step = group * config.chunk_size * config.tile_size**2
+    pairs = _IN_LISTS * 4 * share + _IN_STEP * width * step
+    of_gaussians = _PROJECTED + numbers
     if gradients:  # of one camera; of the others there is what is kept for it
         in_step = config.chunk_size * (2 * in_chunk + _IN_CHUNK_LEARNT)
         pairs += width * rows * (in_step + config.tile_size**2)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from gsjax.numerics import safe_sqrt
+from gsjax.raster.batches import any_of_batch
 from gsjax.raster.counts import squeeze
 from gsjax.raster.types import Array, Projected, RasterConfig
 
@@ -37,7 +38,7 @@ def hidden(
         latest = _latest_over_box(projected, closed, width, height)
         return lax.iota(jnp.int32, ranks) > latest
 
-    return lax.cond(count > 0, search, lambda: jnp.zeros(ranks, bool))
+    return lax.cond(any_of_batch(count > 0), search, lambda: jnp.zeros(ranks, bool))
 
 
 def _candidates(projected: Projected) -> tuple[Array, Array]:

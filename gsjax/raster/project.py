@@ -17,6 +17,7 @@ from gsjax import sh as sh_lib
 from gsjax.cameras import Camera, camera_centre
 from gsjax.gaussians import Gaussians
 from gsjax.numerics import exp_log_scale, safe_normalize
+from gsjax.raster.batches import any_of_batch
 from gsjax.raster.ladder import on_ladder
 from gsjax.raster.types import Array, Projected, RasterConfig
 
@@ -119,7 +120,8 @@ def project(
 
     def run(size: int) -> Projected:
         project_some = jax.checkpoint(partial(some, size))
-        return lax.cond(count > 0, project_some, none, components, camera, count)
+        some_live = any_of_batch(count > 0)
+        return lax.cond(some_live, project_some, none, components, camera, count)
 
     # Two sizes: every one more costs seconds of compiling.
     out = on_ladder(count, room, min(config.rungs, 2), run, step=16)

@@ -23,7 +23,7 @@ class Schedule(NamedTuple):
 
     Attributes:
       tiles: [blocks, G]; places past the last tile hold T, whose list is empty.
-      levels: [blocks] steps of each block, none of them rising; 0 if there is no room.
+      levels: [blocks] steps of each block, falling; all 0 if there is no room.
       start: [T] where the lists begin.
       steps: [] how many are wanted, saturating.
     """

@@ -53,9 +53,9 @@ class RasterConfig:
         stopped. Bit-equal; pays where something opaque fills part of the view.
       rungs: how many sizes, each a quarter of the one before, sorting by depth is
         compiled for; the smallest that fits is run. Sorting pairs has sizes between
-        them; from 2 on there is a small size of projecting, and from 4 on compositing
-        has sizes too, two fewer. Each takes seconds to compile, and saves time where a
-        view needs a quarter of its capacity or less.
+        them; from 2 on there is a small size of projecting, and from 4 on the gradient
+        of compositing has sizes too, two fewer. Each takes seconds to compile, and
+        saves time where a view needs a quarter of its capacity or less.
       devices: how many devices share the tiles; None means all local ones. Within a
         `jax.shard_map` of your own: 1, and ``check_vma=False`` there.
 

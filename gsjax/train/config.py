@@ -105,6 +105,7 @@ class TrainConfig:
             "sh_degree": 0 <= self.sh_degree <= 4,
             "sh_every": self.sh_every >= 1,
             "ssim_weight": 0 <= self.ssim_weight <= 1,
+            "rates' cooling": 0 < self.rates.cooling <= 1,
             "background": self.background in BACKGROUNDS,
             "initial": self.initial in ("points", "random"),
             "initial_count": self.initial_count >= 1,
@@ -169,7 +170,9 @@ def from_json(text: str) -> TrainConfig:
         check_kinds(TrainConfig, data)
         if "rates" in data:  # a NamedTuple: a list in JSON
             rates = data["rates"]
-            check_kinds(Rates, dict(zip(Rates._fields, rates)))
+            if len(rates) == len(Rates._fields) - 1:  # of before there was a cooling
+                rates = [*rates, Rates().cooling]
+            check_kinds(Rates, dict(zip(Rates._fields, rates, strict=True)))
             data["rates"] = Rates(tuple(rates[0]), *rates[1:])
         for name, kind in (("adaptive", AdaptiveSettings), ("mcmc", McmcSettings)):
             if name in data:
