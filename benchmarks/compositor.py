@@ -31,10 +31,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec  # noqa: E402
 from gsjax.raster import bins, schedules  # noqa: E402
 from gsjax.raster.alpha import alphas, pixel_centres  # noqa: E402
 from gsjax.raster.blend import (  # noqa: E402
-    parts_of,
-    rows_of,
     running_product,
     splats_of,
+    tables_of,
 )
 from gsjax.raster.composite import composite, corners, take_rows  # noqa: E402
 from gsjax.raster.order import depth_order  # noqa: E402
@@ -85,7 +84,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
 
     def count_local(device, projected, lists, schedule):
         """[steps] each: evaluations made, and those of them that change the image."""
-        rows = rows_of(projected, config)
+        tables = tables_of(projected, config)
         unrolled = schedules.make_steps(schedule, steps)
         none = projected.u.shape[0]
         work = schedules.make_work(lists, schedule, unrolled, chunk, none, steps)
@@ -93,8 +92,8 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
 
         def step(carried, inputs):
             first, live, block, ranks = inputs
-            corner = corners(schedule.tiles[block], grid, device, rows)
-            splats = parts_of(take_rows(rows, ranks), config).splats
+            corner = corners(schedule.tiles[block], grid, device, pixels.dtype)
+            splats = take_rows(tables.splats, ranks)
             carried = jnp.where(first, 1, carried)
             go = live & jnp.any(carried > config.stop)
             alpha = alphas(splats_of(splats, corner), pixels, config)

@@ -26,7 +26,6 @@ def blend(alpha, carried):
         splats=jnp.concatenate([flat, alpha[..., None]], -1),
         channels=one,
         depth=one,
-        probe=None,
     )
     chunk = Chunk(parts, corner=jnp.zeros((TILES, 2), alpha.dtype))
     pixels = pixel_centres(TILE, alpha.dtype)

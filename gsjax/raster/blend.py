@@ -110,8 +110,8 @@ class Parts(NamedTuple):
 
     splats: Array
     channels: Array
-    depth: Array | None
-    probe: Array | None
+    depth: Array | None = None
+    probe: Array | None = None
 
 
 class Chunk(NamedTuple):
@@ -126,25 +126,35 @@ class Chunk(NamedTuple):
     corner: Array
 
 
-def tables_of(projected: Projected, config: RasterConfig) -> Parts:
-    """Tables [R + 1, ...] of what is blended; the last row is zeros, so opacity 0.
-
-    By rows, so that a Gaussian is in one place of memory; each kind by itself, so that
-    one can have a derivative and another none.
-    """
+def columns_of(projected: Projected, config: RasterConfig) -> dict[str, list[Array]]:
+    """Columns [R] of what is blended, for each of `Parts` that there is."""
     p, outputs = projected, config.outputs
-
-    def table(columns):
-        return jnp.pad(jnp.stack(columns, -1), ((0, 1), (0, 0)))
-
     channels = list(p.colors) if "rgb" in outputs else []
     channels += [p.depth] if "depth" in outputs else []
-    return Parts(
-        splats=table([p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity]),
-        channels=table([*channels, jnp.ones_like(p.u)]),
-        depth=table([p.depth]) if "median_depth" in outputs else None,
-        probe=None if p.probe is None else table(list(p.probe)),
-    )
+    columns = {
+        "splats": [p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity],
+        "channels": [*channels, jnp.ones_like(p.u)],
+    }
+    if "median_depth" in outputs:
+        columns["depth"] = [p.depth]
+    if p.probe is not None:
+        columns["probe"] = list(p.probe)
+    return columns
+
+
+def table_of(columns: list[Array]) -> Array:
+    """[R + 1, columns]; the last row is zeros, so opacity 0.
+
+    By rows, so that a Gaussian is in one place of memory.
+    """
+    return jnp.pad(jnp.stack(columns, -1), ((0, 1), (0, 0)))
+
+
+def tables_of(projected: Projected, config: RasterConfig) -> Parts:
+    """Tables [R + 1, ...] of what is blended, each kind by itself: so one can have a
+    derivative and another none."""
+    columns = columns_of(projected, config)
+    return Parts(**{name: table_of(some) for name, some in columns.items()})
 
 
 def splats_of(splats: Array, corner: Array) -> tuple[Array, ...]:

@@ -25,7 +25,14 @@ from jax.custom_derivatives import SymbolicZero
 from gsjax.raster.alpha import pixel_centres
 from gsjax.raster.batches import any_of_batch
 from gsjax.raster.bins import Grid, Lists, tile_origins
-from gsjax.raster.blend import Chunk, Parts, blend_chunk, tables_of
+from gsjax.raster.blend import (
+    Chunk,
+    Parts,
+    blend_chunk,
+    columns_of,
+    table_of,
+    tables_of,
+)
 from gsjax.raster.ladder import on_ladder
 from gsjax.raster.schedules import (
     Schedule,
@@ -100,13 +107,18 @@ def _by_blocks(
     config: RasterConfig,
 ) -> dict[str, Array]:
     """`composite` by loops that are as long as need be."""
-    tables = tables_of(projected._replace(probe=None), config)
-    # In one table, a Gaussian is looked up once.
-    columns, tree = jax.tree.flatten(tables)
-    rows, widths = lax.concatenate(columns, 1), [part.shape[1] for part in columns]
+    columns = columns_of(projected._replace(probe=None), config)
+    # In one table: a Gaussian is looked up once.
+    rows = table_of([column for some in columns.values() for column in some])
+    widths = [len(some) for some in columns.values()]
+
+    def parts_of(rows):
+        parts = lax.split(rows, widths, axis=rows.ndim - 1)
+        return Parts(**dict(zip(columns, parts)))
+
     pixels = pixel_centres(grid.tile, rows.dtype)
     blocks, group = schedule.tiles.shape
-    nothing = _nothing(tables, group, pixels.shape[1])
+    nothing = _nothing(parts_of(rows), group, pixels.shape[1])
     none = projected.u.shape[0]
 
     def of_block(block, images):
@@ -123,8 +135,7 @@ def _by_blocks(
 
         def advance(state):
             level, ranks, carried, image = state
-            parts = lax.split(take_rows(rows, ranks), widths, axis=2)
-            chunk = Chunk(jax.tree.unflatten(tree, parts), corner)
+            chunk = Chunk(parts_of(take_rows(rows, ranks)), corner)
             carried, added = blend_chunk(carried, chunk, pixels, config)
             image = jax.tree.map(jnp.add, image, added)
             # From one turn to the next: within one, XLA would look up the rank of a
