@@ -12,7 +12,7 @@ from gsjax import cli
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import InputError
 from gsjax.raster.types import RasterConfig
-from gsjax.train.config import TrainConfig
+from gsjax.train.config import TrainConfig, from_json, to_json
 from gsjax.train.folder import (
     RunSettings,
     load_data,
@@ -198,3 +198,13 @@ def test_a_run_that_stopped_early_is_told_as_one(made, capsys):
     change(made / "run" / "config.json", train={**config["train"], "steps": 8})
     assert cli.main(["eval", str(made / "run"), "--views", "train"]) == 0
     assert "not at its end: step 3 of 8 is" in capsys.readouterr().err
+
+
+def test_settings_of_before_there_was_a_cooling():
+    """One number fewer in the rates; they are constant then."""
+    data = json.loads(to_json(CONFIG))
+    del data["rates"][-1]
+    assert from_json(json.dumps(data)).rates == CONFIG.rates._replace(cooling=1.0)
+    del data["rates"][-1]
+    with pytest.raises(InputError, match="not the settings"):
+        from_json(json.dumps(data))

@@ -370,6 +370,11 @@ BAD = {
     ),
     "config huge": Bad("config.json", at("every", to=10**400), "every is 1000"),
     "config rates": Bad("config.json", at("train", "rates", to=[]), "not the settings"),
+    "config cooling": Bad(
+        "config.json",
+        at("train", "rates", 6, to=-0.5),
+        "rates' cooling .* out of range",
+    ),
     "evaluation": Bad(
         "eval.json", at("psnr", to="good"), "psnr is 'good'; .*gsjax eval"
     ),
