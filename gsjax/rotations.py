@@ -7,26 +7,39 @@ Gaussians, stays innermost, which is what vector units want.
 import jax
 import jax.numpy as jnp
 
-from gsjax.numerics import safe_normalize
+from gsjax.numerics import near_one
 
 Array = jax.Array
 
 
 def rotation_rows(w: Array, x: Array, y: Array, z: Array):
-    """Rows of the rotation matrix of a unit quaternion, as nested tuples."""
+    """Rows of the rotation matrix of a quaternion times its squared norm, as tuples.
+
+    Homogeneous in the quaternion: none of its numbers is rounded to normalise it, and
+    a direction is known to a few roundings of products alone. No product is used
+    twice: a compiler would fuse it into the one sum and not into the other, and which
+    it does may differ between programs, by a bit.
+    """
+
+    def squares(a, b, c, d):
+        """a² − b² + c² − d²."""
+        return (a - b) * (a + b) + (c - d) * (c + d)
+
+    w2, x2, y2, z2 = (2 * q for q in (w, x, y, z))
     return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        (squares(w, y, x, z), x * y2 - w * z2, x * z2 + w * y2),
+        (x2 * y + w2 * z, squares(w, z, y, x), y * z2 - w * x2),
+        (x2 * z - w2 * y, y2 * z + w2 * x, squares(w, x, z, y)),
     )
 
 
 def quaternion_to_matrix(quats: Array) -> Array:
-    """Rotation matrices [..., 3, 3] of quaternions [..., 4] (wxyz, normalised here)."""
-    unit, _ = safe_normalize(
-        tuple(jnp.moveaxis(jnp.asarray(quats), -1, 0)), (1.0, 0.0, 0.0, 0.0)
-    )
-    return jnp.stack([jnp.stack(row, -1) for row in rotation_rows(*unit)], -2)
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4] (wxyz, of any norm)."""
+    components = tuple(jnp.moveaxis(jnp.asarray(quats), -1, 0))
+    quat, _ = near_one(components, (1.0, 0.0, 0.0, 0.0))
+    rows = jnp.stack([jnp.stack(row, -1) for row in rotation_rows(*quat)], -2)
+    square = jnp.sum(jnp.square(jnp.stack(quat)), 0)
+    return rows / square[..., None, None]
 
 
 def covariance(quats: Array, scales: Array) -> Array:

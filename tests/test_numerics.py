@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.numerics import exp_negative
+from gsjax.numerics import exp_negative, near_one, safe_normalize
+from gsjax.rotations import quaternion_to_matrix
 
 pytestmark = pytest.mark.as_users
 
@@ -40,3 +41,56 @@ def test_exponential_of_negative_numbers_is_its_own_derivative():
     assert np.array_equal(slope, value * direction)
     back = jax.vjp(exp_negative, x)[1](direction)[0]
     assert np.array_equal(back, slope)
+
+
+FALLBACK = (1.0, 0.0, 0.0)
+
+
+def components(rows):
+    return tuple(jnp.float32(rows).T)
+
+
+def test_near_one_rounds_nothing():
+    """Every magnitude, signs and orders mixed: times one power of two, to the bit."""
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(4000, 3)) * np.logspace(-33, 37, 4000)[:, None]
+    rows = rows.astype(np.float32)
+    limits = np.finfo(np.float32)
+    ends = limits.max, limits.tiny, 1.5, np.nextafter(np.float32(1.5), 0)
+    rows[:4] = np.column_stack([ends, np.zeros((4, 2))])
+    scaled, good = jax.jit(lambda r: near_one(r, FALLBACK))(components(rows))
+    scaled = np.stack(scaled, 1).astype(float)
+    assert np.all(good)
+    largest = np.abs(scaled).max(1)
+    assert largest[0] < 4
+    assert np.all((largest[1:] >= 0.75) & (largest[1:] <= 1.5))
+    place = np.abs(rows).argmax(1)[:, None]
+    ratio = np.take_along_axis(scaled, place, 1) / np.take_along_axis(rows, place, 1)
+    assert np.all(np.frexp(ratio)[0] == 0.5), "a power of two"
+    assert np.array_equal(scaled, rows * ratio)
+
+
+@pytest.mark.parametrize("bad", [0.0, 1e-40, np.inf, -np.inf, np.nan])
+def test_a_vector_of_no_direction_is_the_fallback(bad):
+    def first(rows):
+        return sum(c for c in safe_normalize(tuple(rows), FALLBACK)[0])
+
+    row = jnp.float32([bad, 0, bad])
+    unit, good = safe_normalize(tuple(row), FALLBACK)
+    assert not good
+    assert tuple(map(float, unit)) == FALLBACK
+    assert np.array_equal(jax.grad(first)(row), np.zeros(3))
+
+
+@pytest.mark.parametrize("norm", [1e-30, 1e-10, 1.0, 3e30])
+def test_a_rotation_does_not_depend_on_the_norm(norm):
+    """Nor does its derivative along the quaternion itself exist."""
+    quats = np.random.default_rng(1).normal(size=(50, 4))
+    turned = np.asarray(quaternion_to_matrix(jnp.float32(quats * norm)), float)
+    assert np.abs(turned - quaternion_to_matrix(jnp.float32(quats))).max() < 5e-7
+    identity = np.einsum("nij,nkj->nik", turned, turned)
+    assert np.abs(identity - np.eye(3)).max() < 1e-6
+    _, along = jax.jvp(
+        quaternion_to_matrix, (jnp.float32(quats),), (jnp.float32(quats),)
+    )
+    assert np.abs(along).max() < 2e-6

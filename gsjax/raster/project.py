@@ -16,7 +16,7 @@ from gsjax import rotations
 from gsjax import sh as sh_lib
 from gsjax.cameras import Camera, camera_centre
 from gsjax.gaussians import Gaussians
-from gsjax.numerics import exp_log_scale, safe_normalize
+from gsjax.numerics import exp_log_scale, near_one, safe_normalize
 from gsjax.raster.batches import any_of_batch
 from gsjax.raster.ladder import on_ladder
 from gsjax.raster.types import Array, Projected, RasterConfig
@@ -169,7 +169,7 @@ def _project_components(
     """
     for value in rows.colors:
         live &= jnp.abs(value) < COLOR_LIMIT
-    unit, good = safe_normalize(
+    quat, good = near_one(
         tuple(jnp.where(live, q, 1) for q in rows.quats), (1.0, 0.0, 0.0, 0.0)
     )
     live &= good
@@ -183,7 +183,7 @@ def _project_components(
         u, v = u + rows.shift[0], v + rows.shift[1]
     live &= (jnp.abs(u) < jnp.inf) & (jnp.abs(v) < jnp.inf)
 
-    m1, m2 = _half_covariance(camera, (x, y, z), unit, scales)
+    m1, m2 = _half_covariance(camera, (x, y, z), quat, scales)
     a, b, c, det, det_sharp = _dilate(m1, m2, config.dilation)
     live &= (det > 0) & (det < jnp.inf) & (a < jnp.inf) & (c < jnp.inf)
     a, b, c = jnp.where(live, a, 1), jnp.where(live, b, 0), jnp.where(live, c, 1)
@@ -218,13 +218,15 @@ def _project_components(
     )
 
 
-def _half_covariance(camera: Camera, point, unit, scales):
+def _half_covariance(camera: Camera, point, quat, scales):
     """Rows m1, m2 of J W R S, as components: the 2D covariance is M Mᵀ.
 
     Columns longer than `_LONGEST` are cut to it: their products would overflow, and
     the Gaussian vanish, though all that can be seen of it is that it is flat.
     """
-    rotation = rotations.rotation_rows(*unit)
+    rotation = rotations.rotation_rows(*quat)
+    per_square = 1 / sum(q * q for q in quat)
+    scales = tuple(s * per_square for s in scales)
     halves = []
     for jacobian_row in ewa_jacobian(camera, point):
         in_world = [

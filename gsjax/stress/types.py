@@ -32,7 +32,6 @@ class Case:
       measure: ``full`` → `Measured`; over more where ``full`` is set.
       unit: of the value.
       full_only: left out of the short form, for its time.
-      known: why it is outside its bound in the full form, on some machines or all.
     """
 
     name: str
@@ -41,7 +40,6 @@ class Case:
     measure: Callable[[bool], Measured]
     unit: str = ""
     full_only: bool = False
-    known: str = ""
 
 
 class Result(NamedTuple):
@@ -80,17 +78,15 @@ def run_case(case: Case, full: bool) -> Result:
         error = f"{type(caught).__name__}: {told} ({where.name})"
         measured = Measured(float("nan"))
     value = float(measured.value)
-    good = value <= case.bound
-    notes = [measured.note, "" if good else case.known]
     return Result(
         name=case.name,
         claim=case.claim,
         measured=value,
         bound=case.bound,
         unit=case.unit,
-        good=good,
+        good=value <= case.bound,
         seconds=time.perf_counter() - start,
-        note="; ".join(note for note in notes if note),
+        note=measured.note,
         error=error,
         more=measured.more,
     )
