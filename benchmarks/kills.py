@@ -3,14 +3,16 @@
 ``python benchmarks/kills.py [COUNT]`` trains a small scene with `gsjax train` once
 without interruption, then COUNT times (default 20) kills the process (SIGKILL) at a
 random moment, from starting Python to writing the result, and goes on with
-``--resume``, every fourth time with a second kill on the way. The Gaussians, the last
-checkpoint and the log must be those of the first run, to the bit; seconds apart.
+``--resume``, every fourth time with a second kill on the way. A run that was over
+before its moment came does not count, and another takes its place. The Gaussians, the
+last checkpoint and the log must be those of the first run, to the bit; seconds apart.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -94,16 +96,23 @@ def main(count: int) -> None:
                 finish(command(folder / "dataset", run, strategy))
                 seconds[strategy] = time.perf_counter() - begun
                 wanted[strategy] = left_behind(run)
+
+        def killed(run, strategy, times):
+            """When, and whether the process was alive then: at least once."""
+            arguments = command(folder / "dataset", run, strategy, "--resume")
+            while True:
+                at = list(rng.uniform(0, seconds[strategy], times))
+                alive = [killed_after(arguments, t, environment) for t in at]
+                if any(alive):
+                    return at, alive
+                shutil.rmtree(run)
+
         for index in range(count):
             strategy = ("mcmc", "adaptive")[index % 2]
             run = folder / f"killed-{index}"
-            arguments = command(folder / "dataset", run, strategy, "--resume")
-            alive, at = [], []
-            for _ in range(2 if index % 4 == 3 else 1):
-                at.append(rng.uniform(0, seconds[strategy]))
-                alive.append(killed_after(arguments, at[-1], environment))
+            at, alive = killed(run, strategy, 2 if index % 4 == 3 else 1)
             kept = sorted(p.name for p in run.glob("checkpoints/*.npz"))
-            finish(arguments)
+            finish(command(folder / "dataset", run, strategy, "--resume"))
             rows.append(
                 {
                     "strategy": strategy,
