@@ -18,6 +18,10 @@ from jax.core import Tracer
 
 from gsjax.errors import InputError
 
+# What is nearer to the camera is not drawn, where nothing else is said; world units.
+NEAR = 0.01
+# px, of focal lengths; the principal point lies within. Nothing is drawn beyond.
+LENS_RANGE = (1e-15, 1e15)
 Array = jax.Array
 Point = tuple[Array, Array, Array]
 
@@ -114,7 +118,7 @@ def make_camera(
     K,
     width: int,
     height: int,
-    near=0.01,
+    near=NEAR,
     far=1e10,
     model: str | CameraModel = PINHOLE,
 ) -> Camera:
@@ -181,6 +185,14 @@ def _check_values(viewmat, K, near, far) -> None:
             raise InputError(f"{name} has a value that is not finite: {host[name]}")
     if not (host["K"][..., (0, 1), (0, 1)] > 0).all():
         raise InputError("K[0, 0] and K[1, 1], the focal lengths, must be above 0")
+    focal, centre = host["K"][..., (0, 1), (0, 1)], host["K"][..., :2, 2]
+    low, high = LENS_RANGE
+    if not ((focal > low) & (focal < high) & (np.abs(centre) < high)).all():
+        raise InputError(
+            f"K has a focal length of {focal.ravel()} px and a principal point at "
+            f"{centre.ravel()} px: within {low:g} and {high:g} is wanted, or nothing "
+            "could be drawn"
+        )
     if not ((host["near"] > 0) & (host["far"] > host["near"])).all():
         raise InputError(
             f"near {host['near']} and far {host['far']}: 0 < near < far is wanted"

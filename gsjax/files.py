@@ -150,8 +150,12 @@ def append_to_file(path: Path, data: bytes) -> None:
 
 def write_json(path: Path, data: Any, *, indent: int = 1) -> None:
     """Write ``data`` as JSON, without numbers that it lacks; as `write_file`."""
-    text = json.dumps(data, indent=indent, ensure_ascii=False, allow_nan=False)
-    write_file(path, f"{text}\n".encode())
+    form = {"indent": indent, "allow_nan": False}
+    try:
+        told = f"{json.dumps(data, ensure_ascii=False, **form)}\n".encode()
+    except UnicodeEncodeError:  # the name of a file that is not UTF-8
+        told = f"{json.dumps(data, **form)}\n".encode()
+    write_file(path, told)
 
 
 def finite_or_none(value: float) -> float | None:

@@ -16,6 +16,7 @@ from gsjax.console import note, progress
 from gsjax.gaussians import Gaussians
 from gsjax.movies import check_movie, write_movie
 from gsjax.scene import paths
+from gsjax.scene.image_files import short_names
 from gsjax.scene.image_header import image_size
 from gsjax.scene.transforms import CameraEntry
 from gsjax.scene.types import Scene, View
@@ -115,11 +116,13 @@ def _pictures(
 
 
 def _view_entries(views: Sequence[View], max_size: int | None) -> list[CameraEntry]:
-    names = [PurePosixPath(view.name).with_suffix("") for view in views]
+    names = [PurePosixPath(n) for n in short_names([view.name for view in views])]
     folder = posixpath.commonpath([str(n.parent) for n in names]) if names else ""
+    flat = ["_".join(name.relative_to(folder).parts) for name in names]
+    clear = len({name.casefold() for name in flat}) == len(flat)
     entries = []
-    for name, view in zip(names, views):
-        shown = "_".join(name.relative_to(folder).parts)
+    for index, (shown, view) in enumerate(zip(flat, views)):
+        shown = shown if clear else f"{index:05d}_{shown}"
         trained = _as_trained(view, max_size)
         entries.append(_entry(shown, trained.viewmat, trained))
     return entries

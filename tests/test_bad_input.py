@@ -100,6 +100,8 @@ def put(matrix, place, value):
         ({"K": put(K, (0, 2), np.nan)}, "K"),
         ({"K": put(K, (0, 0), 0.0)}, "focal"),
         ({"K": put(K, (1, 1), -50.0)}, "focal"),
+        ({"K": put(K, (0, 0), 1e16)}, "focal length of .* nothing could be drawn"),
+        ({"K": put(K, (0, 2), -1e16)}, "principal point at .* nothing could be"),
         ({"near": 0.0}, "near"),
         ({"near": np.nan}, "near"),
         ({"near": [0.1, 0.2]}, "near"),

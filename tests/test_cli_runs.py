@@ -212,11 +212,11 @@ def test_training_views_are_measured_beside_the_others(demo, tmp_path, capsys):
 
 
 def test_every_render_has_a_name_of_its_own():
-    from gsjax.train.held_out import _names
+    from gsjax.scene.image_files import short_names
 
-    assert _names(["a/1.jpg", "b/1.jpg"]) == ["a/1", "b/1"]
+    assert short_names(["a/1.jpg", "b/1.jpg"]) == ["a/1", "b/1"]
     for photos in (["1.jpg", "1.png"], ["1.jpg", "1.PNG", "1.jpg.png"], ["A.x", "a.y"]):
-        assert len({name.casefold() for name in _names(photos)}) == len(photos)
+        assert len({name.casefold() for name in short_names(photos)}) == len(photos)
 
 
 # --- export, info ---

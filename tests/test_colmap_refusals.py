@@ -153,7 +153,7 @@ def test_text_by_hand(tmp_path):
         ({"images": "1 nan 0 0 0 0 0 3 1 a.png"}, "pose .*finite numbers"),
         ({"images": "1 1 0 0 0 0 inf 3 1 a.png"}, "pose .*finite numbers"),
         ({"images": "1 1 0 0 0 0 1e300 3 1 a.png"}, "pose .*finite numbers"),
-        ({"images": f"{IMAGE}\n1 2"}, "line 2: 2 values; X Y POINT3D_ID"),
+        ({"images": f"{IMAGE}\n1 2"}, "line 2: 2 values, the last '2'; X Y POINT3D_ID"),
         ({"images": f"{IMAGE}\n\n{IMAGE}\n"}, "line 3: the id 1 is that of another im"),
         ({"images": IMAGE + "x" * 1100}, "a name of more than 1024 bytes"),
         ({"points": "7 1 2 3 255 0 9"}, "line 1: found 7 values, POINT3D_ID"),

@@ -1,6 +1,7 @@
 """Datasets as a whole: what is taken for what, far scenes, and splits."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -82,6 +83,18 @@ def test_names_are_sorted_and_unique(tmp_path):
     write_colmap(tmp_path / "sparse", scene, overwrite=True)
     with pytest.raises(InputError, match=r"'b\.png' is listed more than once"):
         load_dataset(tmp_path)
+
+
+def test_two_names_of_one_photograph(tmp_path):
+    """Else the one view would be trained on the other's photograph."""
+    made = scene_of_views(count=2)
+    views = [replace(v, name=n) for v, n in zip(made.views, ("a.jpg", "a.png"))]
+    write_colmap(tmp_path / "sparse", replace(made, views=tuple(views)))
+    save_photo(tmp_path / "images/a.png")
+    with pytest.raises(InputError, match=r"a\.jpg and a\.png are one photograph in"):
+        load_dataset(tmp_path)
+    save_photo(tmp_path / "images/a.jpg")
+    assert len(load_dataset(tmp_path).views) == 2
 
 
 # --- far scenes ---

@@ -272,7 +272,9 @@ def test_leaving_the_numbers_is_told():
     state = initial_state(scene(), config)
     tuning = replace(state.tuning, exposures=state.tuning.exposures * jnp.nan)
     log = Log()
-    with pytest.raises(DivergedError, match="in 30 steps running, up to step 30"):
+    with pytest.raises(
+        DivergedError, match="in 30 of the last 30 steps, up to step 30"
+    ):
         run(config, log, state=state.replace(tuning=tuning))
     assert [r["finite"] for r in log.records] == [False] * 29
 

@@ -53,6 +53,16 @@ def test_names_are_those_of_the_views_without_what_all_share(data):
     assert [e.name for e in path_entries(everything, "test")] == ["a_0", "a_1", "b_0"]
 
 
+def test_names_stay_apart(data):
+    """Of photographs of one stem, and of folders that are called like one."""
+    for names in (("a/0.png", "a/0.jpg"), ("a/b_0.png", "a_b/0.png")):
+        views = data.scene.views
+        views = tuple(replace(v, name=n) for v, n in zip(views, names))
+        two = Data(replace(data.scene, views=views), [0, 1], [])
+        found = [e.name.casefold() for e in path_entries(two, "train")]
+        assert len(set(found)) == 2
+
+
 @pytest.mark.parametrize("path", PATHS[2:])
 def test_paths_have_frames_of_one_size_that_see_the_scene(data, path):
     entries = path_entries(data, path, frames=5, max_size=64)

@@ -284,6 +284,26 @@ def test_noise_explores_with_what_is_transparent():
     assert (shifts[:, 80:] == 0).all()
 
 
+def test_the_unit_of_length_does_not_matter():
+    """Noise and penalty of a scene in other units, of which the extent tells."""
+    gaussians, rate, key = mixed(), jnp.asarray(1e-4), jax.random.key(1)
+    params = gaussians.params
+    for unit in (1e-3, 1e3):
+        larger = gaussians.replace(
+            params=params.replace(
+                means=params.means * unit,
+                log_scales=params.log_scales + np.log(unit),
+            )
+        )
+        here, there = mcmc(SETTINGS, 3.0), mcmc(SETTINGS, 3.0 * unit)
+        moved = here.perturb(key, gaussians, rate).means - params.means
+        found = there.perturb(key, larger, rate * unit).means - larger.params.means
+        assert np.abs(moved).max() > 1e-6
+        np.testing.assert_allclose(found, moved * unit, rtol=1e-6, atol=1e-12 * unit)
+        wanted = here.penalty(gaussians)
+        np.testing.assert_allclose(there.penalty(larger), wanted, rtol=1e-9)
+
+
 def test_noise_keeps_the_type():
     narrow = jax.tree.map(
         lambda a: a if a.dtype == bool else a.astype(jnp.float32), mixed()

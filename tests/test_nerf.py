@@ -237,7 +237,7 @@ def test_folders_within_folders(tmp_path, more, place):
     assert [view.image for view in load_dataset(tmp_path, **more).views] == copies
     for path in copies:
         path.unlink()
-    with pytest.raises(InputError, match=r"0\.png' is listed more than once"):
+    with pytest.raises(InputError, match=r"0\.png are one photograph in .*images_2, 0"):
         load_dataset(tmp_path, **more)
 
 

@@ -1,6 +1,7 @@
 """Structure from motion: cameras that are known, datasets, photos, masks, videos."""
 
 import json
+import os
 from pathlib import Path
 
 import cv2
@@ -28,7 +29,7 @@ from gsjax import InputError, cli
 from gsjax.scene.colmap import load_colmap
 from gsjax.scene.sfm import SfmSettings, run_sfm
 from gsjax.scene.sfm_colmap import exif_camera, extract
-from gsjax.scene.sfm_photos import Workshop, prepare_photos
+from gsjax.scene.sfm_photos import Workshop, find_photos, prepare_photos
 from gsjax.scene.video import sharpest_frames, sharpness
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is absent")
@@ -283,6 +284,21 @@ def test_video_to_dataset(video, tmp_path):
     assert list(report["registered"]) == [f"frame_{i:06d}.jpg" for i in range(3, 30, 5)]
     assert report["settings"]["matcher"] == "sequential"
     assert len(load_colmap(out).views) == 6
+
+
+def test_a_video_that_ends_early_is_told(video, monkeypatch):
+    monkeypatch.setattr("gsjax.scene.video._count", lambda _: 60)
+    with pytest.warns(UserWarning, match="breaks off after 30 of 60 frames"):
+        assert len(list(sharpest_frames(video, 6))) == 3
+    monkeypatch.setattr("gsjax.scene.video._count", lambda _: 31)
+    assert len(list(sharpest_frames(video, 31))) == 30
+
+
+def test_names_are_utf_8(tmp_path):
+    for name in (b"one.png", b"caf\xe9.png"):
+        (tmp_path / os.fsdecode(name)).write_bytes(b"")
+    with pytest.raises(InputError, match=r"'caf\\udce9.png' is not UTF-8; rename"):
+        find_photos(tmp_path)
 
 
 def test_a_video_that_breaks_off(video, tmp_path, monkeypatch):

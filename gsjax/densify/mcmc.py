@@ -3,7 +3,9 @@
 Axis legend: N Gaussians (capacity).
 
 Dead Gaussians are moved onto live ones, drawn by opacity, and the count grows to a
-cap in the same way; noise explores, and two penalties free what is not needed.
+cap in the same way; noise explores, and two penalties free what is not needed. The
+noise goes with the square of the scales and one penalty with them, in world units: here
+in units of a fifth of the scene's extent, so that a run does not depend on the unit.
 """
 
 import math
@@ -23,6 +25,9 @@ from gsjax.rotations import covariance
 
 Array = jax.Array
 
+# Extent of the scenes that the paper's noise and penalty are for: COLMAP scales what it
+# reconstructs so that eight tenths of the cameras lie within 10 units along an axis.
+_USUAL_EXTENT = 5.0
 # Trapezoid of ∫ over [0, 5]; the integrand is entire, so it converges faster than
 # any power of the step: 3e-7 relative for n up to 51 (tested).
 _NODES, _REACH = 51, 5.0
@@ -78,8 +83,14 @@ class McmcSettings:
                 )
 
 
-def mcmc(settings: McmcSettings) -> Densifier:
-    """The strategy."""
+def mcmc(settings: McmcSettings, extent: float = _USUAL_EXTENT) -> Densifier:
+    """The strategy.
+
+    Args:
+      settings: see there.
+      extent: of the scene, in its units; see `gsjax.scene.initialise.scene_extent`.
+    """
+    unit = extent / _USUAL_EXTENT
 
     def plan(key: Array, step: Array, gaussians: Gaussians, stats: tuple):
         del step
@@ -105,7 +116,8 @@ def mcmc(settings: McmcSettings) -> Densifier:
         scales = exp_log_scale(jnp.where(active[:, None], params.log_scales, 0))
         of_opacity = jnp.sum(jnp.where(active, opacity, 0)) / count
         of_scale = jnp.sum(jnp.where(active[:, None], scales, 0)) / (3 * count)
-        return settings.opacity_penalty * of_opacity + settings.scale_penalty * of_scale
+        by_scale = settings.scale_penalty / unit * of_scale
+        return settings.opacity_penalty * of_opacity + by_scale
 
     def perturb(key: Array, gaussians: Gaussians, rate: Array):
         params = gaussians.params
@@ -115,7 +127,8 @@ def mcmc(settings: McmcSettings) -> Densifier:
         spread = covariance(params.quats, exp_log_scale(params.log_scales))
         shift = jnp.einsum("nij,nj->ni", spread, noise, precision="highest")
         # The rate may be wider than the parameters, and must not widen them.
-        shift = shift * (gate * settings.noise * rate.astype(gate.dtype))[:, None]
+        strength = settings.noise / unit**2 * rate.astype(gate.dtype)
+        shift = shift * (gate * strength)[:, None]
         moved = params.means + shift
         good = gaussians.active[:, None] & jnp.isfinite(moved)
         means = jnp.where(good, moved, params.means)

@@ -14,7 +14,7 @@ from jax import lax
 
 from gsjax import rotations
 from gsjax import sh as sh_lib
-from gsjax.cameras import Camera, camera_centre
+from gsjax.cameras import LENS_RANGE, Camera, camera_centre
 from gsjax.gaussians import Gaussians
 from gsjax.numerics import exp_log_scale, near_one, safe_normalize
 from gsjax.raster.batches import any_of_batch
@@ -24,7 +24,6 @@ from gsjax.raster.types import Array, Projected, RasterConfig
 # What keeps squares of squares within float32, far beyond what any image shows.
 _LONGEST = 1e9  # px, σ along an axis: a longer one is drawn as long as this
 COLOR_LIMIT = 1e32  # a coefficient or feature from there on counts as infinite
-_LENS_RANGE = (1e-15, 1e15)  # px, focal lengths; the principal point lies within
 
 
 def transform_point(viewmat: Array, point):
@@ -52,7 +51,7 @@ def ewa_jacobian(camera: Camera, point):
 
 def usable(camera: Camera) -> Array:
     """Whether a camera can draw at all; under jit a bad one cannot be refused."""
-    low, high = _LENS_RANGE
+    low, high = LENS_RANGE
     focal = jnp.abs(jnp.stack([camera.K[0, 0], camera.K[1, 1]]))
     centre = jnp.abs(jnp.stack([camera.K[0, 2], camera.K[1, 2]]))
     good = jnp.all(jnp.isfinite(camera.viewmat[:3]))

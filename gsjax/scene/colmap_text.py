@@ -109,6 +109,21 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
     return cameras
 
 
+def _check_observations(where: str, line: str) -> None:
+    """See that a line may be the 2D points of an image; they are not read.
+
+    Raises:
+      InputError: if not; as where it was left out, and the next image stands there.
+    """
+    values = line.split()
+    last = values[-1].removeprefix("-") if values else "0"
+    if len(values) % 3 or not (last.isascii() and last.isdecimal()):
+        raise InputError(
+            f"{where}: {len(values)} values, the last {values[-1][:40]!r}; X Y "
+            "POINT3D_ID of each 2D point, or an empty line, is wanted after an image"
+        )
+
+
 def read_images(path: Path) -> list[ColmapImage]:
     """Images of an images.txt, in its order; their 2D points are skipped."""
     images: list[ColmapImage] = []
@@ -119,11 +134,7 @@ def read_images(path: Path) -> list[ColmapImage]:
         where = f"{path}: line {number}"
         if observations:  # a line of its own after each image, which may be empty
             observations = False
-            if len(line.split()) % 3:
-                raise InputError(
-                    f"{where}: {len(line.split())} values; X Y POINT3D_ID of each 2D "
-                    "point, or an empty line, is wanted after an image"
-                )
+            _check_observations(where, line)
             continue
         if not _is_record(line):
             declared = _declared(line, "images", declared)

@@ -110,7 +110,7 @@ def find_files(
 
     Raises:
       InputError: on missing files, unless ``skip_missing``; on all files missing; on
-        a name that leads out of ``root``.
+        two names of one file; on a name that leads out of ``root``.
     """
     found: dict[str, Path] = {}
     missing: list[str] = []
@@ -124,6 +124,13 @@ def find_files(
             missing.append(name)
         else:
             found[name] = path
+    owner: dict[Path, str] = {}
+    for name, path in found.items():
+        if owner.setdefault(path, name) != name:
+            raise InputError(
+                f"{source}: {owner[path]} and {name} are one photograph in {root}, "
+                f"{path.name}; put there what is missing, or take one off the list"
+            )
     if missing:
         message = (
             f"{source}: {len(missing)} of {len(missing) + len(found)} photographs are "
@@ -153,6 +160,28 @@ def _stems(folder: Path) -> dict[str, Path]:
     files = [p for p in files if p.suffix.lower() in rank]
     files.sort(key=lambda p: (rank[p.suffix.lower()], p.name))
     return {p.stem: p for p in files}
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Of photographs: without suffixes, unless two of them then had one name."""
+    short = [str(Path(name).with_suffix("")) for name in names]
+    clear = len({name.casefold() for name in short}) == len(short)
+    return short if clear else list(names)
+
+
+def check_name(path: Path) -> str:
+    """The name of a file, which datasets hold in UTF-8.
+
+    Raises:
+      InputError: if it is not.
+    """
+    try:
+        path.name.encode()
+    except UnicodeEncodeError as error:
+        raise InputError(
+            f"{path.parent}: the name of {path.name!r} is not UTF-8; rename the file"
+        ) from error
+    return path.name
 
 
 def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:

@@ -18,8 +18,12 @@ Buffer = bytes | mmap.mmap
 MAX_PIXELS = 1 << 28
 # Deflate shrinks by 1032 at most, so that a smaller PNG cannot be complete.
 _MAX_DEFLATE = 1032
+# LZW, the other of TIFF's, by less than 1400: 12 bits for 4096 bytes at most.
+_MAX_TIFF = 1400
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _REMEDY = "copy or export it again"
+# Tags of TIFF: width, height, bits of a sample, compression, samples of a pixel.
+_TIFF_TAGS = (256, 257, 258, 259, 277)
 # Markers of JPEG without a length, and those that carry the size of the image.
 _JPEG_BARE = {0x01, *range(0xD0, 0xD9)}
 _JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
@@ -108,7 +112,7 @@ def _png(data: Buffer) -> tuple[int, int]:
 
 
 def _jpeg(data: Buffer) -> tuple[int, int]:
-    at, size = 2, None
+    at, size, arithmetic = 2, None, False
     while True:
         marker, code = data[at], data[at + 1]
         if marker != 0xFF:
@@ -123,8 +127,11 @@ def _jpeg(data: Buffer) -> tuple[int, int]:
             break
         if code in _JPEG_FRAMES:
             height, width = struct.unpack_from(">HH", data, at + 5)
-            size = width, height
+            size, arithmetic = (width, height), code > 0xC8
         at += 2 + struct.unpack_from(">H", data, at + 2)[0]
+    # Huffman codes take a bit or more for each block of 8 × 8.
+    if not arithmetic and -(-size[0] // 8) * -(-size[1] // 8) > 8 * len(data):
+        raise _Truncated(f"{size[0]} × {size[1]} px cannot fit in it")
     # Within compressed data FF is followed by 00 or a restart, so this is the end.
     if data.find(b"\xff\xd9", at) < 0:
         raise _Truncated("no end-of-image marker")
@@ -154,14 +161,23 @@ def _tiff(data: Buffer) -> tuple[int, int]:
     (at,) = struct.unpack_from(f"{order}I", data, 4)
     (count,) = struct.unpack_from(f"{order}H", data, at)
     found = {}
-    for index in range(count):
-        tag, kind = struct.unpack_from(f"{order}HH", data, at + 2 + 12 * index)
+    for entry in range(at + 2, at + 2 + 12 * count, 12):
+        tag, kind, values = struct.unpack_from(f"{order}HHI", data, entry)
         form = {1: "B", 3: "H", 4: "I"}.get(kind)
-        if tag in (256, 257) and form:
-            (found[tag],) = struct.unpack_from(order + form, data, at + 10 + 12 * index)
-    if len(found) < 2:
+        if tag in _TIFF_TAGS and form:
+            at = entry + 8
+            if values * struct.calcsize(form) > 4:  # of several the first, elsewhere
+                (at,) = struct.unpack_from(f"{order}I", data, at)
+            (found[tag],) = struct.unpack_from(order + form, data, at)
+    if not {256, 257} <= set(found):
         raise _Truncated("no image size")
-    return found[256], found[257]
+    width, height = found[256], found[257]
+    bits = width * height * found.get(258, 1) * found.get(277, 1)
+    ratio = {1: 1, 5: _MAX_TIFF, 8: _MAX_DEFLATE, 32946: _MAX_DEFLATE}
+    shrunk = ratio.get(found.get(259, 1))  # others, as of fax, have no such bound
+    if width * height <= MAX_PIXELS and shrunk and bits > 8 * shrunk * len(data):
+        raise _Truncated(f"{width} × {height} px cannot fit in it")
+    return width, height
 
 
 def _bmp(data: Buffer) -> tuple[int, int]:

@@ -14,7 +14,7 @@ from gsjax.errors import InputError
 from gsjax.files import read_bytes
 from gsjax.io.npy import read_npy
 from gsjax.scene.colmap_model import MAX_COORDINATE, MAX_SIDE
-from gsjax.scene.image_files import SUFFIXES, image_folder
+from gsjax.scene.image_files import SUFFIXES, check_name, image_folder
 from gsjax.scene.transforms_fields import rigid
 from gsjax.scene.types import Scene, View
 
@@ -42,7 +42,7 @@ def load_llff(
             "rows have no names, the photographs must be exactly those of the rows"
         )
     views = [
-        _view(f"{path}: row {index}", row, file)
+        _view(f"{path}: row {index}", row, file.with_name(check_name(file)))
         for index, (row, file) in enumerate(zip(table, files))
     ]
     return Scene(path, "llff", tuple(views))

@@ -162,6 +162,14 @@ def _masked(path: Path, width: int, height: int) -> np.ndarray:
     """[H, W] bool: where the mask is 0."""
     mask = _decode(path, grey=True)
     if mask.shape != (height, width):
+        rounding = sum(1 / side for side in (*mask.shape, height, width))
+        stretch = mask.shape[1] / width * height / mask.shape[0]
+        if abs(np.log(stretch)) > _ASPECT_TOLERANCE + rounding:
+            raise InputError(
+                f"{path}: a mask of {mask.shape[1]} × {mask.shape[0]} px for a "
+                f"photograph of {width} × {height}; one of the same aspect ratio is "
+                "wanted"
+            )
         rows = (np.arange(height) + 0.5) * (mask.shape[0] / height)
         columns = (np.arange(width) + 0.5) * (mask.shape[1] / width)
         mask = mask[rows.astype(int)[:, None], columns.astype(int)]

@@ -16,7 +16,7 @@ import numpy as np
 from gsjax.errors import InputError
 from gsjax.files import read_bytes, write_file
 from gsjax.images import encode_png, opencv
-from gsjax.scene.image_files import find_mask
+from gsjax.scene.image_files import check_name, find_mask
 from gsjax.scene.image_header import check_image
 from gsjax.scene.sfm_colmap import Shot, exif_camera
 
@@ -105,8 +105,13 @@ def _told_of_subfolders(folder: Path) -> str:
 
 
 def dataset_name(path: Path) -> str:
-    """What a photograph is called in the dataset: as it was, if JPEG or PNG."""
+    """What a photograph is called in the dataset: as it was, if JPEG or PNG.
+
+    Raises:
+      InputError: if that is not UTF-8.
+    """
     kept = path.suffix.lower() in _KEPT
+    check_name(path)
     return path.name if kept else path.with_suffix(".png").name
 
 

@@ -1,5 +1,6 @@
 """Frames of a video: of each stretch of time the sharpest."""
 
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -10,6 +11,7 @@ from gsjax.errors import InputError
 from gsjax.images import opencv
 from gsjax.scene.sfm_photos import READ, shrink, silent_libraries
 
+_MOST = 0.9  # of the frames; what a file says of their number is often a little off
 _JUDGED_AT = 640  # px: noise of single pixels is not sharpness
 
 
@@ -39,6 +41,9 @@ def sharpest_frames(path: Path, wanted: int, max_size: int = 0) -> Iterator[Fram
 
     Raises:
       InputError: if it is not a video, or breaks off before the second frame.
+
+    Warns:
+      if it breaks off later.
     """
     total = _count(path)
     if total < 2:
@@ -55,6 +60,13 @@ def sharpest_frames(path: Path, wanted: int, max_size: int = 0) -> Iterator[Fram
             best, best_score = Frame(index, shrink(pixels, max_size)), score
     if best is not None:
         yield best
+    if index + 1 < _MOST * total:
+        warnings.warn(
+            f"{path}: breaks off after {index + 1} of {total} frames; copy it again if "
+            "it is to be longer",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
 def _frames(path: Path) -> Iterator[np.ndarray]:

@@ -137,7 +137,12 @@ def around_marks(path: Path) -> tuple[str, str]:
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file to put the table into")
-    text = path.read_text(encoding="utf-8")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: byte {error.start} is not UTF-8; save it as that"
+        ) from error
     before, found, rest = text.partition(_MARKS[0])
     _, closed, after = rest.partition(_MARKS[1])
     if not found or not closed or _MARKS[0] in rest:

@@ -130,7 +130,7 @@ class TrainConfig:
     def densifier(self, extent: float) -> Densifier:
         """The strategy, for a scene of this extent."""
         if self.strategy == "mcmc":
-            return mcmc(self.mcmc)
+            return mcmc(self.mcmc, extent)
         return adaptive(self.adaptive, extent)
 
     @property

@@ -171,8 +171,8 @@ def fit(
       CapacityError: if a view wants more pairs than can be addressed, or a step more
         memory than there is (see `gsjax.memory`); what was learnt until then has gone
         to ``hooks.checkpoint``.
-      DivergedError: if for 50 steps running, or half of a short run, numbers are not
-        finite, pictures are worse than any can be, or nothing is in view any more.
+      DivergedError: if in 50 of the last 100 steps, or half of a short run, numbers
+        are not finite, pictures are worse than any can be, or nothing is in view.
     """
     check_photos(scene, photos)
     hooks = hooks or Hooks()

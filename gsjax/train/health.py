@@ -4,14 +4,16 @@ Both are looked at on the host, and neither changes a bit of what is computed.
 """
 
 import warnings
+from collections import deque
 from collections.abc import Sequence
 
+from gsjax.cameras import NEAR
 from gsjax.errors import DivergedError, InputError
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.step import Metrics
 
 _MAX_BAD_STEPS = 50
-_LOST = "nothing of the scene was in view any more"
+_LOST = "nothing of the scene was in view"
 # A loss above it is not that of photographs of nothing.
 _SOMETHING = 0.01
 
@@ -48,16 +50,24 @@ def check_photos(scene: Scene, photos: Sequence[Photo]) -> None:
 
 
 def check_points(scene: Scene) -> None:
-    """See that some point lies before some camera.
+    """See that some point lies before some camera, and not too near to be drawn.
 
     Raises:
       InputError: if none does: such Gaussians would never be seen, nor ever move.
     """
-    points = scene.points
+    points, farthest = scene.points, 0.0
     for view in scene.views:
         depth = points @ view.viewmat[2, :3] + view.viewmat[2, 3]
-        if len(points) == 0 or (depth > 0).any():
+        farthest = max(farthest, depth.max(initial=0))
+        if len(points) == 0 or farthest > NEAR:
             return
+    if farthest > 0:
+        raise InputError(
+            f"{scene.source}: no point is farther than {farthest:.2g} from a camera, "
+            f"and what is nearer than {NEAR:g} is not drawn; give the dataset a "
+            "smaller unit of length: multiply points and camera positions by "
+            f"{10 * NEAR / farthest:.1g} or more"
+        )
     raise InputError(
         f"{scene.source}: all {len(points):,} points lie behind all {len(scene.views)} "
         "cameras; are the poses camera → world where world → camera is wanted, or "
@@ -67,17 +77,17 @@ def check_points(scene: Scene) -> None:
 
 
 class Health:
-    """Counts the steps in a row that did a run no good.
+    """Counts the steps that did a run no good.
 
     Attributes:
-      bad: that many, up to now.
+      bad: that many in a row, up to now.
     """
 
     def __init__(self, steps: int):
         self.bad = 0
         # A short run has an end before so many have come together.
         self._limit = min(_MAX_BAD_STEPS, max(1, steps // 2))
-        self._saw = False
+        self._lately = deque[bool](maxlen=2 * _MAX_BAD_STEPS)
 
     def look(self, metrics: Metrics) -> None:
         """Take a step into account.
@@ -86,13 +96,14 @@ class Health:
           DivergedError: at the last of too many bad ones.
         """
         fault = self._fault(metrics)
-        self._saw |= bool(metrics.pairs > 0)
         self.bad = 0 if fault is None else self.bad + 1
-        if self.bad >= (_MAX_BAD_STEPS if fault == _LOST else self._limit):
+        self._lately.append(fault is not None)
+        count = sum(self._lately)
+        if fault and count >= (_MAX_BAD_STEPS if fault == _LOST else self._limit):
             raise DivergedError(
-                f"{fault} in {self.bad} steps running, up to step {int(metrics.step)}; "
-                "look for a photograph or a pose that is off, or train anew with lower "
-                "rates (TrainConfig.rates)"
+                f"{fault} in {count} of the last {len(self._lately)} steps, up to step "
+                f"{int(metrics.step)}; look for a photograph or a pose that is off, or "
+                "train anew with lower rates (TrainConfig.rates)"
             )
 
     def _fault(self, metrics: Metrics) -> str | None:
@@ -100,6 +111,6 @@ class Health:
             return "the loss, its gradient or a Gaussian was not finite"
         if metrics.psnr < 0:  # an error above 1, of colours from 0 to 1
             return "the picture was farther from the photograph than any can be"
-        if self._saw and metrics.pairs == 0 and metrics.loss > _SOMETHING:
+        if metrics.pairs == 0 and metrics.loss > _SOMETHING:
             return _LOST
         return None

@@ -10,6 +10,7 @@ from gsjax.errors import InputError
 from gsjax.evaluation import Summary, ViewResult, evaluate, summarise
 from gsjax.files import finite_or_none, make_folder, write_file, write_json
 from gsjax.gaussians import Gaussians
+from gsjax.scene.image_files import short_names
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
 from gsjax.sheets import SheetRow, comparison
@@ -91,7 +92,7 @@ def write_evaluation(
     """
     make_folder(files.renders)
     begun, results = time.perf_counter(), []
-    names = _names([view.name for view in scene.views])
+    names = short_names([view.name for view in scene.views])
     for name, result in zip(names, results_of(gaussians, scene, photos, config)):
         path = files.renders / f"{name}.png"
         make_folder(path.parent)
@@ -110,13 +111,6 @@ def write_evaluation(
     write_json(files.eval, told)
     _write_preview(files, results)
     return summary
-
-
-def _names(photos: list[str]) -> list[str]:
-    """Of the renders: without suffixes, unless two photographs then had one name."""
-    short = [str(Path(name).with_suffix("")) for name in photos]
-    clear = len({name.casefold() for name in short}) == len(short)
-    return short if clear else photos
 
 
 def _told(result: ViewResult) -> dict:

@@ -88,6 +88,33 @@ def first_array(found):
     return next(name for name in found if "means" in name)
 
 
+def jpeg_of(width: int, height: int):
+    """Another size in the frame of a baseline JPEG."""
+
+    def change(data: bytes) -> bytes:
+        start = data.index(b"\xff\xc0")
+        return put(start + 5, "4s", struct.pack(">HH", height, width))(data)
+
+    return change
+
+
+def tiff_of(width: int, height: int):
+    """Another size, and as many rows in the one strip, in a little-endian TIFF."""
+
+    def change(data: bytes) -> bytes:
+        (start,) = struct.unpack_from("<I", data, 4)
+        (count,) = struct.unpack_from("<H", data, start)
+        wanted = {256: width, 257: height, 278: height}
+        for entry in range(start + 2, start + 2 + 12 * count, 12):
+            (tag,) = struct.unpack_from("<H", data, entry)
+            if tag in wanted:
+                data = put(entry + 2, "HII", 4, 1, wanted.pop(tag))(data)
+        assert not wanted
+        return data
+
+    return change
+
+
 def png(width, height, color=2) -> bytes:
     def chunk(kind, body):
         crc = struct.pack(">I", zlib.crc32(kind + body))
@@ -200,6 +227,11 @@ BAD = {
     "text observations": Bad(
         "text/images.txt", swap("1.5 2 1", "1 2"), "line 4: 2 val"
     ),
+    "text no observations": Bad(
+        "text/images.txt",
+        swap("1.5 2 1", "7 1 0 0 0 0 0 1 1 IMG (2) a.png"),
+        "line 4: 12 values, the last 'a.png'; X Y POINT3D_ID",
+    ),
     "text colour": Bad("text/points3D.txt", swap("255", "256"), "line 3: colour .256"),
     "text track": Bad("text/points3D.txt", swap("2 1\n", "2\n"), "line 3: the track"),
     "text point": Bad("text/points3D.txt", swap("0.5 1", "0.5 1_"), "line 3: .*1_"),
@@ -295,12 +327,15 @@ BAD = {
     "photo aspect": Bad("photo.png", constant(png(16, 20, 0)), "16 × 20 px, but it"),
     "photo checksum": Bad("photo.png", put(50, "B", 77), "cannot be decoded"),
     "jpeg cut": Bad("photo.jpg", lambda d: d[:-9], "no end-of-image marker"),
+    "jpeg bomb": Bad("photo.jpg", jpeg_of(8000, 8000), "8000 × 8000 px cannot fit"),
     "jpeg marker": Bad("photo.jpg", put(2, "B", 0), "starts with|no marker"),
     "webp length": Bad(
         "photo.webp", put(4, "I", 2**31), "2147483656 bytes are declared"
     ),
+    "tiff bomb": Bad("photo.tiff", tiff_of(8000, 8000), "8000 × 8000 px cannot fit"),
     "tiff offset": Bad("photo.tiff", put(4, "I", 2**32 - 1), "truncated or damaged"),
     "bmp size": Bad("photo.bmp", put(18, "i", 2**30), "declares 1073741824 × 6 px"),
+    "mask aspect": Bad("mask.png", constant(png(16, 20, 0)), "a mask of 16 × 20"),
     "mask kind": Bad("mask.png", constant(b"no mask"), "starts with b'no mask'"),
     # checkpoints
     "zip empty": Bad(STEP, constant(b""), "damaged checkpoint: File is not a zip file"),

@@ -9,12 +9,14 @@ import json
 import os
 import signal
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
 import pytest
+from captures import scene_of_views
 from hostile import HOSTILE, harmless, write_hostile
 
 import gsjax
@@ -31,7 +33,7 @@ from gsjax.subjects import splat_file
 from gsjax.train.checkpoint import load_checkpoint
 from gsjax.train.config import TrainConfig
 from gsjax.train.folder import RunSettings
-from gsjax.train.health import Health
+from gsjax.train.health import Health, check_points
 from gsjax.train.held_out import evaluate_run
 from gsjax.train.history import read_metrics
 from gsjax.train.run import resume_run, start_run
@@ -110,6 +112,28 @@ def test_ends_in_a_finite_scene_or_in_one_line(name, strategy, tmp_path):
     assert result.summary.views == 1
 
 
+def in_units(scene, unit: float):
+    """All lengths times ``unit``."""
+    scale = np.diag([unit, unit, unit, 1.0])
+    views = [
+        replace(v, viewmat=scale @ v.viewmat @ np.linalg.inv(scale))
+        for v in scene.views
+    ]
+    return replace(scene, views=tuple(views), points=scene.points * unit)
+
+
+def test_a_unit_too_large_is_told():
+    """What is nearer than `NEAR` would never be drawn, nor ever move."""
+    scene = scene_of_views(count=3)
+    check_points(scene)
+    small = in_units(scene, 1e-4)
+    with pytest.raises(InputError, match=r"nearer than 0\.01 .* smaller unit") as told:
+        check_points(small)
+    factor = float(str(told.value).split()[-3])
+    assert factor > 1
+    check_points(in_units(small, factor))
+
+
 # --- divergence ---
 
 
@@ -174,7 +198,7 @@ def metrics_of(step, **changes) -> Metrics:
 
 
 def test_what_counts_as_diverging():
-    """Steps in a row, and only what can be nothing else."""
+    """So many of the last steps, and only what can be nothing else."""
 
     def run(bad, steps=1000, start=1):
         health = Health(steps)
@@ -186,19 +210,24 @@ def test_what_counts_as_diverging():
 
     nothing = {"pairs": 0}
     for bad in ({"finite": False}, {"psnr": -0.1}, nothing):
-        with pytest.raises(DivergedError, match=r"in 50 steps running, up to step 50"):
+        with pytest.raises(DivergedError, match=r"in 50 of the last 51 .* step 50"):
             run(bad)
-    with pytest.raises(DivergedError, match=r"in 8 steps running"):
+    with pytest.raises(DivergedError, match=r"in 8 of the last 9 steps"):
         run({"finite": False}, steps=16)
-    # Photographs of nothing are shown by nothing; and what never was cannot be lost.
+    with pytest.raises(DivergedError, match=r"in view in 50 of the last 50 steps"):
+        run(nothing, start=0)
+    # Photographs of nothing are shown by nothing.
     assert run({**nothing, "loss": 0.001}).bad == 0
-    assert run(nothing, start=0).bad == 0
     for fine in ({"psnr": 0.1}, {"psnr": np.inf}, {"loss": 50.0}):
         assert run(fine).bad == 0
     health = run({})
     for step in range(200):
         health.look(metrics_of(step, finite=bool(step % 40)))
     assert health.bad == 0
+    for step in range(99):
+        health.look(metrics_of(step, finite=bool(step % 2 == 0)))
+    with pytest.raises(DivergedError, match=r"in 50 of the last 100 steps"):
+        health.look(metrics_of(99, finite=False))
 
 
 # --- memory ---

@@ -164,6 +164,9 @@ def test_json_and_markdown(monkeypatch, tmp_path, capsys):
     capsys.readouterr()
     assert stress(monkeypatch, "well", *args) == 3
     assert "exists; pass --overwrite" in capsys.readouterr().err
+    page.write_bytes(b"caf\xe9")
+    assert stress(monkeypatch, "well", "--markdown", str(page)) == 3
+    assert "byte 3 is not UTF-8" in capsys.readouterr().err
     page.write_text("no marks")
     for where, told in ((page, "no place for the table"), (tmp_path / "x", "no such")):
         assert stress(monkeypatch, "well", "--markdown", str(where)) == 3
