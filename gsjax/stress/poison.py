@@ -8,16 +8,19 @@ rounding of such sums.
 """
 
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.cameras import Camera
+from gsjax.cameras import ORTHOGRAPHIC, Camera
 from gsjax.gaussians import Gaussians
+from gsjax.raster.types import RasterConfig
 from gsjax.stress.scenes import (
     BACKGROUND,
+    COMPAT,
     FIELDS,
     SLOTS,
     camera_of,
@@ -59,15 +62,21 @@ def poisoned(value: float, shift: int) -> tuple[Gaussians, dict[int, str]]:
     return changed(usual(), **fields), slots
 
 
-def traces(scene: Gaussians, spoilt: list[int], value: float) -> dict[str, list[int]]:
+def traces(
+    scene: Gaussians, spoilt: list[int], value: float, setting: str = "usual"
+) -> dict[str, list[int]]:
     """What is wrong with a scene of which ``spoilt`` slots hold ``value``.
+
+    Args:
+      setting: of `settings`.
 
     Returns:
       "not finite": how many numbers; "seen": spoilt slots that show although their
       value is no finite number; "traces": how many numbers differ from those of the
       scene without what is not seen.
     """
-    out, slopes = usual_gradients(scene)
+    seen_by = partial(usual_gradients, **settings()[setting])
+    out, slopes = seen_by(scene)
     images = (out.rgb, out.alpha, out.depth, out.radii)
     unseen = out.radii == 0
     clean = jax.tree.map(
@@ -78,7 +87,7 @@ def traces(scene: Gaussians, spoilt: list[int], value: float) -> dict[str, list[
         usual().params,
     )
     without = scene.replace(params=clean, active=scene.active & ~unseen)  # pyright: ignore
-    wanted, wanted_slopes = usual_gradients(without)
+    wanted, wanted_slopes = seen_by(without)
     difference = unequal(images[:3], (wanted.rgb, wanted.alpha, wanted.depth))
     difference += unequal(slopes.params, wanted_slopes.params)
     difference += unequal(slopes.background, wanted_slopes.background)
@@ -105,6 +114,40 @@ def _sweep(full: bool) -> Iterator[tuple[float, int, dict, dict]]:
         for shift in range(SLOTS) if full else (0,):
             scene, slots = poisoned(value, shift)
             yield value, shift, slots, traces(scene, list(slots), value)
+
+
+@cache
+def settings() -> dict[str, dict[str, Any]]:
+    """Ways to render, as arguments of `usual_gradients`."""
+    outputs = (*COMPAT.outputs, "median_depth")
+    accurate = RasterConfig.accurate().replace(
+        rungs=1, devices=1, pair_capacity=COMPAT.pair_capacity, outputs=outputs
+    )
+    level = {"focal": 6.0, "model": ORTHOGRAPHIC}
+    return {
+        "usual": {},
+        "antialiased": {"config": COMPAT.replace(antialias=True)},
+        "accurate": {"config": accurate},
+        "orthographic": {"camera": camera_of(**level)},
+    }
+
+
+def of_settings(full: bool) -> Measured:
+    """All that `traces` counts, over ways to render, values and numbers."""
+    del full
+    count, words, others = 0, [], [name for name in settings() if name != "usual"]
+    for setting in others:
+        for value in VALUES:
+            scene, slots = poisoned(value, 0)
+            wrong = traces(scene, list(slots), value, setting)
+            changes, seen = wrong["traces"]
+            some = sum(wrong["not finite"]) + len(wrong["seen"]) + changes
+            some += seen < SLOTS // 4
+            count += some
+            if some:
+                words.append(f"{value:g}, {setting}: {wrong}")
+    what = f"{', '.join(others)}: {len(VALUES)} values × {len(entries())} numbers"
+    return Measured(count, "; ".join([what, *words[:2]]), {"wrong": words})
 
 
 @cache
@@ -136,30 +179,35 @@ def of_parameters(kind: str):
     return measure
 
 
-def spoilt_cameras() -> Iterator[tuple[str, float, Camera]]:
-    """Cameras as they can arise under jit, where nothing can be refused."""
-    camera = camera_of()
+def camera_entries() -> Iterator[tuple[str, tuple[int, ...]]]:
+    """Every single number of a camera: (field, index)."""
     for name in ("viewmat", "K", "near", "far"):
-        array = np.asarray(getattr(camera, name))
-        for index in np.ndindex(array.shape):
-            for value in VALUES:
-                bad = array.copy()
-                bad[index] = value
-                fields = {**vars(camera), name: jnp.asarray(bad)}
-                yield f"{name}{list(index)}", value, Camera(**fields)
+        for index in np.ndindex(getattr(camera_of(), name).shape):
+            yield name, index
+
+
+def spoilt_camera(values: dict[tuple[str, tuple[int, ...]], float]) -> Camera:
+    """As it can arise under jit, where nothing can be refused."""
+    fields = vars(camera_of()).copy()
+    for (name, index), value in values.items():
+        array = np.array(fields[name])
+        array[index] = value
+        fields[name] = jnp.asarray(array)
+    return Camera(**fields)
 
 
 def of_cameras(full: bool) -> Measured:
     """Numbers that are not finite, in images and gradients, over spoilt cameras."""
     del full
     count, words, renders = 0, [], 0
-    for name, value, camera in spoilt_cameras():
-        renders += 1
-        out, slopes = usual_gradients(usual(), camera)
-        wrong = not_finite((out.rgb, out.alpha, out.depth, out.radii, slopes))
-        count += wrong
-        if wrong:
-            words.append(f"{value:g} in {name}")
+    for entry in camera_entries():
+        for value in VALUES:
+            renders += 1
+            out, slopes = usual_gradients(usual(), spoilt_camera({entry: value}))
+            wrong = not_finite((out.rgb, out.alpha, out.depth, out.radii, slopes))
+            count += wrong
+            if wrong:
+                words.append(f"{value:g} in {entry[0]}{list(entry[1])}")
     return Measured(
         count, "; ".join([f"{renders} cameras", *words[:2]]), {"wrong": words}
     )
@@ -186,6 +234,7 @@ CASES = (
     Case("poison/not finite", "images and gradients", 0, of_parameters("not finite")),
     Case("poison/seen", "Gaussians of NaN or inf seen", 0, of_parameters("seen")),
     Case("poison/traces", "live numbers changed", 0, of_parameters("traces")),
+    Case("poison/settings", "any of these", 0, of_settings, full_only=True),
     Case("poison/camera", "images and gradients not finite", 0, of_cameras),
     Case("poison/background", "images and gradients not finite", 0, of_backgrounds),
 )

@@ -142,15 +142,19 @@ def _channels(rgb, alpha, depth) -> Array:
     return jnp.concatenate([rgb, alpha[..., None], depth[..., None]], -1)
 
 
-@jax.jit
+@partial(jax.jit, static_argnames="config")
 def gradients(
-    gaussians: Gaussians, camera: Camera, background: Array, weigh: Array
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Array,
+    weigh: Array,
+    config: RasterConfig = COMPAT,
 ) -> tuple[Render, Gradients]:
-    """A render by the usual settings, and the slopes of Σ weigh · channels."""
+    """A render, and the slopes of Σ weigh · channels."""
 
     def loss(params, camera, background):
         scene = gaussians.replace(params=params)  # pyright: ignore
-        out = render(scene, camera, COMPAT, background)
+        out = render(scene, camera, config, background)
         return jnp.sum(weigh * _channels(out.rgb, out.alpha, out.depth)), out
 
     given = gaussians.params, camera, background
@@ -163,13 +167,14 @@ def usual_gradients(
     camera: Camera | None = None,
     background: np.ndarray = BACKGROUND,
     weigh: np.ndarray | None = None,
+    config: RasterConfig = COMPAT,
 ) -> tuple[Any, Any]:
     """`gradients` on the host; default the usual camera, background and weights."""
     camera = camera_of() if camera is None else camera
     weigh = weights() if weigh is None else weigh
     # Always of one type: another would be compiled again.
     given = single(background), single(weigh)
-    return on_host(gradients(gaussians, camera, *given))
+    return on_host(gradients(gaussians, camera, *given, config=config))
 
 
 def _only(params: GaussianParams, active: Array) -> Gaussians:

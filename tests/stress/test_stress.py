@@ -13,7 +13,13 @@ from hypothesis import strategies as st
 
 from gsjax import cli
 from gsjax.stress import poison, precision, run
-from gsjax.stress.scenes import changed, host_fields, usual
+from gsjax.stress.scenes import (
+    changed,
+    host_fields,
+    not_finite,
+    usual,
+    usual_gradients,
+)
 from gsjax.stress.types import Case, Measured, worse
 
 pytestmark = pytest.mark.as_users
@@ -69,6 +75,20 @@ def test_any_value_anywhere(value, entry, slots):
     changes, seen = wrong["traces"]
     assert changes == 0
     assert seen > 80
+
+
+@on_cpu
+@settings(max_examples=40, deadline=None, derandomize=True, database=None)
+@given(
+    values=st.lists(st.floats(width=32), min_size=3, max_size=3),
+    places=st.sets(st.sampled_from(list(poison.camera_entries())), max_size=3),
+)
+def test_any_camera_and_background(values, places):
+    """Several numbers of the camera at a time, and the whole background."""
+    with jax.enable_x64(False):
+        camera = poison.spoilt_camera(dict(zip(sorted(places), values)))
+        out, slopes = usual_gradients(usual(), camera, np.float32(values))
+    assert not_finite((out.rgb, out.alpha, out.depth, out.radii, slopes)) == 0
 
 
 @on_cpu
