@@ -263,7 +263,7 @@ def _display(value, **options):
     except ImportError as error:
         raise MissingExtraError(
             "IPython, which notebooks run on, is missing; install it: "
-            "pip install 'gsjax[notebooks]'"
+            "pip install ipython"
         ) from error
     return display(value, **options)
 

@@ -211,12 +211,12 @@ assert len(turntable.data) < 500_000
 #
 # `gsjax view SCENE.ply` serves an interactive viewer, `gsjax view SCENE.ply --html
 # scene.html` writes it as one page, Gaussians and all, that needs no network and no
-# Python. The page is drawn by viser, an extra: `pip install 'gsjax[viewer]'`. It shows
+# Python. The page is drawn by viser, an extra: `pip install viser`. It shows
 # one colour from all sides (SH degree 0); that is why the highlights stand still there.
 
 # %%
 if importlib.util.find_spec("viser") is None:
-    print("viser is not installed, so there is no page: pip install 'gsjax[viewer]'")
+    print("viser is not installed, so there is no page: pip install viser")
 else:
     from gsjax.viewer.opening import open_exhibit
     from gsjax.viewer.page import write_page

@@ -81,12 +81,12 @@ def require_viser() -> Any:
     except ImportError as error:
         raise MissingExtraError(
             f"viser, which shows scenes in the browser, does not load ({error}); "
-            "install it: pip install 'gsjax[viewer]'"
+            "install it: pip install viser"
         ) from error
     has_page = hasattr(viser.SceneApi, "as_html")
     if not has_page or not hasattr(viser.ViserServer, "initial_camera"):
         raise MissingExtraError(
-            f"viser {viser.__version__} is too old; pip install -U 'gsjax[viewer]'"
+            f"viser {viser.__version__} is too old; pip install -U viser"
         )
     return viser
 
