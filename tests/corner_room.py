@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from gsjax import look_at
 
@@ -128,6 +129,18 @@ def make_room(folder: Path) -> Path:
     (folder / "notes.txt").write_text("not a photo")
     (folder / "._photo 0.jpg").write_text("of another system")
     return folder
+
+
+def make_video(path: Path) -> None:
+    """Thirty frames on the arc, all but every fifth blurred; .avi."""
+    code = cv2.VideoWriter.fourcc(*"MJPG")
+    writer = cv2.VideoWriter(str(path), code, 10, (WIDTH, HEIGHT))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no MJPG")
+    for i in range(30):
+        pixels = corner_view(viewmat_at(i / 29))[..., ::-1]
+        writer.write(pixels if i % 5 == 3 else cv2.GaussianBlur(pixels, (0, 0), 3))
+    writer.release()
 
 
 def leftovers(folder: Path) -> list[str]:

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 from unittest import mock
 
 import pytest
-from corner_room import NAMES, make_room
+from corner_room import NAMES, make_room, make_video
 from snippets import ROOT, blocks, commands, mentions, typed
 
 import gsjax.bench.pareto as pareto_module
@@ -47,6 +47,7 @@ SMALLER = {
     "bench": {"--size": "32x24", "--repeats": "1"},
     "demo": {"--photos": "9", "--size": "64x48", "--steps": "4"},
     "render": {"--frames": "3"},
+    "sfm": {"--frames": "6"},
     "stress": {"--only": "opacity/round"},
     "train": {"--preset": "fast", "--steps": "4", "--max-size": "80"},
 }
@@ -158,7 +159,10 @@ def test_text(name, folder, tmp_path):
     if IN_TEXT[name][0] == "view" or "--viewer" in IN_TEXT[name]:
         pytest.importorskip("viser", reason="needs gsjax[viewer]")
     given = {"RUN": "run", "DATASET": "dataset", "PHOTOS": "photos"}
+    given["VIDEO"] = "walk.avi"
     given = {mark: str(folder / there) for mark, there in given.items()}
+    if "VIDEO" in IN_TEXT[name]:
+        make_video(folder / "walk.avi")
     given["IMAGE"] = NAMES[0]
     words = IN_TEXT[name]
     filled = [

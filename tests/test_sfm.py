@@ -20,6 +20,7 @@ from corner_room import (
     corner_view,
     leftovers,
     make_room,
+    make_video,
     read,
     viewmat_at,
     write_photo,
@@ -253,16 +254,8 @@ def test_the_focal_length_of_exif_is_where_colmap_begins(room, tmp_path):
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory) -> Path:
-    """Thirty frames on the arc, all but every fifth blurred."""
     path = tmp_path_factory.mktemp("video") / "walk.avi"
-    code = cv2.VideoWriter.fourcc(*"MJPG")
-    writer = cv2.VideoWriter(str(path), code, 10, (WIDTH, HEIGHT))
-    if not writer.isOpened():
-        pytest.skip("this OpenCV writes no MJPG")
-    for i in range(30):
-        pixels = corner_view(viewmat_at(i / 29))[..., ::-1]
-        writer.write(pixels if i % 5 == 3 else cv2.GaussianBlur(pixels, (0, 0), 3))
-    writer.release()
+    make_video(path)
     return path
 
 
