@@ -14,7 +14,8 @@ class InputError(GsjaxError, ValueError):
 
 
 class CapacityError(GsjaxError, RuntimeError):
-    """A fixed-size stage wanted more than it may have; says how much it wanted."""
+    """A fixed-size stage, or the memory, does not hold what is wanted; says how much
+    that is. See `gsjax.memory`."""
 
     exit_code = 3
 
@@ -26,7 +27,8 @@ class SfmError(GsjaxError, RuntimeError):
 
 
 class DivergedError(GsjaxError, RuntimeError):
-    """Training has left the finite numbers; says when, and what to try."""
+    """Training no longer learns: numbers are not finite, pictures worse than any can
+    be, or nothing is in view any more; says when, and what to try."""
 
     exit_code = 5
 
