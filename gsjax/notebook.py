@@ -284,7 +284,7 @@ def _cells(value) -> list[Cell]:
     return [Cell(sketches.visible(array))]
 
 
-def concrete(value) -> bool:
+def _concrete(value) -> bool:
     """Whether the leaves of a pytree, if any, are arrays with values, now."""
     leaves = jax.tree.leaves(value)
     return bool(leaves) and all(
@@ -300,7 +300,7 @@ def concrete(value) -> bool:
 
 def _png(value) -> tuple[bytes, dict[str, int]] | None:
     """What Jupyter asks of a `Render` or of `Gaussians`; None where it is to print."""
-    if not concrete(value):
+    if not _concrete(value):
         return None
     try:
         return picture(value)._repr_png_()
@@ -310,7 +310,7 @@ def _png(value) -> tuple[bytes, dict[str, int]] | None:
 
 def _html(camera: Camera) -> str | None:
     """What Jupyter asks of a `Camera`."""
-    if not concrete(camera):
+    if not _concrete(camera):
         return None
     count = camera.viewmat.shape[0] if camera.batched else 1
     told = [f"{camera.width} × {camera.height} px, {camera.model.name}"]
