@@ -77,11 +77,12 @@ show(
 # %% [markdown]
 # ## What training starts from
 #
-# One Gaussian for each point, round, as wide as its neighbours are far, of the point's
-# colour, and nearly transparent. This is a sketch of it, that is, discs:
+# One Gaussian for each point, round, half as wide as its neighbours are far, of the
+# point's colour, and half opaque: so the preset `fast`, used below, begins. This is a
+# sketch of it, that is, discs:
 
 # %%
-start = gsjax.init_gaussians(scene, sh_degree=1)
+start = gsjax.init_gaussians(scene, sh_degree=1, opacity=0.5, scale=0.5)
 start
 
 # %% [markdown]
