@@ -28,7 +28,7 @@ class SfmError(GsjaxError, RuntimeError):
 
 class DivergedError(GsjaxError, RuntimeError):
     """Training no longer learns: numbers are not finite, pictures worse than any can
-    be, or nothing is in view any more; says when, and what to try."""
+    be, or nothing is in view; says when, and what to try."""
 
     exit_code = 5
 
