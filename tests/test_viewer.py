@@ -1,32 +1,24 @@
-"""The viewer: the browser's numbers, our picture for its camera, pages, live runs."""
+"""The viewer: the browser's numbers, our picture for its camera, panels, live runs."""
 
-import base64
 import contextlib
-import json
 import logging
 import re
-import shutil
 import socket
-import struct
-import subprocess
-import sys
 import threading
 import time
-import urllib.request
 
-import cv2
 import jax
 import numpy as np
 import pytest
 import training
 from conftest import LIGHT, frustum_points, gaussians_at
+from viewing import COUNT, scene, wait_for
 
 import gsjax
-from gsjax import cli
 from gsjax.errors import InputError
 from gsjax.rotations import covariance, quaternion_to_matrix
 from gsjax.scene.types import Photo
-from gsjax.sh import rgb_to_dc
+from gsjax.sheets import depth_colors
 from gsjax.train.config import TrainConfig
 from gsjax.train.fit import Progress, initial_state
 from gsjax.train.step import Metrics
@@ -48,28 +40,6 @@ from gsjax.viewer.stage import (
     open_server,
     stop_server,
 )
-
-COUNT = 64
-
-
-def wait_for(condition, seconds=30.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
-def scene(spread=1.0, degree=1):
-    """Gaussians of all sizes and opacities, orange, as large as ``spread``."""
-    rng = np.random.default_rng(0)
-    points = spread * frustum_points(rng, COUNT)
-    scales = spread * np.exp(rng.normal(-2.0, 0.7, (COUNT, 3)))
-    found = gaussians_at(points, scales, rng.uniform(0.02, 0.99, COUNT), degree=degree,
-                         viewmat=np.eye(4))  # fmt: skip
-    sh = np.zeros_like(found.params.sh)
-    sh[:, 0] = (np.array([0.9, 0.5, 0.1]) - 0.5) / 0.28209479177387814
-    return found.replace(params=found.params.replace(sh=jax.numpy.asarray(sh)))
-
 
 # --- numbers ---
 
@@ -183,231 +153,7 @@ def test_exact_pictures_are_the_renderers():
     assert re.match(r"depth \d.* \(red\) to \d.* \(blue\)", what)
 
 
-# --- the command ---
-
-
-@pytest.fixture
-def ply(tmp_path):
-    path = tmp_path / "a.ply"
-    gsjax.save(path, scene())
-    return path
-
-
-def test_without_viser_the_line_that_installs_it(ply, tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    for args in (["view", str(ply)], ["train", "x", "-o", str(tmp_path), "--viewer"]):
-        assert cli.main(args) == 6
-        said = capsys.readouterr()
-        assert said.out == ""
-        assert "install it: pip install viser" in said.err
-
-
-@pytest.mark.parametrize(
-    "args", [["--min-opacity", "1"], ["--max-gaussians", "0"], ["--port", "0"],
-             ["--up", "z"]],
-)  # fmt: skip
-def test_usage(ply, args, capsys):
-    assert cli.main(["view", str(ply), *args]) == 2
-    assert args[0] in capsys.readouterr().err
-
-
-def splats_of(text: str) -> np.ndarray:
-    """Packed splats [M, 8] of a page: the largest of its buffers, and the only one."""
-    import msgspec
-    import zstandard
-
-    data = base64.b64decode(re.search(r'EMBED_DATA__="([^"]*)"', text)[1])
-    inner = zstandard.ZstdDecompressor().decompressobj().decompress(data[8:])
-    length = 8 + struct.unpack("<Q", inner[:8])[0]
-    told = msgspec.msgpack.decode(inner[8:length])
-    kinds = [message["type"] for _, message in told["messages"]]
-    assert kinds.count("GaussianSplatsMessage") == 1
-    assert "BackgroundImageMessage" in kinds
-    (size,) = told["binaryBufferLengths"]
-    return np.frombuffer(inner[len(inner) - size :], np.uint32).reshape(-1, 8)
-
-
-def test_a_page_holds_the_scene_and_needs_nothing_else(ply, tmp_path, capsys):
-    pytest.importorskip("viser", reason="needs gsjax[viewer]")
-    out = tmp_path / "new" / "a.html"
-    assert cli.main(["view", str(ply), "--html", str(out)]) == 0
-    size = out.stat().st_size / 2**20
-    assert capsys.readouterr().out == f"{out}  {COUNT} Gaussians, {size:.2f} MiB\n"
-    text = out.read_text()
-    links = set(re.findall(r"(?:src|href)=.?https?://[^\"' ]+", text))
-    assert not links
-    assert "SH degree 0" in text
-    packed = splats_of(text)
-    rgb = packed[:, 7:].copy().view(np.uint8)[:, :3] / 255
-    np.testing.assert_allclose(rgb, [[0.9, 0.5, 0.1]] * COUNT, atol=1 / 255)
-    assert cli.main(["view", str(ply), "--html", str(out)]) == 3
-    assert "exists" in capsys.readouterr().err
-    args = ["--overwrite", "--max-gaussians", "20", "--min-opacity", "0.5"]
-    assert cli.main(["view", str(ply), "--html", str(out), *args]) == 0
-    assert f"20 of {COUNT} Gaussians" in capsys.readouterr().out
-    args = ["--overwrite", "--min-opacity", "0.999"]
-    assert cli.main(["view", str(ply), "--html", str(out), *args]) == 3
-    assert "lower --min-opacity" in capsys.readouterr().err
-
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-
-
-@pytest.fixture
-def pictures_of_page(tmp_path):
-    """A function: pictures [H, W, 3] of a page in Chromium, one after another.
-
-    What is sent to it is a script, which the page runs before the next.
-    """
-    client = pytest.importorskip("websockets.sync.client", reason="needs viser")
-    profile, browsers = tmp_path / "profile", []
-
-    def look(url: str, size: str = "500,400"):
-        browsers.append(
-            subprocess.Popen(
-                [CHROMIUM, "--headless", "--no-sandbox", "--use-angle=swiftshader",
-                 "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
-                 "--remote-debugging-port=0", f"--user-data-dir={profile}",
-                 f"--window-size={size}", url],
-                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            )
-        )  # fmt: skip
-        port = profile / "DevToolsActivePort"
-        wait_for(lambda: port.exists() and port.read_text())
-        address = f"http://127.0.0.1:{port.read_text().split()[0]}/json"
-        targets = json.loads(urllib.request.urlopen(address, timeout=30).read())
-        (target,) = (one for one in targets if one["type"] == "page")
-        with client.connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
-
-            def told(method: str, **params) -> dict:
-                socket.send(json.dumps({"id": 0, "method": method, "params": params}))
-                return json.loads(socket.recv(timeout=60))["result"]
-
-            while True:
-                data = base64.b64decode(told("Page.captureScreenshot")["data"])
-                picture = cv2.imdecode(np.frombuffer(data, np.uint8), 1)[..., ::-1]
-                script = yield picture
-                if script is not None:
-                    told("Runtime.evaluate", expression=script)
-
-    yield look
-    for browser in browsers:
-        browser.kill()
-        browser.wait()
-
-
-def shell_and_core():
-    """An opaque orange sphere with a green one in it, in the file before and after."""
-    rng = np.random.default_rng(0)
-    direction = rng.normal(size=(1200, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    shell = np.arange(1200) // 300 % 2 == 0
-    colours = np.where(shell[:, None], [0.9, 0.5, 0.1], [0.1, 0.9, 0.2])
-    return gsjax.make_gaussians(
-        means=direction * np.where(shell, 1.0, 0.6)[:, None],
-        quats=np.tile([1.0, 0, 0, 0], (1200, 1)),
-        log_scales=np.full((1200, 3), np.log(0.08)),
-        logit_opacities=np.full(1200, 6.0),
-        sh=np.asarray(rgb_to_dc(colours))[:, None],
-    )
-
-
-@pytest.mark.long
-@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
-def test_a_page_from_a_disk_shows_what_is_before(tmp_path, capsys, pictures_of_page):
-    """Nothing of the core, once the page has sorted its splats."""
-    pytest.importorskip("viser", reason="needs gsjax[viewer]")
-    ply, out = tmp_path / "a.ply", tmp_path / "a.html"
-    gsjax.save(ply, shell_and_core())
-    assert cli.main(["view", str(ply), "--html", str(out)]) == 0
-    capsys.readouterr()
-    # The page loads and sorts its splats in workers, in its own time.
-    pictures, deadline = pictures_of_page(out.as_uri()), time.monotonic() + 120
-    shell, core = 0.0, 1.0
-    while (shell < 0.02 or core > 0.01 * shell) and time.monotonic() < deadline:
-        red, green, blue = np.moveaxis(next(pictures).astype(float), -1, 0)
-        shell = ((red > 60) & (red > 1.3 * green) & (green > 1.5 * blue)).mean()
-        core = ((green > 60) & (green > 1.3 * red)).mean()
-    assert shell >= 0.02
-    assert core <= 0.01 * shell
-
-
 # --- live ---
-
-
-ORANGE, BLUE = np.array([0.9, 0.5, 0.1]), np.array([0.1, 0.3, 0.9])
-
-
-def orange_but_blue_from(eye) -> gsjax.Gaussians:
-    """A ball: orange where SH are of degree 0, and with degree 1 blue from there."""
-    rng = np.random.default_rng(0)
-    direction = rng.normal(size=(1000, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    x, y, z = (direction - eye).T / np.linalg.norm(direction - eye, axis=1)
-    sh = np.zeros((1000, 4, 3))
-    sh[:, 0] = rgb_to_dc(ORANGE)
-    sh[:, 1:] = np.stack([-y, z, -x], -1)[..., None] * (BLUE - ORANGE) / 0.4886025
-    return gsjax.make_gaussians(
-        means=direction,
-        quats=np.tile([1.0, 0, 0, 0], (1000, 1)),
-        log_scales=np.full((1000, 3), np.log(0.1)),
-        logit_opacities=np.full(1000, 6.0),
-        sh=sh,
-    )
-
-
-def share_of(color, page) -> float:
-    """Of the pixels: those of about this colour."""
-    return float((np.abs(page - 255 * color).max(-1) < 40).mean())
-
-
-def first_with(color, pictures) -> np.ndarray:
-    """The first of them with much of this colour: the browser takes its time."""
-    end = time.monotonic() + 120
-    for page in pictures:
-        if share_of(color, page) > 0.1:
-            return page
-        assert time.monotonic() < end, f"{color} is not seen"
-    raise AssertionError("no picture")
-
-
-@pytest.mark.long
-@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
-def test_a_browser_shows_the_splats_and_then_our_own_picture(
-    tmp_path, pictures_of_page
-):
-    """`gsjax view PLY`, and a click on *Render*, which shows what viser cannot."""
-    pytest.importorskip("viser", reason="needs gsjax[viewer]")
-    from gsjax.viewer.opening import open_exhibit
-    from gsjax.viewer.window import Window
-
-    eye = eye_of_gaussians(orange_but_blue_from(np.zeros(3)), UPS["-y"]).position
-    gsjax.save(tmp_path / "a.ply", orange_but_blue_from(eye))
-    exhibit = open_exhibit(tmp_path / "a.ply").exhibit
-    exhibit.renderer.config = exhibit.renderer.config.replace(**LIGHT)
-    window = Window(exhibit, port=8590)
-    try:
-        pictures = pictures_of_page(window.url, "900,600")
-        splats = first_with(ORANGE, pictures)
-        assert share_of(BLUE, splats) < 0.01
-        (session,) = window.sessions.values()
-        session.height.value = "270"
-        pictures.send(
-            "[...document.querySelectorAll('button')]"
-            ".find((button) => button.textContent.trim() == 'Render').click()"
-        )
-        shown = first_with(BLUE, pictures)
-        eye, width = session.client.camera, round(270 * session.client.camera.aspect)
-        camera = camera_of(eye.wxyz, eye.position, eye.fov, width, 270)
-        ours = picture(exhibit.renderer(exhibit.gaussians, camera), "rgb")[0]
-    finally:
-        window.close()
-    ours = cv2.resize(ours, shown.shape[1::-1]).astype(float)
-    # The panel lies over a part of the ball; half of its pixels are seen at least.
-    ball = np.abs(ours - 255 * BLUE).max(-1) < 40
-    assert 0.1 < ball.mean() < 0.9
-    assert np.median(np.abs(shown - ours)[ball]) < 4
-    assert np.median(np.abs(splats - ours)[ball]) > 40
 
 
 CAMERA = {
@@ -431,9 +177,20 @@ class Browser:
             subprotocols=[f"viser-v{viser.__version__}"],
             max_size=None,
         )
-        self.socket.send(msgspec.msgpack.encode(CAMERA))
+        self.encode = msgspec.msgpack.encode
+        self.socket.send(self.encode(CAMERA))
         self.reader = threading.Thread(target=lambda: list(self.socket), daemon=True)
         self.reader.start()
+
+    def click(self, session, name: str) -> None:
+        """On what has this name in the scene of its own session."""
+        click = {
+            "type": "SceneNodeClickMessage", "name": name, "instance_index": None,
+            "ray_origin": (0.0, 0.0, 0.0), "ray_direction": (0.0, 0.0, 1.0),
+            "screen_pos": (0.5, 0.5), "modifier": None,
+            "owner": str(session.client.client_id),
+        }  # fmt: skip
+        self.socket.send(self.encode(click))
 
     def close(self) -> None:
         self.socket.close()
@@ -463,10 +220,15 @@ def window():
     made.close()
 
 
+def session_of(window):
+    """That of its only browser, once Gaussians are sent."""
+    wait_for(lambda: window.sessions and next(iter(window.sessions.values())).splats)
+    return next(iter(window.sessions.values()))
+
+
 def test_a_session_cuts_renders_and_moves(window):
     browser = Browser(window.url)
-    wait_for(lambda: window.sessions and next(iter(window.sessions.values())).splats)
-    session = next(iter(window.sessions.values()))
+    session = session_of(window)
     assert session.splats.buffer.shape == (COUNT, 8)
     assert f"**{COUNT}** of {COUNT} Gaussians" in session.counts.content
     assert len(session.cameras) == 1 + training.VIEWS
@@ -494,6 +256,121 @@ def test_a_session_cuts_renders_and_moves(window):
     )
     browser.close()
     wait_for(lambda: not window.watched)
+
+
+@pytest.fixture
+def joined(window):
+    """A browser that looks into the window, and its session."""
+    browser = Browser(window.url)
+    yield browser, session_of(window)
+    browser.close()
+
+
+def test_a_click_on_a_camera_stands_there_and_shows_its_photograph(window, joined):
+    """Once photographs are loaded; then one at a time, whichever way it is chosen."""
+    browser, session = joined
+    views = training.scene().views
+
+    def stands_at(view) -> bool:
+        camera = session.client.camera
+        place = np.allclose(camera.position, view.centre, atol=1e-6)
+        turn = np.asarray(quaternion_to_matrix(camera.wxyz))
+        half = view.height / 2 / view.K[1, 1]
+        return (
+            place
+            and np.allclose(turn, view.viewmat[:3, :3].T, atol=1e-6)
+            and np.isclose(np.tan(camera.fov / 2), half)
+        )
+
+    browser.click(session, "/cameras/0003")
+    wait_for(lambda: stands_at(views[3]))
+    assert session.photo is None
+    flat = [np.full((24, 32, 3), 60 * index, np.uint8) for index in range(len(views))]
+    photos = [Photo(pixels, None, None, views[0].K) for pixels in flat]
+    window.show_cameras(frusta_of(views, photos))
+    wait_for(lambda: not window.busy)
+    browser.click(session, "/cameras/0002")
+    wait_for(lambda: session.photo and session.photo.label == views[2].name)
+    assert stands_at(views[2])
+    first = session.photo
+    np.testing.assert_array_equal(first.image, flat[2])
+    session.go_to.value = views[1].name
+    wait_for(lambda: session.photo.label == views[1].name)
+    assert stands_at(views[1])
+    assert session.photo is first
+    np.testing.assert_array_equal(first.image, flat[1])
+
+
+def test_the_scale_slider_sends_the_smallest_so_many_percent(window, joined):
+    """By the longest axis, and together with the opacity one."""
+    _, session = joined
+    opacities, longest = opacities_of(scene()), longest_axes(scene())
+    limit = np.percentile(longest, 40)
+
+    def sends(kept) -> bool:
+        told = f"**{kept.sum()}** of {COUNT} Gaussians"
+        if told not in session.counts.content:
+            return False
+        centers = session.splats.buffer[:, :3].view(np.float32) * session.splats.scale
+        wanted = np.asarray(scene().params.means)[kept]
+        return centers.shape == wanted.shape and np.allclose(centers, wanted, rtol=1e-5)
+
+    session.scale.value = 40
+    wait_for(lambda: sends(longest <= limit))
+    assert f"scales up to {limit:.3g}" in session.counts.content
+    session.opacity.value = 0.5
+    kept = (longest <= limit) & (opacities >= 0.5)
+    wait_for(lambda: sends(kept))
+    session.render()
+    np.testing.assert_array_equal(window.calls[-1][0].active, kept)
+    session.scale.value = 100
+    wait_for(lambda: sends(opacities >= 0.5))
+    assert "scales" not in session.counts.content
+
+
+def test_a_scene_may_begin_with_an_opacity_beyond_the_slider(window):
+    """As `gsjax view PLY --min-opacity 0.995` does."""
+    window.exhibit.min_opacity = 0.995
+    window.exhibit.gaussians = brightest = scene().replace(
+        params=scene().params.replace(logit_opacities=jax.numpy.linspace(0, 9, COUNT))
+    )
+    browser = Browser(window.url)
+    session = session_of(window)
+    kept = (opacities_of(brightest) >= 0.995).sum()
+    wait_for(lambda: f"**{kept}** of {COUNT} Gaussians" in session.counts.content)
+    assert session.splats.buffer.shape == (kept, 8)
+    browser.close()
+
+
+@pytest.mark.long
+def test_the_exact_picture_of_a_session_is_what_it_says(window, monkeypatch):
+    """Rgb, then depth, then alpha, as they are chosen, each with a line about it."""
+    monkeypatch.setattr("gsjax.viewer.session._HEIGHTS", ("24", "540"))
+    config, background = gsjax.RasterConfig(**LIGHT), (0.1, 0.2, 0.3)
+    window.exhibit.renderer = ExactRenderer(config, background)
+    browser = Browser(window.url)
+    session = session_of(window)
+    session.height.value, session.place.value = "24", "in the panel"
+    session.render()
+    camera = camera_of((1, 0, 0, 0), (0, 0, 0), 0.7, 32, 24)
+    wanted = gsjax.reference_render(scene(), camera, config, np.array(background))
+    depths, near, far = depth_colors(np.asarray(wanted["depth"]))
+    alphas = np.repeat(255 * np.asarray(wanted["alpha"])[..., None], 3, axis=2)
+    for kind, image, line in (
+        ("rgb", 255 * np.asarray(wanted["rgb"]), "rgb"),
+        ("depth", depths, f"depth {near:.3g} (red) to {far:.3g} (blue)"),
+        ("alpha", alphas, "alpha"),
+    ):
+        session.kind.value = kind
+        wait_for(
+            lambda line=line: session.told.content.startswith(f"{line}, 32 × 24 px")
+        )
+        with session.render.busy:  # until it is shown, too
+            shown = session.result.image.astype(float)
+        assert np.std(image) > 20
+        # A level of depth more or less is another colour.
+        np.testing.assert_allclose(shown, image, atol=8 if kind == "depth" else 0.51)
+    browser.close()
 
 
 @pytest.mark.timeout(60)  # viser would wait for ever

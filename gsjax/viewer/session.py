@@ -94,11 +94,11 @@ class Session:
     # --- the panel ---
 
     def _add_controls(self) -> None:
-        gui = self.client.gui
+        gui, begin = self.client.gui, self.exhibit.min_opacity
         self.counts = gui.add_markdown("")
         self.opacity = gui.add_slider(
-            "Opacity from", min=0.0, max=0.99, step=0.01,
-            initial_value=self.exhibit.min_opacity, hint="hide those of less",
+            "Opacity from", min=0.0, max=max(0.99, begin), step=0.01,
+            initial_value=begin, hint="hide those of less",
         )  # fmt: skip
         self.scale = gui.add_slider(
             "Scale up to, %", min=0.0, max=100.0, step=0.5, initial_value=100.0,
