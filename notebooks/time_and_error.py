@@ -232,7 +232,7 @@ assert {rows[index]["name"] for index in best} & {"fast", "compat"}
 # ## What to take away
 #
 # - The α cut is the knob that counts, in both ways. In a fog the 1/255 of `compat` and
-#   `fast` saves more than half of the time and costs sixteen grey levels at worst.
+#   `fast` saves about half of the time and costs sixteen grey levels at worst.
 # - `fast` stops ten times earlier than `compat` and errs no more: it blends the
 #   Gaussian that ends a pixel, and `compat` leaves it out.
 # - Stopping early pays where pixels become opaque, and in a fog few do. SH bands cost
