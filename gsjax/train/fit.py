@@ -172,7 +172,8 @@ def fit(
         memory than there is (see `gsjax.memory`); what was learnt until then has gone
         to ``hooks.checkpoint``.
       DivergedError: if in 50 of the last 100 steps, or half of a short run, numbers
-        are not finite, pictures are worse than any can be, or nothing is in view.
+        are not finite or pictures worse than any can be; or in 50 running nothing is
+        in view.
     """
     check_photos(scene, photos)
     hooks = hooks or Hooks()

@@ -97,11 +97,14 @@ class Health:
         """
         fault = self._fault(metrics)
         self.bad = 0 if fault is None else self.bad + 1
-        self._lately.append(fault is not None)
-        count = sum(self._lately)
-        if fault and count >= (_MAX_BAD_STEPS if fault == _LOST else self._limit):
+        lost = fault == _LOST
+        self._lately.append(fault is not None and not lost)
+        count, limit, span = sum(self._lately), self._limit, len(self._lately)
+        if lost:  # some views may show nothing of a scene that others show
+            count, limit, span = self.bad, _MAX_BAD_STEPS, self.bad
+        if fault and count >= limit:
             raise DivergedError(
-                f"{fault} in {count} of the last {len(self._lately)} steps, up to step "
+                f"{fault} in {count} of the last {span} steps, up to step "
                 f"{int(metrics.step)}; look for a photograph or a pose that is off, or "
                 "train anew with lower rates (TrainConfig.rates)"
             )

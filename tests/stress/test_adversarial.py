@@ -209,8 +209,9 @@ def test_what_counts_as_diverging():
         return health
 
     nothing = {"pairs": 0}
-    for bad in ({"finite": False}, {"psnr": -0.1}, nothing):
-        with pytest.raises(DivergedError, match=r"in 50 of the last 51 .* step 50"):
+    for bad, span in (({"finite": False}, 51), ({"psnr": -0.1}, 51), (nothing, 50)):
+        told = rf"in 50 of the last {span} steps, up to step 50"
+        with pytest.raises(DivergedError, match=told):
             run(bad)
     with pytest.raises(DivergedError, match=r"in 8 of the last 9 steps"):
         run({"finite": False}, steps=16)
@@ -224,6 +225,8 @@ def test_what_counts_as_diverging():
     for step in range(200):
         health.look(metrics_of(step, finite=bool(step % 40)))
     assert health.bad == 0
+    for step in range(200):
+        health.look(metrics_of(step, pairs=step % 2))
     for step in range(99):
         health.look(metrics_of(step, finite=bool(step % 2 == 0)))
     with pytest.raises(DivergedError, match=r"in 50 of the last 100 steps"):
