@@ -12,6 +12,20 @@ from gsjax.numerics import near_one
 Array = jax.Array
 
 
+@jax.custom_jvp
+def _squares(a: Array, b: Array, c: Array, d: Array) -> Array:
+    """a² − b² + c² − d². Its slope by what is 0 is 0, to the last bit: of the products
+    here it would be a difference of equal ones, which a compiler may round but once.
+    """
+    return (a - b) * (a + b) + (c - d) * (c + d)
+
+
+@_squares.defjvp
+def _squares_jvp(numbers, rates):
+    a, b, c, d = (number * rate for number, rate in zip(numbers, rates))
+    return _squares(*numbers), 2 * (a - b + c - d)
+
+
 def rotation_rows(w: Array, x: Array, y: Array, z: Array):
     """Rows of the rotation matrix of a quaternion times its squared norm, as tuples.
 
@@ -21,15 +35,11 @@ def rotation_rows(w: Array, x: Array, y: Array, z: Array):
     it does may differ between programs, by a bit.
     """
 
-    def squares(a, b, c, d):
-        """a² − b² + c² − d²."""
-        return (a - b) * (a + b) + (c - d) * (c + d)
-
     w2, x2, y2, z2 = (2 * q for q in (w, x, y, z))
     return (
-        (squares(w, y, x, z), x * y2 - w * z2, x * z2 + w * y2),
-        (x2 * y + w2 * z, squares(w, z, y, x), y * z2 - w * x2),
-        (x2 * z - w2 * y, y2 * z + w2 * x, squares(w, x, z, y)),
+        (_squares(w, y, x, z), x * y2 - w * z2, x * z2 + w * y2),
+        (x2 * y + w2 * z, _squares(w, z, y, x), y * z2 - w * x2),
+        (x2 * z - w2 * y, y2 * z + w2 * x, _squares(w, x, z, y)),
     )
 
 

@@ -94,3 +94,21 @@ def test_a_rotation_does_not_depend_on_the_norm(norm):
         quaternion_to_matrix, (jnp.float32(quats),), (jnp.float32(quats),)
     )
     assert np.abs(along).max() < 2e-6
+
+
+def test_slopes_of_a_rotation_by_what_is_zero():
+    """Exact: turned about z, a Gaussian seen along z has no reason to tilt, and an
+    optimiser that divides by the size of a slope would make a step of any rounding.
+    """
+    rng = np.random.default_rng(2)
+    quats = jnp.float32(rng.normal(size=(500, 4)) * [1, 0, 0, 1])
+    weights = jnp.float32(rng.normal(size=(500, 2, 2)))
+
+    @jax.jit
+    @jax.grad
+    def slopes(quats):
+        return jnp.sum(weights * quaternion_to_matrix(quats)[:, :2, :2])
+
+    found = slopes(quats)
+    assert np.array_equal(found[:, 1:3], np.zeros((500, 2)))
+    assert np.abs(found[:, ::3]).min(0).max() > 0

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from gsjax import images
 from gsjax.cameras import Camera, make_camera
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.raster.render import render_exact
 from gsjax.raster.types import RasterConfig, Render
-from gsjax.rotations import rotation_rows
 from gsjax.sheets import depth_colors
 
 KINDS = ("rgb", "depth", "alpha")
@@ -28,8 +28,7 @@ def camera_of(wxyz, position, fov: float, width: int, height: int) -> Camera:
       fov: vertical field of view, radians.
       width, height: px of the picture that is wanted.
     """
-    unit = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)
-    world_from_camera = np.array(rotation_rows(*unit))
+    world_from_camera = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix()
     viewmat = np.eye(4)
     viewmat[:3, :3] = world_from_camera.T
     viewmat[:3, 3] = -world_from_camera.T @ np.asarray(position, np.float64)

@@ -11,9 +11,9 @@ waits for what a device is busy with.
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from gsjax.gaussians import Gaussians
-from gsjax.rotations import rotation_rows
 from gsjax.sh import dc_to_rgb
 
 LEAST_OPACITY = 0.01
@@ -134,7 +134,6 @@ def _unit(longest: np.ndarray) -> float:
 
 def _rotations(quats: np.ndarray) -> np.ndarray:
     """[M, 3, 3] float32."""
-    norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    unit = np.where(norms > 0, quats, (1.0, 0, 0, 0)) / np.where(norms > 0, norms, 1)
-    rows = rotation_rows(*unit.T)  # pyright: ignore
-    return np.moveaxis(np.asarray(rows, np.float32), -1, 0)
+    some = np.any(quats != 0, axis=1, keepdims=True)
+    xyzw = np.roll(np.where(some, quats, (1.0, 0, 0, 0)), -1, axis=1)
+    return Rotation.from_quat(xyzw).as_matrix().astype(np.float32)
