@@ -22,8 +22,8 @@ _MAX_DEFLATE = 1032
 _MAX_TIFF = 1400
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _REMEDY = "copy or export it again"
-# Tags of TIFF: width, height, bits of a sample, compression, samples of a pixel.
-_TIFF_TAGS = (256, 257, 258, 259, 277)
+# Tags of TIFF: width, height, bits of a sample, compression.
+_TIFF_TAGS = (256, 257, 258, 259)
 # Markers of JPEG without a length, and those that carry the size of the image.
 _JPEG_BARE = {0x01, *range(0xD0, 0xD9)}
 _JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
@@ -172,7 +172,8 @@ def _tiff(data: Buffer) -> tuple[int, int]:
     if not {256, 257} <= set(found):
         raise _Truncated("no image size")
     width, height = found[256], found[257]
-    bits = width * height * found.get(258, 1) * found.get(277, 1)
+    # Of one sample: others may be fewer than the pixels, as in YCbCr.
+    bits = width * height * found.get(258, 1)
     ratio = {1: 1, 5: _MAX_TIFF, 8: _MAX_DEFLATE, 32946: _MAX_DEFLATE}
     shrunk = ratio.get(found.get(259, 1))  # others, as of fax, have no such bound
     if width * height <= MAX_PIXELS and shrunk and bits > 8 * shrunk * len(data):
