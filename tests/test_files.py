@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 
 from gsjax.errors import InputError
-from gsjax.files import make_folder, read_bytes, read_json, replacing, write_file
+from gsjax.files import (
+    make_folder,
+    read_bytes,
+    read_json,
+    replacing,
+    write_file,
+    write_json,
+)
 
 
 def names(folder: Path) -> list[str]:
@@ -69,3 +76,12 @@ def test_what_cannot_be_read(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "read_bytes", full)
     with pytest.raises(InputError, match="a: cannot be read: larger than the memory"):
         read_bytes(path)
+
+
+@pytest.mark.parametrize("name", [b"caf\xc3\xa9", b"caf\xe9"])
+def test_names_of_files_go_through_json(tmp_path, name):
+    """Also those that are not UTF-8; those that are can be read in it."""
+    path, data = tmp_path / "a.json", {"dataset": os.fsdecode(name)}
+    write_json(path, data)
+    assert os.fsencode(read_json(path)["dataset"]) == name
+    assert ("café" in path.read_text(encoding="utf-8")) == (name == b"caf\xc3\xa9")

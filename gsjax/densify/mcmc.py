@@ -26,7 +26,8 @@ from gsjax.rotations import covariance
 Array = jax.Array
 
 # Extent of the scenes that the paper's noise and penalty are for: COLMAP scales what it
-# reconstructs so that eight tenths of the cameras lie within 10 units along an axis.
+# reconstructs so that the box around the middle eight tenths of the cameras, along each
+# axis, has a diagonal of 10 units.
 _USUAL_EXTENT = 5.0
 # Trapezoid of ∫ over [0, 5]; the integrand is entire, so it converges faster than
 # any power of the step: 3e-7 relative for n up to 51 (tested).

@@ -118,7 +118,7 @@ def _by_blocks(
 
     pixels = pixel_centres(grid.tile, rows.dtype)
     blocks, group = schedule.tiles.shape
-    nothing = _nothing(parts_of(rows), group, pixels.shape[1])
+    nothing = _nothing(jax.eval_shape(parts_of, rows), group, pixels.shape[1])
     none = projected.u.shape[0]
 
     def of_block(block, images):

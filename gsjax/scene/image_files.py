@@ -169,8 +169,8 @@ def short_names(names: Sequence[str]) -> list[str]:
     return short if clear else list(names)
 
 
-def check_name(path: Path) -> str:
-    """The name of a file, which datasets hold in UTF-8.
+def check_name(path: Path) -> None:
+    """See that the name of a file is UTF-8, in which datasets hold it.
 
     Raises:
       InputError: if it is not.
@@ -181,7 +181,6 @@ def check_name(path: Path) -> str:
         raise InputError(
             f"{path.parent}: the name of {path.name!r} is not UTF-8; rename the file"
         ) from error
-    return path.name
 
 
 def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:

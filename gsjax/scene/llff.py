@@ -41,8 +41,10 @@ def load_llff(
             f"{path}: {len(table)} rows, but {root} has {len(files)} photographs; as "
             "rows have no names, the photographs must be exactly those of the rows"
         )
+    for file in files:
+        check_name(file)
     views = [
-        _view(f"{path}: row {index}", row, file.with_name(check_name(file)))
+        _view(f"{path}: row {index}", row, file)
         for index, (row, file) in enumerate(zip(table, files))
     ]
     return Scene(path, "llff", tuple(views))

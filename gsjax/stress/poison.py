@@ -77,7 +77,7 @@ def traces(
     """
     seen_by = partial(usual_gradients, **settings()[setting])
     out, slopes = seen_by(scene)
-    images = (out.rgb, out.alpha, out.depth, out.radii)
+    images = (out.rgb, out.alpha, out.depth, out.median_depth, out.radii)
     unseen = out.radii == 0
     clean = jax.tree.map(
         lambda bad, good: jnp.where(
@@ -88,7 +88,8 @@ def traces(
     )
     without = scene.replace(params=clean, active=scene.active & ~unseen)  # pyright: ignore
     wanted, wanted_slopes = seen_by(without)
-    difference = unequal(images[:3], (wanted.rgb, wanted.alpha, wanted.depth))
+    others = (wanted.rgb, wanted.alpha, wanted.depth, wanted.median_depth)
+    difference = unequal(images[:4], others)
     difference += unequal(slopes.params, wanted_slopes.params)
     difference += unequal(slopes.background, wanted_slopes.background)
     difference += _beyond_rounding(slopes.camera, wanted_slopes.camera)
