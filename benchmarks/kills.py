@@ -1,23 +1,28 @@
-"""Claim: a run that is killed at any moment goes on to the same bits.
+"""Claim: a run that is killed, or interrupted, at any moment goes on to the same bits.
 
-``python benchmarks/kills.py [COUNT]`` trains a small scene with `gsjax train` once
-without interruption, then COUNT times (default 20) kills the process (SIGKILL) at a
-random moment, from starting Python to writing the result, and goes on with
-``--resume``, every fourth time with a second kill on the way. A run that was over
-before its moment came does not count, and another takes its place. The Gaussians, the
-last checkpoint and the log must be those of the first run, to the bit; seconds apart.
+``python benchmarks/kills.py [COUNT] [--interrupt]`` trains a small scene with
+`gsjax train` once without interruption, then COUNT times (default 20) kills the process
+(SIGKILL; Ctrl-C's SIGINT with ``--interrupt``) at a random moment, from starting Python
+to writing the result, and goes on with ``--resume``, every fourth time with a second
+kill on the way. A run that was over before its moment came does not count, and another
+takes its place. The Gaussians, the last checkpoint and the log must be those of the
+first run, to the bit; seconds apart. Of Ctrl-C a run must also make exit status 130
+within 20 seconds, and no traceback.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import measure
 import numpy as np
@@ -54,18 +59,40 @@ def left_behind(run: Path) -> dict:
     }
 
 
-def killed_after(arguments: list[str], seconds: float, environment) -> bool:
-    """Start, and kill after so many seconds; whether it was still alive then."""
+class Stopped(NamedTuple):
+    """How a run took a signal: whether it was alive then, and how it ended."""
+
+    alive: bool
+    good: bool
+
+
+def stopped_after(
+    arguments: list[str], seconds: float, environment, how: signal.Signals
+) -> Stopped:
+    """Start, and send a signal after so many seconds."""
+    pipe = subprocess.PIPE
     process = subprocess.Popen(
-        arguments, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        arguments, env=environment, stdout=subprocess.DEVNULL, stderr=pipe, text=True
     )
     try:
-        process.wait(seconds)
-        return False
+        process.communicate(timeout=seconds)
+        return Stopped(False, process.returncode == 0)
     except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-        return True
+        process.send_signal(how)
+        try:
+            _, told = process.communicate(timeout=20)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            return Stopped(True, False)
+        if how == signal.SIGKILL:
+            return Stopped(True, process.returncode == -signal.SIGKILL)
+        # Python's own start, and its end after all is written, take it as they do.
+        own = process.returncode == -signal.SIGINT and "gsjax" not in told
+        done = process.returncode == 0
+        good = process.returncode == 130 and "Traceback" not in told
+        if not (good or own or done):
+            print(process.returncode, told, flush=True)
+        return Stopped(not done, good or own or done)
 
 
 def prepared(folder: Path) -> dict[str, str]:
@@ -77,8 +104,10 @@ def prepared(folder: Path) -> dict[str, str]:
     return {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder / "programs")}
 
 
-def main(count: int) -> None:
+def main(count: int, how: signal.Signals) -> None:
     """Measure and save."""
+    # A shell has what it starts in the background ignore Ctrl-C, and that is inherited.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     rng = np.random.default_rng(0)
     rows = []
     with tempfile.TemporaryDirectory() as name:
@@ -97,37 +126,43 @@ def main(count: int) -> None:
                 seconds[strategy] = time.perf_counter() - begun
                 wanted[strategy] = left_behind(run)
 
-        def killed(run, strategy, times):
-            """When, and whether the process was alive then: at least once."""
+        def stopped(run, strategy, times):
+            """When, and how the process took it: alive at least once."""
             arguments = command(folder / "dataset", run, strategy, "--resume")
             while True:
                 at = list(rng.uniform(0, seconds[strategy], times))
-                alive = [killed_after(arguments, t, environment) for t in at]
-                if any(alive):
-                    return at, alive
+                took = [stopped_after(arguments, t, environment, how) for t in at]
+                if any(took_it.alive for took_it in took):
+                    return at, took
                 shutil.rmtree(run)
 
         for index in range(count):
             strategy = ("mcmc", "adaptive")[index % 2]
             run = folder / f"killed-{index}"
-            at, alive = killed(run, strategy, 2 if index % 4 == 3 else 1)
+            at, took = stopped(run, strategy, 2 if index % 4 == 3 else 1)
             kept = sorted(p.name for p in run.glob("checkpoints/*.npz"))
             finish(command(folder / "dataset", run, strategy, "--resume"))
             rows.append(
                 {
                     "strategy": strategy,
-                    "killed after s": [round(t, 2) for t in at],
-                    "was alive": alive,
+                    f"{how.name} after s": [round(t, 2) for t in at],
+                    "was alive": [took_it.alive for took_it in took],
+                    "ended well": all(took_it.good for took_it in took),
                     "checkpoints found": kept,
                     "same bits": left_behind(run) == wanted[strategy],
                 }
             )
             print(rows[-1], flush=True)
-    measure.save("kills", rows, claim=__doc__)
-    same = sum(row["same bits"] for row in rows)
-    print(f"{same} of {len(rows)} end with the same bits")
-    sys.exit(same != len(rows))
+    name = "kills" if how == signal.SIGKILL else "interrupts"
+    measure.save(name, rows, claim=__doc__)
+    good = sum(row["same bits"] and row["ended well"] for row in rows)
+    print(f"{good} of {len(rows)} end with the same bits")
+    sys.exit(good != len(rows))
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 20)
+    given = argparse.ArgumentParser()
+    given.add_argument("count", type=int, nargs="?", default=20)
+    given.add_argument("--interrupt", action="store_true")
+    options = given.parse_args()
+    main(options.count, signal.SIGINT if options.interrupt else signal.SIGKILL)

@@ -51,8 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: list[str]) -> int:
-    # OpenCV tells of bad photographs on its own, on top of our one line.
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    # OpenCV warns of what is no harm; of what is, `scene.decode` hears and tells.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     # Where there is no ∞, a ?; stderr has a way of its own, and so may stdout.
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="replace")

@@ -14,6 +14,9 @@ from typing import Any, BinaryIO
 from gsjax.errors import InputError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
+# Of JSON: a camera is an object and five lists in 90 bytes or more; 3 bytes, "[],",
+# take 70 in memory, so that what is full of them is refused before it is parsed.
+_MANY, _LEAST_BYTES = 10_000, 10
 
 
 @contextmanager
@@ -62,9 +65,16 @@ def read_json(path: Path, wanted: str = "a JSON file") -> dict[str, Any]:
     """The object that a JSON file holds.
 
     Raises:
-      InputError: as `reading`, and if it is no JSON, or no object.
+      InputError: as `reading`, and if it is no JSON, no object, or so full of empty
+        objects and lists that it would take many times its size in memory.
     """
     raw = read_bytes(path, wanted)
+    nested = raw.count(b"{") + raw.count(b"[")
+    if nested > _MANY and nested * _LEAST_BYTES > len(raw):
+        raise InputError(
+            f"{path}: {nested} objects and lists in {len(raw)} bytes, fewer than "
+            f"{_LEAST_BYTES} bytes each, which no list of cameras has; pass {wanted}"
+        )
     try:
         data = json.loads(raw)
     except (ValueError, RecursionError) as error:

@@ -1,5 +1,7 @@
 """Memory: what there is, what a render takes, and that too much is refused in time."""
 
+import os
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,6 +15,7 @@ from conftest import LIGHT, camera_of, frustum_points, gaussians_at
 import gsjax
 import gsjax.raster.render as render_module
 from gsjax import CapacityError, RasterConfig, memory
+from gsjax.io.point_cloud import read_point_cloud
 from gsjax.losses import photometric_spread
 from gsjax.memory import Estimate, require, size_text, system_available, unlimited
 from gsjax.raster.render import render_estimate
@@ -222,3 +225,21 @@ def test_the_estimate_of_a_run_is_what_runs_took(name, changes, measured, report
     found = run_estimate(replace(made, views=views), config, count, slots, begins=True)
     report(f"memory of {name}", abs(np.log(found.total / 1e6 / measured)), np.log(1.5))
     assert 1 / 1.5 < found.total / 1e6 / measured < 1.5
+
+
+def test_files_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    """By what their headers declare; the files are sparse."""
+    monkeypatch.setattr(memory, "available", lambda: GB // 4)
+    names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2".split()
+    names += [f"rot_{i}" for i in range(4)]
+    rows = 10_000_000
+    for read, properties in ((gsjax.load, names), (read_point_cloud, names[:3])):
+        path = tmp_path / f"{len(properties)}.ply"
+        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {rows}\n"
+        head += "".join(f"property float {name}\n" for name in properties)
+        path.write_text(head + "end_header\n")
+        os.truncate(path, path.stat().st_size + rows * 4 * len(properties))
+        begun = time.perf_counter()
+        with pytest.raises(CapacityError, match=r"ply: 10,000,000 .* would take about"):
+            read(path)
+        assert time.perf_counter() - begun < 1

@@ -1,6 +1,7 @@
 """Photographs: pixels as stored, lenses undone, sizes, masks, and what is refused."""
 
 import contextlib
+import os
 import struct
 import time
 import zlib
@@ -12,8 +13,10 @@ import pytest
 from captures import save_photo
 
 from gsjax.errors import InputError
+from gsjax.scene.decode import telling_of_damage
 from gsjax.scene.image_header import MAX_PIXELS, check_image, image_size
 from gsjax.scene.photos import load_photo, load_photos, undistorted_view
+from gsjax.scene.sfm_photos import read_upright
 from gsjax.scene.types import Lens, View
 from gsjax.scene.undistort import distort
 
@@ -422,3 +425,55 @@ def test_float_images(tmp_path):
     path.write_bytes(data.tobytes())
     with pytest.raises(InputError, match=r"a\.tiff: pixels of float32"):
         load_photo(view_of(path))
+
+
+# --- damaged, and read all the same ---
+
+
+def with_hole(path: Path, *encoding: int) -> Path:
+    """A photograph in whose pixels some bytes are lost; its headers are whole."""
+    pixels = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    done, data = cv2.imencode(path.suffix, pixels, encoding)
+    assert done
+    whole = data.tobytes()
+    middle = len(whole) // 2
+    path.write_bytes(whole[:middle] + bytes(40) + whole[middle + 40 :])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted"),
+    [("a.jpg", "Corrupt JPEG data"), ("a.tiff", "LZWDecode")],
+)
+def test_holes_are_told(tmp_path, capfd, name, wanted):
+    path = with_hole(tmp_path / name)
+    good = [save_photo(tmp_path / f"{index}.png") for index in range(40)]
+    told = rf"damaged .*: \S*{name}: {wanted}[^;]*; copy or export them again"
+    view = view_of(path, 64, 48)
+    with pytest.warns(UserWarning, match=told):
+        assert load_photo(view).pixels.shape == (48, 64, 3)
+    with pytest.warns(UserWarning, match=told):
+        read_upright(path)
+    with pytest.warns(UserWarning, match=told) as warned:
+        photos = load_photos([view_of(p) for p in good] + [view])
+    assert [photo.pixels.shape[0] for photo in photos] == [24] * 40 + [48]
+    assert len(warned) == 1
+    with pytest.warns(
+        UserWarning, match=f"{name}: {wanted}[^;]*; \\S*m_{name}: [^;]*; copy"
+    ):
+        load_photo(view_of(path, 64, 48, mask=with_hole(tmp_path / f"m_{name}")))
+    assert capfd.readouterr().err == ""  # once, by us
+
+
+def test_what_others_write_on_stderr_is_kept(tmp_path, capfd):
+    view = view_of(save_photo(tmp_path / "a.png"))
+    with telling_of_damage([view.image]):
+        os.write(2, b"of XLA\nlibpng warning: iCCP: known incorrect sRGB profile\n")
+        with telling_of_damage([view.image]):
+            load_photo(view)
+            os.write(2, b"within\n")
+    assert sorted(capfd.readouterr().err.splitlines()) == ["of XLA", "within"]
+    with pytest.raises(InputError), telling_of_damage([view.image]):
+        raise InputError("of which the rest is of no interest")
+    os.write(2, b"after\n")
+    assert capfd.readouterr().err == "after\n"

@@ -23,6 +23,7 @@ from gsjax.files import opened, replacing
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.io.ply_header import Header, check_properties, check_size, read_header, warn
 from gsjax.io.ply_rows import CHUNK_ROWS, read_rows
+from gsjax.memory import Estimate, require
 
 _NORMALS = ("nx", "ny", "nz")
 _MAX_SHIFT = 0.1  # of a Gaussian's size by rounding, before it is told
@@ -50,6 +51,7 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
       InputError: if the file cannot be read, is no PLY, is truncated, lacks
         properties, has an f_rest of no SH degree, or has values that are not
         finite; the message names what was found and what was wanted.
+      CapacityError: if the memory would not hold it, before it is read.
     """
     path = Path(path)
     with opened(path, "a .ply file") as file:
@@ -89,6 +91,12 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
     # float64 only if the file holds more than float32 can and jax would keep it.
     wide = not {"f8", "i4", "u4"}.isdisjoint(header.vertex.types.values())
     dtype = np.dtype(jnp.result_type(float)) if wide else np.dtype(np.float32)
+    held = header.vertex.rows * (11 + 3 * bases) * dtype.itemsize
+    require(
+        Estimate({"values as read": held, "values on the device": held}),
+        f"{header.path}: {header.vertex.rows:,} Gaussians",
+        "make the file smaller where it was made",
+    )
     fields = _allocate(header.vertex.rows, bases, dtype)
     views = _views(fields)
     start, displaced, furthest = 0, 0, 0.0

@@ -9,6 +9,7 @@ from gsjax.errors import InputError
 from gsjax.files import opened
 from gsjax.io.ply_header import check_size, read_header
 from gsjax.io.ply_rows import read_rows
+from gsjax.memory import Estimate, require
 
 _GREY = 128
 
@@ -25,6 +26,7 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
     Raises:
       InputError: if the file cannot be read, is no PLY, is truncated, has no x y z,
         or values that are not finite.
+      CapacityError: if the memory would not hold it, before it is read.
     """
     path = Path(path)
     with opened(path, "a .ply file") as file:
@@ -39,6 +41,11 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
         names = [name for name in ("red", "green", "blue") if name in types]
         names = names if len(names) == 3 else []
         unit = bool(names) and all((types[n] or "").startswith("f") for n in names)
+        require(
+            Estimate({"coordinates and colours": header.vertex.rows * 28}),
+            f"{path}: {header.vertex.rows:,} points",
+            "leave out some of them where the file was made",
+        )
         points = np.empty((header.vertex.rows, 3))
         colors = np.full((header.vertex.rows, 3), _GREY, np.uint8)
         wild = np.zeros(header.vertex.rows, bool)

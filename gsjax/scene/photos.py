@@ -15,15 +15,15 @@ from pathlib import Path
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.files import read_bytes
 from gsjax.images import opencv
-from gsjax.scene.image_header import check_image
+from gsjax.scene.decode import decode, telling_of_damage
 from gsjax.scene.types import Lens, Photo, View
 from gsjax.scene.undistort import undistortion_maps
 
 # Sizes that differ from the camera's by rounding only: 1 px a side and this much.
 _ASPECT_TOLERANCE = 0.01
 _MAX_REMAP = 32766  # of cv2.remap
+_BATCH = 8  # photographs a thread, before anything is told of them
 Filter = Callable[[np.ndarray], np.ndarray]
 
 
@@ -32,7 +32,8 @@ def load_photo(view: View, max_size: int | None = None) -> Photo:
 
     16 bits are rounded to 8, grey becomes RGB. The ideal pinhole keeps focal lengths
     and principal point; pixels that the lens did not see are not valid, nor is any
-    pixel to which one that is masked or was not seen contributes.
+    pixel to which one that is masked or was not seen contributes. Damage that the
+    decoder could mend is warned of.
 
     Args:
       view: which photograph.
@@ -42,9 +43,19 @@ def load_photo(view: View, max_size: int | None = None) -> Photo:
       InputError: if the file cannot be read, is no image, is truncated or too large,
         has not the aspect ratio of the camera, or max_size is below 1.
     """
+    with telling_of_damage(_files([view])):
+        return _load(view, max_size)
+
+
+def _files(views: Sequence[View]) -> list[Path]:
+    both = [path for view in views for path in (view.image, view.mask)]
+    return [path for path in both if path is not None]
+
+
+def _load(view: View, max_size: int | None) -> Photo:
     if max_size is not None and max_size < 1:
         raise InputError(f"max_size {max_size}: at least 1 px is wanted")
-    stored = _decode(view.image)
+    stored = decode(view.image, opencv().IMREAD_UNCHANGED)  # which does not rotate
     pixels, alpha = _to_rgb(view.image, stored)
     height, width = pixels.shape[:2]
     K = _scaled(view.K, *_ratio(view, width, height))
@@ -78,7 +89,7 @@ def load_photos(
     Args:
       views: which photographs.
       max_size: longest side in px, or None.
-      progress: called with (how many are done, how many there are) after each.
+      progress: called with (how many are done, how many there are) for each.
 
     Raises:
       InputError: on the first photograph that `load_photo` refuses.
@@ -86,36 +97,19 @@ def load_photos(
     workers = min(32, os.cpu_count() or 1)
     photos: list[Photo] = []
     with ThreadPoolExecutor(workers) as pool:
-        tasks = [pool.submit(load_photo, view, max_size) for view in views]
-        try:
-            for task in tasks:
-                photos.append(task.result())
-                if progress is not None:
-                    progress(len(photos), len(tasks))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        for start in range(0, len(views), _BATCH * workers):
+            batch = views[start : start + _BATCH * workers]
+            with telling_of_damage(_files(batch)):
+                tasks = [pool.submit(_load, view, max_size) for view in batch]
+                try:
+                    photos += [task.result() for task in tasks]
+                except BaseException:
+                    pool.shutdown(wait=False, cancel_futures=True)
+                    raise
+            if progress is not None:
+                for done in range(start, len(photos)):
+                    progress(done + 1, len(views))
     return photos
-
-
-def _decode(path: Path, *, grey: bool = False) -> np.ndarray:
-    """Pixels as stored, in OpenCV's order of channels."""
-    data = read_bytes(path, "a photograph")
-    check_image(path, data)
-    cv2 = opencv()
-    flags = cv2.IMREAD_UNCHANGED  # does not rotate
-    if grey:
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        raise InputError(f"{path}: cannot be decoded: {str(error)[:120]}") from error
-    if pixels is None:
-        raise InputError(
-            f"{path}: cannot be decoded: the image is truncated, damaged or of a kind "
-            "that OpenCV does not read; convert it to PNG or JPEG"
-        )
-    return pixels
 
 
 def _to_rgb(path: Path, stored: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
@@ -160,7 +154,8 @@ def _scaled(K: np.ndarray, sx: float, sy: float) -> np.ndarray:
 
 def _masked(path: Path, width: int, height: int) -> np.ndarray:
     """[H, W] bool: where the mask is 0."""
-    mask = _decode(path, grey=True)
+    cv2 = opencv()
+    mask = decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if mask.shape != (height, width):
         rounding = sum(1 / side for side in (*mask.shape, height, width))
         stretch = mask.shape[1] / width * height / mask.shape[0]

@@ -4,20 +4,17 @@ They are decoded by OpenCV, which turns them as EXIF says, scaled down, and writ
 PNG without EXIF: whatever reads those files sees the same pixels the same way up.
 """
 
-import os
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.files import read_bytes, write_file
+from gsjax.files import write_file
 from gsjax.images import encode_png, opencv
+from gsjax.scene.decode import decode, telling_of_damage
 from gsjax.scene.image_files import check_name, find_mask
-from gsjax.scene.image_header import check_image
 from gsjax.scene.sfm_colmap import Shot, exif_camera
 
 READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
@@ -123,15 +120,8 @@ def read_upright(path: Path, grey: bool = False) -> np.ndarray:
         than any camera makes, which is found before they are taken.
     """
     cv2 = opencv()
-    data = read_bytes(path, "a photograph")
-    check_image(path, data)
-    flag = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR
-    pixels = None
-    with suppress(cv2.error), silent_libraries():
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
-    if pixels is None:
-        raise InputError(f"{path}: damaged: OpenCV does not decode it")
-    return pixels
+    with telling_of_damage([path]):
+        return decode(path, cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
 
 
 def prepare_photos(
@@ -228,18 +218,3 @@ def _some(paths: Sequence[Path]) -> str:
     others = [path.name for path in paths[1:6]]
     dots = ["…"] if len(paths) > 6 else []
     return ", ".join([str(paths[0]), *others, *dots])
-
-
-@contextmanager
-def silent_libraries() -> Iterator[None]:
-    """Within, what C libraries write on stderr is dropped: errors are told by us."""
-    sys.stderr.flush()
-    kept = os.dup(2)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)

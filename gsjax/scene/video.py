@@ -9,7 +9,8 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.images import opencv
-from gsjax.scene.sfm_photos import READ, shrink, silent_libraries
+from gsjax.scene.decode import libraries_heard
+from gsjax.scene.sfm_photos import READ, shrink
 
 _MOST = 0.9  # of the frames; what a file says of their number is often a little off
 _JUDGED_AT = 640  # px: noise of single pixels is not sharpness
@@ -74,7 +75,7 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
     capture = _opened(path)
     try:
         while True:
-            with silent_libraries():
+            with libraries_heard():
                 good, pixels = capture.read()
             if not good:
                 return
@@ -91,7 +92,7 @@ def _count(path: Path) -> int:
         if told > 0:
             return told
         counted = 0
-        with silent_libraries():
+        with libraries_heard():
             while capture.grab():
                 counted += 1
         return counted
@@ -103,7 +104,7 @@ def _opened(path: Path):
     if path.suffix.lower() in READ:
         raise InputError(f"{path}: is a single image; a folder or a video is wanted")
     cv2 = opencv()
-    with silent_libraries():
+    with libraries_heard():
         capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise InputError(

@@ -125,7 +125,8 @@ def png(width, height, color=2) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*each) for each in chunks)
 
 
-NAN, DEEP = struct.pack("<f", np.nan), "[" * 200_000
+NAN = struct.pack("<f", np.nan)
+DEEP = "[" * 9_000  # deeper than Python parses, and not yet a multitude
 NPY = "{'descr': '<f8', 'fortran_order': False, 'shape': (%s), }\n"
 CAMERAS, IMAGES, POINTS = (
     f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")
@@ -238,6 +239,11 @@ BAD = {
     # transforms.json
     "json empty": Bad("transforms.json", constant(b""), "not JSON: .*char 0"),
     "json deep": Bad("transforms.json", constant(DEEP), "not JSON"),
+    "json of braces": Bad(
+        "transforms.json",
+        constant('{"frames":[' + "{}," * 50_000 + "{}]}"),
+        "50003 objects and lists in 150015 bytes",
+    ),
     "json encoding": Bad("transforms.json", constant(b"\xff\xfe\xff"), "not JSON"),
     "json list": Bad(
         "transforms.json", constant("[1]"), r"the top is \[1\], an object"

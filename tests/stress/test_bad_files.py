@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bad_files import BAD, IMAGES, LEAVING, swap
+from bad_files import BAD, CAMERAS, IMAGES, LEAVING, POINTS, swap
 from captures import scene_of_views
-from good_files import READ, TEXT, write_good_files
+from good_files import READ, STEP, TEXT, write_good_files
 
 from gsjax import cli
 from gsjax.errors import InputError
@@ -196,36 +196,61 @@ def test_memory_of_what_is_good(tmp_path, report):
 # --- on the command line ---
 
 
-@pytest.mark.parametrize(
-    ("name", "args"),
-    [
-        ("ply count", ["info", "scene.ply"]),
-        ("ply not finite", ["export", "scene.ply", "out.ply"]),
-        ("json matrix huge", ["render", "scene.ply", "--cameras", "transforms.json"]),
-        ("json deep", ["render", "scene.ply", "--cameras", "transforms.json"]),
-        ("camera count", ["train", "."]),
-        ("image name no text", ["train", "."]),
-        ("point track", ["train", "."]),
-        ("json path up", ["train", "transforms.json"]),
-        ("json path unpaired", ["train", "transforms.json"]),
-        ("npy size", ["train", "poses_bounds.npy"]),
-        ("config deep", ["info", "."]),
-        ("config half", ["eval", "."]),
-        ("evaluation views", ["info", "."]),
-    ],
-)
-def test_the_command_line_tells_in_one_line(folder, name, args, capsys, monkeypatch):
-    monkeypatch.chdir(folder)
+MODEL = [CAMERAS, IMAGES, POINTS]
+TEXTS = [name for name in READ if name.startswith("text/")]
+PHOTOS = [name for name in READ if name.startswith("photo.")]
+# A command that reads each of the files.
+COMMANDS = {
+    "scene.ply": ["info", "scene.ply"],
+    "ascii.ply": ["export", "ascii.ply", "out.ply"],
+    "cloud.ply": ["train", "with_cloud.json", "-o", "run"],
+    **{name: ["train", ".", "-o", "run"] for name in MODEL},
+    **{name: ["train", "text", "-o", "run"] for name in TEXTS},
+    "transforms.json": ["train", "transforms.json", "-o", "run"],
+    "poses_bounds.npy": ["train", "poses_bounds.npy", "-o", "run"],
+    **{name: ["train", f"of_{name}.json", "-o", "run"] for name in PHOTOS},
+    "mask.png": ["train", "masked.json", "-o", "run"],
+    STEP: ["train", ".", "-o", ".", "--resume"],
+    "config.json": ["info", "."],
+    "eval.json": ["info", "."],
+    "cameras.json": ["eval", "."],
+}
+
+
+@pytest.fixture(scope="module")
+def datasets(folder) -> Path:
+    """The good files, with datasets that name those which are no dataset."""
+    shutil.copy(folder / "photo.png", folder / "a.png")
+    frame = {"transform_matrix": np.eye(4).tolist()}
+    top = {"w": 8, "h": 6, "fl_x": 8}
+
+    def write(name, photo, **more):
+        frames = [{**frame, "file_path": file} for file in ("a.png", photo)]
+        frames[1] |= more.pop("frame", {})
+        (folder / name).write_text(json.dumps({**top, **more, "frames": frames}))
+
+    for name in PHOTOS:
+        shutil.copy(folder / name, folder / f"b_{name}")
+        write(f"of_{name}.json", name)
+    write("masked.json", "b_photo.png", frame={"mask_path": "mask.png"})
+    write("with_cloud.json", "b_photo.png", ply_file_path="cloud.ply")
+    shutil.copytree(folder / "images", folder / "text" / "images")
+    return folder
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_the_command_line_tells_in_one_line(datasets, name, capfd, monkeypatch):
+    monkeypatch.chdir(datasets)
     file, change, wanted = BAD[name]
-    extra = {"render": ["-o", "out"], "train": ["-o", "run"]}.get(args[0], [])
-    with replaced(folder / file, change((folder / file).read_bytes())):
-        code = cli.main([*args, *extra])
-    said = capsys.readouterr()
-    assert code == 3
+    with replaced(datasets / file, change((datasets / file).read_bytes())):
+        code = cli.main(COMMANDS[file])
+    said = capfd.readouterr()
+    assert code == 3, said
     assert said.out == ""
-    (told,) = [line for line in said.err.splitlines() if line]
+    *before, told = [line for line in said.err.splitlines() if line]
     assert told.startswith("gsjax: error: ")
+    late = file in (*PHOTOS, "mask.png")  # looked at when all else is known
+    assert len(before) == 2 * late, before
     assert re.search(wanted, told), told
-    assert not (folder / "out").exists()
-    assert not (folder / "out.ply").exists()
-    assert not (folder / "run").exists()
+    assert not (datasets / "out.ply").exists()
+    assert not (datasets / "run").exists()

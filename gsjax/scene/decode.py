@@ -1,0 +1,123 @@
+"""Image files → pixels as they are stored; what is damaged is refused, or told of.
+
+OpenCV decodes and is loaded when first needed. Its decoders return what they could
+make of a damaged JPEG or TIFF and tell of it on stderr only, without the file's name.
+"""
+
+import os
+import re
+import sys
+import tempfile
+import threading
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from gsjax.errors import InputError
+from gsjax.files import read_bytes
+from gsjax.images import opencv
+from gsjax.scene.image_header import check_image
+
+# What libjpeg, libpng and, through OpenCV, libtiff say of pixels that are not as they
+# were; the rest of libpng's warnings are of colour profiles and the like.
+_DAMAGE = re.compile(
+    "(?:Corrupt JPEG data|Premature end of JPEG file|libpng warning: IDAT).*"
+    "|(?<=TIFF_Error ).*"
+)
+_HARMLESS = "libpng warning: "
+_SHOWN = 3
+_MOST_HEARD = 2**20
+_stderr_lock = threading.RLock()  # that of the process, which others must not swap too
+
+
+def decode(path: Path, flags: int) -> np.ndarray:
+    """Pixels of an image file, in OpenCV's order of channels.
+
+    Args:
+      path: the file; its own bytes are checked before anything is decoded.
+      flags: of cv2.imdecode.
+
+    Raises:
+      InputError: if it cannot be read, is no image, is truncated, or declares more
+        pixels than any camera makes.
+    """
+    data = read_bytes(path, "a photograph")
+    check_image(path, data)
+    cv2 = opencv()
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise InputError(f"{path}: cannot be decoded: {str(error)[:120]}") from error
+    if pixels is None:
+        raise InputError(
+            f"{path}: cannot be decoded: the image is truncated, damaged or of a kind "
+            "that OpenCV does not read; convert it to PNG or JPEG"
+        )
+    return pixels
+
+
+@contextmanager
+def telling_of_damage(files: Sequence[Path]) -> Iterator[None]:
+    """Within, ``files`` are decoded; those that OpenCV's decoders mend are warned of.
+
+    Threads decode at once and share one stderr. So if damage is heard of, which files
+    it is of is found by decoding them again, in turn.
+    """
+    with libraries_heard() as heard:
+        yield
+    if any(map(_DAMAGE.search, heard)):
+        _warn_of_damage(files)
+    for line in heard:
+        if not (_DAMAGE.search(line) or line.startswith(_HARMLESS)):
+            os.write(2, f"{line}\n".encode())
+
+
+def _warn_of_damage(files: Sequence[Path]) -> None:
+    told = {}
+    for path in files:
+        with libraries_heard() as heard:
+            decode(path, opencv().IMREAD_GRAYSCALE)
+        found = [match for match in map(_DAMAGE.search, heard) if match]
+        if found:
+            told[path] = found[0][0]
+    if told:
+        some = "; ".join(f"{path}: {why}" for path, why in [*told.items()][:_SHOWN])
+        more = f"; and {len(told) - _SHOWN} more" if len(told) > _SHOWN else ""
+        warnings.warn(
+            f"photographs that are damaged are read as far as they could be: {some}"
+            f"{more}; copy or export them again, or remove them",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+@contextmanager
+def libraries_heard() -> Iterator[list[str]]:
+    """Within, nothing reaches stderr; afterwards the list holds its lines.
+
+    C libraries write there, past Python. Another thread's use of this waits.
+    """
+    heard: list[str] = []
+    with _stderr_lock, _scratch() as scratch:
+        if sys.stderr is not None:
+            sys.stderr.flush()
+        kept = os.dup(2)
+        try:
+            os.dup2(scratch.fileno(), 2)
+            yield heard
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            scratch.seek(0)
+            text = scratch.read(_MOST_HEARD).decode(errors="replace")
+            heard += [line for line in text.splitlines() if line.strip()]
+
+
+def _scratch():
+    """A file without a name; in memory where there is such a thing."""
+    if hasattr(os, "memfd_create"):
+        return os.fdopen(os.memfd_create("stderr"), "w+b")
+    return tempfile.TemporaryFile()
