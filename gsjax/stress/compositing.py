@@ -10,8 +10,10 @@ from gsjax.raster.alpha import alphas
 from gsjax.raster.blend import running_product
 from gsjax.raster.counts import total_count
 from gsjax.raster.reference import reference_render
-from gsjax.raster.render import render
+from gsjax.raster.render import render, render_exact
+from gsjax.sh import dc_to_rgb
 from gsjax.stress.scenes import (
+    BACKGROUND,
     BAND,
     COMPAT,
     SIZE,
@@ -200,6 +202,25 @@ def everywhere(full: bool) -> Measured:
     return Measured(float(error) if whole else np.nan, f"{int(out.demand.pairs)} pairs")
 
 
+def full_screen(full: bool) -> Measured:
+    """Largest error of a colour behind 120 000 faint splats over the whole image."""
+    del full
+    rng = np.random.default_rng(4)
+    count, opacity = 120_000, 0.01
+    depths = rng.permutation(np.linspace(4, 5, count, dtype=np.float32))
+    points = np.stack([0 * depths, 0 * depths, depths], axis=-1)
+    fields = fields_at(points, 3000, opacity, np.eye(4), degree=0)
+    scene, camera = make_gaussians(**fields), camera_of(np.eye(4), width=128, height=96)
+    out = render_exact(scene, camera, background=BACKGROUND)
+    # Flat over the image, so that a pixel is a sum; by the time it ends nothing is seen.
+    colors = double(dc_to_rgb(fields["sh"][:, 0]))
+    through = (1 - opacity) ** np.arange(count)
+    wanted = opacity * through @ colors[np.argsort(depths)]
+    error = np.abs(np.asarray(out.rgb) - wanted).max()
+    pairs = int(out.demand.pairs)
+    return Measured(float(error), f"{count:,} splats, {pairs:,} pairs")
+
+
 def constants(full: bool) -> Measured:
     """Bytes of arrays that a compiled render captures; scenes are arguments."""
     del full
@@ -229,5 +250,12 @@ CASES = (
     Case("capacity/past 2^31", "silent or wrong", 0, past_32_bits),
     Case("sizes/odd", "largest error of α or colour", 1e-5, sizes, full_only=True),
     Case("sizes/splats everywhere", "largest error of a colour", 1e-5, everywhere),
+    Case(
+        "sizes/full-screen splats",
+        "error of a colour",
+        1e-4,
+        full_screen,
+        full_only=True,
+    ),
     Case("compiling/captured arrays", "size", 1024, constants, "bytes"),
 )
