@@ -230,8 +230,8 @@ def test_the_estimate_of_a_run_is_what_runs_took(name, changes, measured, report
 def test_files_are_refused_before_they_are_read(tmp_path, monkeypatch):
     """By what their headers declare; the files are sparse."""
     monkeypatch.setattr(memory, "available", lambda: GB // 4)
-    names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2".split()
-    names += [f"rot_{i}" for i in range(4)]
+    names = [*"xyz", "opacity", *(f"rot_{i}" for i in range(4))]
+    names += [f"{part}_{i}" for part in ("f_dc", "scale") for i in range(3)]
     rows = 10_000_000
     for read, properties in ((gsjax.load, names), (read_point_cloud, names[:3])):
         path = tmp_path / f"{len(properties)}.ply"

@@ -212,7 +212,7 @@ def full_screen(full: bool) -> Measured:
     fields = fields_at(points, 3000, opacity, np.eye(4), degree=0)
     scene, camera = make_gaussians(**fields), camera_of(np.eye(4), width=128, height=96)
     out = render_exact(scene, camera, background=BACKGROUND)
-    # Flat over the image, so that a pixel is a sum; by the time it ends nothing is seen.
+    # Flat over the image, so that any pixel is a sum; the background is behind it all.
     colors = double(dc_to_rgb(fields["sh"][:, 0]))
     through = (1 - opacity) ** np.arange(count)
     wanted = opacity * through @ colors[np.argsort(depths)]
