@@ -211,7 +211,7 @@ def full_screen(full: bool) -> Measured:
     points = np.stack([0 * depths, 0 * depths, depths], axis=-1)
     fields = fields_at(points, 3000, opacity, np.eye(4), degree=0)
     scene, camera = make_gaussians(**fields), camera_of(np.eye(4), width=128, height=96)
-    out = render_exact(scene, camera, background=BACKGROUND)
+    out = render_exact(scene, camera, background=jnp.asarray(BACKGROUND))
     # Flat over the image, so that any pixel is a sum; the background is behind it all.
     colors = double(dc_to_rgb(fields["sh"][:, 0]))
     through = (1 - opacity) ** np.arange(count)
