@@ -20,6 +20,10 @@ from gsjax.errors import InputError
 
 # What is nearer to the camera is not drawn, where nothing else is said; world units.
 NEAR = 0.01
+# Extent (`scene.initialise.scene_extent`) of the scenes that the field's numbers in
+# units of the world are for: COLMAP scales what it reconstructs so that the box around
+# the middle eight tenths of the cameras, along each axis, has a diagonal of 10 units.
+USUAL_EXTENT = 5.0
 # px, of focal lengths; the principal point lies within. Nothing is drawn beyond.
 LENS_RANGE = (1e-15, 1e15)
 Array = jax.Array

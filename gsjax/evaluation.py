@@ -92,7 +92,7 @@ def evaluate(
     for view, photo in zip(views, photos, strict=True):
         height, width = photo.pixels.shape[:2]
         camera = make_camera(
-            viewmat=view.viewmat, K=photo.K, width=width, height=height
+            viewmat=view.viewmat, K=photo.K, width=width, height=height, near=view.near
         )
         result = render_exact(gaussians, camera, config, jnp.asarray(behind))
         assert result.rgb is not None

@@ -124,7 +124,7 @@ def _view_entries(views: Sequence[View], max_size: int | None) -> list[CameraEnt
     for index, (shown, view) in enumerate(zip(flat, views)):
         shown = shown if clear else f"{index:05d}_{shown}"
         trained = _as_trained(view, max_size)
-        entries.append(_entry(shown, trained.viewmat, trained))
+        entries.append(_entry(shown, trained.viewmat, trained, view.near))
     return entries
 
 
@@ -146,12 +146,17 @@ def _flight(
         )
     flown = fly(viewmats, frames, depth=depth)
     lens = paths.median_intrinsics([_as_trained(v, max_size) for v in scene.views])
-    return [_entry(f"frame_{n:04d}", pose, lens) for n, pose in enumerate(flown, 1)]
+    near = min(view.near for view in scene.views)
+    return [
+        _entry(f"frame_{n:04d}", pose, lens, near) for n, pose in enumerate(flown, 1)
+    ]
 
 
-def _entry(name: str, viewmat: np.ndarray, lens: View | paths.Intrinsics):
+def _entry(
+    name: str, viewmat: np.ndarray, lens: View | paths.Intrinsics, near: float
+) -> CameraEntry:
     camera = make_camera(
-        viewmat=viewmat, K=lens.K, width=lens.width, height=lens.height
+        viewmat=viewmat, K=lens.K, width=lens.width, height=lens.height, near=near
     )
     return CameraEntry(name, camera)
 

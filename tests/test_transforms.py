@@ -236,7 +236,7 @@ def test_many_equal_names(tmp_path):
         ("", "not JSON"),
         ("{", "not JSON"),
         (b"\xff\xfe\xff", "not JSON"),
-        ("[" * 100_000, "not JSON"),
+        ("[" * 9_000, "not JSON"),
         ("[1]", r"the top is \[1\]"),
         ({}, "'frames' is missing"),
         ({"frames": []}, r"'frames' is \[\]"),

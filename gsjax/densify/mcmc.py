@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from gsjax.cameras import USUAL_EXTENT
 from gsjax.densify.schedule import is_due
 from gsjax.densify.slots import copy_into
 from gsjax.densify.types import Densifier, SlotEdit
@@ -25,10 +26,6 @@ from gsjax.rotations import covariance
 
 Array = jax.Array
 
-# Extent of the scenes that the paper's noise and penalty are for: COLMAP scales what it
-# reconstructs so that the box around the middle eight tenths of the cameras, along each
-# axis, has a diagonal of 10 units.
-_USUAL_EXTENT = 5.0
 # Trapezoid of ∫ over [0, 5]; the integrand is entire, so it converges faster than
 # any power of the step: 3e-7 relative for n up to 51 (tested).
 _NODES, _REACH = 51, 5.0
@@ -84,14 +81,14 @@ class McmcSettings:
                 )
 
 
-def mcmc(settings: McmcSettings, extent: float = _USUAL_EXTENT) -> Densifier:
+def mcmc(settings: McmcSettings, extent: float = USUAL_EXTENT) -> Densifier:
     """The strategy.
 
     Args:
       settings: see there.
       extent: of the scene, in its units; see `gsjax.scene.initialise.scene_extent`.
     """
-    unit = extent / _USUAL_EXTENT
+    unit = extent / USUAL_EXTENT
 
     def plan(key: Array, step: Array, gaussians: Gaussians, stats: tuple):
         del step

@@ -6,8 +6,11 @@ from itertools import pairwise
 from os import PathLike
 from pathlib import Path
 
+import numpy as np
+
 from gsjax.errors import InputError
 from gsjax.scene.colmap import find_colmap, load_colmap
+from gsjax.scene.initialise import near_plane
 from gsjax.scene.llff import load_llff
 from gsjax.scene.nerf import find_transforms, load_nerf
 from gsjax.scene.rebase import rebase
@@ -83,7 +86,7 @@ def load_dataset(
 
 
 def _finished(scene: Scene) -> Scene:
-    """Views sorted, names unique, coordinates near 0."""
+    """Views sorted, names unique, a near plane that suits, coordinates near 0."""
     views = sorted(scene.views, key=lambda view: view.name)
     if not views:
         raise InputError(f"{scene.source}: no view is left; at least 1 is wanted")
@@ -93,4 +96,6 @@ def _finished(scene: Scene) -> Scene:
                 f"{scene.source}: the photograph {after.name!r} is listed more than "
                 "once; remove all but one"
             )
-    return rebase(replace(scene, views=tuple(views)))
+    near = near_plane(np.stack([view.centre for view in views]))
+    views = tuple(replace(view, near=near) for view in views)
+    return rebase(replace(scene, views=views))

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from gsjax.cameras import NEAR, USUAL_EXTENT
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.scene.paths import focus_point
@@ -20,6 +21,20 @@ def scene_extent(centres: np.ndarray) -> float:
     """
     spread = np.linalg.norm(centres - centres.mean(0), axis=1).max()
     return float(1.1 * spread) if spread > 0 else 1.0
+
+
+def near_plane(centres: np.ndarray) -> float:
+    """How near a camera Gaussians are drawn: `NEAR`, less in a scene of a small unit.
+
+    Args:
+      centres: [V, 3] where the cameras stand.
+
+    Returns:
+      The same share of `scene_extent` in any unit, at most `NEAR`, which is also that
+      of cameras in one place.
+    """
+    extent = scene_extent(centres) if np.ptp(centres, axis=0).any() else USUAL_EXTENT
+    return NEAR * min(1.0, extent / USUAL_EXTENT)
 
 
 def init_gaussians(

@@ -15,6 +15,7 @@ import numpy as np
 
 from gsjax.cameras import Camera, make_camera
 from gsjax.errors import InputError
+from gsjax.scene.initialise import near_plane
 from gsjax.scene.rebase import far_origin, shifted
 from gsjax.scene.transforms_fields import (
     Frame,
@@ -68,7 +69,7 @@ def load_transforms(
       InputError: if the file cannot be read, is no such JSON, or a frame has no
         rigid transform_matrix, no usable intrinsics, no size or an unknown lens.
     """
-    entries, _ = _load(Path(path), size, near=False)
+    entries, _ = _load(Path(path), size, near_origin=False)
     return entries
 
 
@@ -81,11 +82,11 @@ def load_near_transforms(
       The cameras, and what was subtracted from their world's coordinates [3] in
       float64, and is to be from those of the scene; see `gsjax.scene.rebase`.
     """
-    return _load(Path(path), size, near=True)
+    return _load(Path(path), size, near_origin=True)
 
 
 def _load(
-    path: Path, size: tuple[int, int] | None, near: bool
+    path: Path, size: tuple[int, int] | None, near_origin: bool
 ) -> tuple[list[CameraEntry], np.ndarray]:
     if size is not None and not (
         len(size) == 2 and all(isinstance(v, int | np.integer) and v >= 1 for v in size)
@@ -93,16 +94,15 @@ def _load(
         raise InputError(f"size {size}: (width, height), whole and ≥ 1, is wanted")
     frames = read_frames(path)
     poses = [pose_of(frame) for frame in frames]
-    origin = np.zeros(3)
-    if near and poses:
-        centres = [-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat, _ in poses]
-        origin = far_origin(np.stack(centres), np.zeros((0, 3)))
+    centres = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose, _ in poses])
+    origin = far_origin(centres, np.zeros((0, 3))) if near_origin else np.zeros(3)
+    near = near_plane(centres)
     entries: list[CameraEntry] = []
     used: dict[str, int] = {}
     distorted = set()
     for index, (frame, (viewmat, _)) in enumerate(zip(frames, poses)):
         distorted.update(_distortion(frame))
-        camera = _camera(frame, shifted(viewmat, origin), size)
+        camera = _camera(frame, shifted(viewmat, origin), size, near)
         entries.append(CameraEntry(_unique_name(frame, index, used), camera))
     factors = enumerate(factor for _, factor in poses)
     warn_of_scaled(path, [(index, factor) for index, factor in factors if factor != 1])
@@ -119,7 +119,9 @@ def _load(
 # --- intrinsics ---
 
 
-def _camera(frame: Frame, viewmat: np.ndarray, size: tuple[int, int] | None) -> Camera:
+def _camera(
+    frame: Frame, viewmat: np.ndarray, size: tuple[int, int] | None, near: float
+) -> Camera:
     model = _model(frame)
     width, height = _size(frame, size)
     fx, fy = focal_lengths(frame, width, height, model)
@@ -136,6 +138,7 @@ def _camera(frame: Frame, viewmat: np.ndarray, size: tuple[int, int] | None) -> 
                 K=K,
                 width=int(out_width),
                 height=int(out_height),
+                near=near,
                 model=model,
             )
     except InputError as error:

@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsjax.cameras import NEAR
+
 
 class Lens(NamedTuple):
     """Distortion of a photograph, in OpenCV's terms.
@@ -38,6 +40,7 @@ class View:
       mask: file of a grey image of the same size, 0 where a pixel is to be left
         out; or None.
       split: "train" or "test" where the dataset itself says so, else None.
+      near: what is nearer than that, in units of the scene, is not drawn.
     """
 
     name: str
@@ -49,6 +52,7 @@ class View:
     lens: Lens | None = None
     mask: Path | None = None
     split: str | None = None
+    near: float = NEAR
 
     @property
     def centre(self) -> np.ndarray:

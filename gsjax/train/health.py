@@ -7,7 +7,6 @@ import warnings
 from collections import deque
 from collections.abc import Sequence
 
-from gsjax.cameras import NEAR
 from gsjax.errors import DivergedError, InputError
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.step import Metrics
@@ -50,23 +49,38 @@ def check_photos(scene: Scene, photos: Sequence[Photo]) -> None:
 
 
 def check_points(scene: Scene) -> None:
-    """See that some point lies before some camera, and not too near to be drawn.
+    """See that points lie before cameras, and not too near to be drawn.
+
+    Warns where half of those that lie before a camera are too near to it.
 
     Raises:
-      InputError: if none does: such Gaussians would never be seen, nor ever move.
+      InputError: if no camera sees one: such Gaussians would never be drawn, nor move.
     """
-    points, farthest = scene.points, 0.0
+    points = scene.points
+    if len(points) == 0:
+        return
+    before, drawn, farthest = 0, 0, 0.0
     for view in scene.views:
         depth = points @ view.viewmat[2, :3] + view.viewmat[2, 3]
-        farthest = max(farthest, depth.max(initial=0))
-        if len(points) == 0 or farthest > NEAR:
-            return
-    if farthest > 0:
+        before += int((depth > 0).sum())
+        drawn += int((depth > view.near).sum())
+        farthest = max(farthest, depth.max())
+    near = max(view.near for view in scene.views)
+    unit = "are points and poses in one unit of length?"
+    if 0 < drawn < before / 2:
+        warnings.warn(
+            f"{scene.source}: {1 - drawn / before:.0%} of the points before a camera "
+            f"are nearer to it than {near:.2g}, and not drawn; {unit}",
+            UserWarning,
+            stacklevel=2,
+        )
+    if drawn:
+        return
+    if before:
         raise InputError(
             f"{scene.source}: no point is farther than {farthest:.2g} from a camera, "
-            f"and what is nearer than {NEAR:g} is not drawn; give the dataset a "
-            "smaller unit of length: multiply points and camera positions by "
-            f"{10 * NEAR / farthest:.1g} or more"
+            f"and what is nearer than {near:.2g} is not drawn; {unit} Mend the "
+            "dataset, or start from random points (--initial random)"
         )
     raise InputError(
         f"{scene.source}: all {len(points):,} points lie behind all {len(scene.views)} "

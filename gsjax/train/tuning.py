@@ -26,7 +26,8 @@ class Tuning:
       turns: [V, 3] rotation of the camera, as half the vector part of a quaternion.
       shifts: [V, 3] of the camera, in camera axes and in extents of the scene.
       intrinsics: [4] logarithm of the factor on each focal length, and shift of the
-        principal point as a share of the image's size; one for all views.
+        principal point in focal lengths, as given; one for all views. (Not in sizes of
+        the image, which is padded in a batch of photographs of several sizes.)
       exposures: [V, 3, 4] affine map of the colours, minus the identity.
     """
 
@@ -80,9 +81,9 @@ def tuned_camera(camera: Camera, tuning: Tuning, index: Array, extent: float) ->
         viewmat = jnp.concatenate([top, viewmat[:, 3:]], 1)
     if tuning.intrinsics is not None:
         factor = jnp.exp(tuning.intrinsics[:2])
-        size = jnp.asarray([camera.width, camera.height], K.dtype)
+        focal = jnp.stack([K[:, 0, 0], K[:, 1, 1]], -1)
         K = K.at[:, 0, 0].multiply(factor[0]).at[:, 1, 1].multiply(factor[1])
-        K = K.at[:, :2, 2].add(size * tuning.intrinsics[2:])
+        K = K.at[:, :2, 2].add(focal * tuning.intrinsics[2:])
     return Camera(viewmat, K, camera.near, camera.far, camera.width, camera.height,
                   camera.model)  # fmt: skip
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsjax import images
-from gsjax.cameras import Camera, make_camera
+from gsjax.cameras import NEAR, Camera, make_camera
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.raster.render import render_exact
 from gsjax.raster.types import RasterConfig, Render
@@ -19,7 +19,9 @@ KINDS = ("rgb", "depth", "alpha")
 _PAIRS, _MARGIN = 2**20, 1.5  # room at first, and for the views to come
 
 
-def camera_of(wxyz, position, fov: float, width: int, height: int) -> Camera:
+def camera_of(
+    wxyz, position, fov: float, width: int, height: int, near: float = NEAR
+) -> Camera:
     """The pinhole camera of a browser.
 
     Args:
@@ -27,6 +29,7 @@ def camera_of(wxyz, position, fov: float, width: int, height: int) -> Camera:
       position: [3] in the world.
       fov: vertical field of view, radians.
       width, height: px of the picture that is wanted.
+      near: what is nearer than that is not drawn.
     """
     world_from_camera = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix()
     viewmat = np.eye(4)
@@ -34,7 +37,7 @@ def camera_of(wxyz, position, fov: float, width: int, height: int) -> Camera:
     viewmat[:3, 3] = -world_from_camera.T @ np.asarray(position, np.float64)
     focal = 0.5 * height / np.tan(fov / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return make_camera(viewmat=viewmat, K=K, width=width, height=height)
+    return make_camera(viewmat=viewmat, K=K, width=width, height=height, near=near)
 
 
 class ExactRenderer:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gsjax.cameras import NEAR
 from gsjax.console import note, one_line
 from gsjax.errors import GsjaxError
 from gsjax.gaussians import Gaussians, select
@@ -223,7 +224,14 @@ class Session:
         try:
             view = self.exhibit.renderer(
                 select(gaussians, self.shown),  # pyright: ignore
-                camera_of(camera.wxyz, camera.position, camera.fov, width, height),
+                camera_of(
+                    camera.wxyz,
+                    camera.position,
+                    camera.fov,
+                    width,
+                    height,
+                    near=min(NEAR, self.exhibit.eye.near),
+                ),
             )
         except GsjaxError as error:
             self.told.content = f"not rendered: {one_line(error)}"

@@ -69,6 +69,11 @@ class Eye(NamedTuple):
         """From the target, world units."""
         return float(np.linalg.norm(self.target - self.position))
 
+    @property
+    def near(self) -> float:
+        """What is nearer than that to a browser's camera is not drawn."""
+        return 1e-3 * self.distance
+
 
 def require_viser() -> Any:
     """The module viser.
@@ -232,7 +237,7 @@ def set_eye(server: Any, eye: Eye) -> None:
     camera = server.initial_camera
     camera.position, camera.look_at = tuple(eye.position), tuple(eye.target)
     camera.fov = eye.fov
-    camera.near, camera.far = 1e-3 * eye.distance, 1e4 * eye.distance
+    camera.near, camera.far = eye.near, 1e4 * eye.distance
 
 
 def paint_background(scene: Any, color: Sequence[float]) -> None:

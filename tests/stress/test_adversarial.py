@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 import pytest
-from captures import scene_of_views
+from captures import save_photo, scene_of_views
 from hostile import HOSTILE, harmless, write_hostile
 
 import gsjax
@@ -28,11 +28,18 @@ from gsjax.commands.train import TrainCommand
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import CapacityError, DivergedError, InputError
+from gsjax.evaluation import evaluate
+from gsjax.flights import path_entries
 from gsjax.raster.types import RasterConfig
+from gsjax.scene.colmap_writer import write_colmap
+from gsjax.scene.dataset import load_dataset
+from gsjax.scene.initialise import init_gaussians
+from gsjax.scene.photos import load_photos
 from gsjax.subjects import splat_file
 from gsjax.train.checkpoint import load_checkpoint
 from gsjax.train.config import TrainConfig
-from gsjax.train.folder import RunSettings
+from gsjax.train.folder import Data, RunSettings
+from gsjax.train.frames import make_frames
 from gsjax.train.health import Health, check_points
 from gsjax.train.held_out import evaluate_run
 from gsjax.train.history import read_metrics
@@ -123,15 +130,46 @@ def in_units(scene, unit: float):
 
 
 def test_a_unit_too_large_is_told():
-    """What is nearer than `NEAR` would never be drawn, nor ever move."""
+    """Of points alone: what is too near would never be drawn, nor ever move."""
     scene = scene_of_views(count=3)
     check_points(scene)
     small = in_units(scene, 1e-4)
-    with pytest.raises(InputError, match=r"nearer than 0\.01 .* smaller unit") as told:
+    with pytest.raises(InputError, match=r"nearer than 0\.01 .* one unit of length"):
         check_points(small)
-    factor = float(str(told.value).split()[-3])
-    assert factor > 1
-    check_points(in_units(small, factor))
+    view = scene.views[0]
+    tight = view.centre + 0.005 * view.viewmat[2, :3]
+    few = np.stack([tight, tight, tight, view.centre + view.viewmat[2, :3]])
+    with pytest.warns(UserWarning, match="75% of the points .* 0.01, and not drawn"):
+        check_points(replace(scene, points=few, views=(view,)))
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e3])
+def test_a_dataset_may_be_in_any_unit(unit, tmp_path):
+    """What is drawn of it does not depend on that, wherever cameras are made."""
+    seen = {}
+    for factor in (0.1, unit):  # of an extent below the usual one
+        folder = tmp_path / str(factor)
+        scene = in_units(scene_of_views(count=3), factor)
+        write_colmap(folder / "sparse/0", scene)
+        for view in scene.views:
+            save_photo(folder / "images" / view.name)
+        found = load_dataset(folder)
+        check_points(found)
+        photos, gaussians = load_photos(found.views), init_gaussians(found, sh_degree=0)
+        first = next(evaluate(gaussians, found.views, photos))
+        frames = make_frames(found.views, photos)
+        cameras = [frames.camera]
+        for path in ("train", "orbit"):
+            entries = path_entries(Data(found, [0, 1], []), path, frames=2)
+            cameras += [entry.camera for entry in entries]
+        near = np.concatenate([np.atleast_1d(camera.near) for camera in cameras])
+        seen[factor] = first.render, near / factor
+    (wanted, usual), (render, near) = seen.values()
+    assert wanted.std() > 0.02  # something is seen
+    np.testing.assert_allclose(render, wanted, atol=1e-4)
+    np.testing.assert_allclose(near, near[0], rtol=1e-6)
+    if unit < 1:
+        np.testing.assert_allclose(near, usual, rtol=1e-6)
 
 
 # --- divergence ---
