@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import ArrayLike
 
 from gsjax.errors import InputError
 
@@ -122,8 +123,8 @@ def make_camera(
     K,
     width: int,
     height: int,
-    near=NEAR,
-    far=1e10,
+    near: ArrayLike = NEAR,
+    far: ArrayLike = 1e10,
     model: str | CameraModel = PINHOLE,
 ) -> Camera:
     """A camera (or batch) from arrays; traceable in ``viewmat``, ``K``, near and far.

@@ -21,16 +21,31 @@ def test_the_time_left_knows_of_larger_pictures_and_of_compiling(monkeypatch, ca
     monkeypatch.setattr("gsjax.train.report._LINE_SECONDS", 0.0)
     reporter = Reporter(CONFIG)
     reporter.step(progress(10, 30.0, 20.0))  # a step a second, twenty for a program
-    assert reporter.left(10) == pytest.approx(40 + 4 * 30 + 16 * 20 + 2 * 20)
+    assert reporter.left(10) == pytest.approx(40 + 2 * 30 + 4 * 20 + 2 * 20)
     reporter.step(progress(60, 120.0, 20.0 + 30.0))
     assert reporter.rate == pytest.approx(50 / 60)
-    assert reporter.left(60) == pytest.approx(60 / 50 * (20 + 4 * 20) + 25)
+    assert reporter.left(60) == pytest.approx(60 / 50 * (20 + 2 * 20) + 25)
     reporter.step(progress(100, 200.0, 50.0))
     assert reporter.left(100) == 0
     reporter.close()
     *_, before, last = capsys.readouterr().err.splitlines()
     assert "step 60/100: loss 0.0000, 0.00 dB, 0 Gaussians, 0.8 steps/s" in before
     assert last.endswith("3:20 gone, 0:00 left")
+
+
+def test_of_the_first_steps_nothing_is_foretold(monkeypatch, capsys):
+    """They are slow; and where all are, they are waited for no longer than usual."""
+    monkeypatch.setattr("gsjax.train.report._LINE_SECONDS", 0.5)
+    reporter = Reporter(CONFIG)
+    reporter.last = 0.0  # long ago, as after compiling
+    for step in range(1, 20):
+        reporter.step(progress(step, 20.02 * step, 20.0 * step))
+    assert capsys.readouterr().err == ""
+    reporter.step(progress(20, 420.4, 420.0))
+    assert "step 20/100" in capsys.readouterr().err
+    reporter.last = 0.0
+    reporter.step(progress(21, 421.4, 420.0))
+    assert "1.0 steps/s" in capsys.readouterr().err
 
 
 def test_a_bar_on_a_terminal(monkeypatch, capsys):

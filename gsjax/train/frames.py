@@ -87,7 +87,7 @@ def make_frames(
         K=np.stack([photo.K for photo in small]),
         width=width,
         height=height,
-        near=np.asarray([view.near for view in views]),
+        near=jnp.asarray([view.near for view in views]),
     )
     return Frames(
         jnp.asarray(pixels), None if valid.all() else jnp.asarray(valid), camera

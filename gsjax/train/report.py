@@ -12,6 +12,7 @@ from gsjax.train.fit import Progress
 
 _LINE_SECONDS, _BAR_SECONDS = 10.0, 1.0
 _SMOOTH = 0.05
+_SURE = 20
 
 
 class Reporter:
@@ -20,8 +21,10 @@ class Reporter:
     def __init__(self, config: TrainConfig, done: int = 0):
         self.steps = config.steps
         self.divisors = np.array([config.divisor(s) for s in range(config.steps)])
-        # Pixels of all steps from each on, in those of the photographs.
-        self.ahead = np.append(np.cumsum(self.divisors[::-1] ** -2.0)[::-1], 0)
+        # Times of all steps from each on, in those of a step at full size. They go with
+        # the side of the pictures rather than with their pixels: twice the side took
+        # 1.1 to 2.3 times as long, as more than pictures is worked on.
+        self.ahead = np.append(np.cumsum(1 / self.divisors[::-1])[::-1], 0)
         self.bar: Any = None
         if sys.stderr.isatty():
             from tqdm import tqdm
@@ -56,11 +59,13 @@ class Reporter:
         if self.bar is not None:
             self.bar.update(1)
         pause = _LINE_SECONDS if self.bar is None else _BAR_SECONDS
-        if step < self.steps and now < self.last + pause:
-            return
-        self.last = now
         working = progress.seconds - progress.compile_seconds
         before, then = self.rate_from
+        # The first steps of a program are slow: of few of them nothing follows.
+        sure = step - before >= _SURE or working - then >= pause
+        if step < self.steps and not (sure and now >= self.last + pause):
+            return
+        self.last = now
         self.rate = (step - before) / max(working - then, 1e-9)
         self.rate_from = (step, working)
         told = (
@@ -85,10 +90,10 @@ class Reporter:
             )
 
     def left(self, step: int) -> float:
-        """Seconds to come, about: a step takes as long as it has pixels, and where
-        pictures become larger there is a program to compile."""
+        """Seconds to come, about: a step takes as long as its pictures are wide, and
+        where they become larger there is a program to compile."""
         here = self.divisors[max(step - 1, 0)]
-        work = here**2 * self.ahead[step]
+        work = here * self.ahead[step]
         programs = np.sum(np.unique(self.divisors[step:]) != here)
         each = self.compiled[-1] / len(self.compiled) if self.compiled else 0.0
         return work / max(self.rate, 1e-9) + programs * each
