@@ -16,6 +16,7 @@ import resource
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 
 import measure
 import numpy as np
@@ -99,14 +100,43 @@ def _peak_gb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
 
 
-def slopes(rows: list[dict]) -> dict[str, float]:
-    """Exponents of time against pairs (log-log) over the points above 10 k pairs."""
-    large = [row for row in rows if row["pairs"] > 10_000 and row["room"] == 1]
-    pairs = np.log([row["pairs"] for row in large])
+def series(rows: list[dict]) -> dict[str, tuple[list[dict], Callable[[dict], float]]]:
+    """The rows in which one thing alone varies, and that thing, by its name."""
+    plain = [row for row in rows if row["room"] == row["cameras"] == 1]
+    small = [row for row in rows if row["width"] == 320]
+    wide = [row for row in plain if row["width"] == 1280] or plain
+    sizes = [row for row in plain if row["Gaussians"] == 100_000]
     return {
-        key: float(np.polyfit(pairs, np.log([row[key] for row in large]), 1)[0])
-        for key in ("forward ms", "v+g ms")
-    }
+        "Gaussians": (wide, lambda row: row["Gaussians"]),
+        "pixels": (
+            sorted(sizes, key=lambda row: row["width"]),
+            lambda row: row["width"] * row["height"],
+        ),
+        "pairs": (
+            [row for row in rows if row["pairs"] > 10_000 and row["room"] == 1],
+            lambda row: row["pairs"],
+        ),
+        "cameras": (
+            [row for row in small if row["room"] == 1], lambda row: row["cameras"]
+        ),
+        "capacity / active": (
+            [row for row in small if row["cameras"] == 1], lambda row: row["room"]
+        ),
+    }  # fmt: skip
+
+
+def slopes(rows: list[dict]) -> dict[str, dict[str, float]]:
+    """Exponents of time, memory and first calls against each thing (log-log)."""
+    measured = ("forward ms", "v+g ms", "v+g GB", "first forward s", "first v+g s")
+    return {
+        name: {
+            key: float(np.polyfit(np.log([x(row) for row in chosen]),
+                                  np.log([row[key] for row in chosen]), 1)[0])
+            for key in measured
+        }
+        for name, (chosen, x) in series(rows).items()
+        if len({x(row) for row in chosen}) > 1
+    }  # fmt: skip
 
 
 def plot(rows: list[dict], path) -> None:
@@ -119,20 +149,17 @@ def plot(rows: list[dict], path) -> None:
 
     figure, axes = plt.subplots(1, 5, figsize=(20, 4))
 
-    def pixels(row: dict) -> int:
-        return row["width"] * row["height"]
-
-    plain = [row for row in rows if row["room"] == row["cameras"] == 1]
-    by_count = [row for row in plain if row["width"] == 1280]
-    by_size = sorted((r for r in plain if r["Gaussians"] == 100_000), key=pixels)
-    batches = [row for row in rows if row["width"] == 320 and row["room"] == 1]
-    roomy = [row for row in rows if row["width"] == 320 and row["cameras"] == 1]
-    panels = (
-        (axes[0], by_count, lambda r: r["Gaussians"], "Gaussians (1280 × 720)"),
-        (axes[1], by_size, pixels, "pixels (100 k)"),
-        (axes[2], batches, lambda r: r["cameras"], "cameras (100 k, 320 × 180)"),
-        (axes[3], roomy, lambda r: r["room"], "capacity / active (100 k, 320 × 180)"),
-    )
+    labels = {
+        "Gaussians": "Gaussians (1280 × 720)",
+        "pixels": "pixels (100 k)",
+        "cameras": "cameras (100 k, 320 × 180)",
+        "capacity / active": "capacity / active (100 k, 320 × 180)",
+    }
+    found = series(rows)
+    panels = [
+        (axis, *found[name], label) for axis, (name, label) in zip(axes, labels.items())
+    ]
+    by_count = found["Gaussians"][0]
     for axis, chosen, x, label in panels:
         for key in ("forward ms", "v+g ms"):
             axis.loglog(

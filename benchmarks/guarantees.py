@@ -1,0 +1,94 @@
+"""Claim: what each guarantee costs is known.
+
+``python benchmarks/guarantees.py`` renders guitar.ply at 400 × 300 (where the data are
+absent, a synthetic shell), all in turn in one run: float32 by default; float64; without
+the cap and the cut that the field has (`accurate`); on one device instead of all, which
+gives the same bits; by calls that are queued; derivatives in forward mode (`jax.jvp`,
+one direction), in reverse mode (value and gradient), and of second order (a
+Hessian–vector product). Ratios are to the first, but for the last: to the gradient.
+
+That a run gives the same bits again has no switch: sums go in a fixed order, and ties
+of depth by slot, in any setting.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import gsjax
+
+QUEUED = "--queued" in sys.argv
+gsjax.use_all_cores(queued=QUEUED)
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import measure  # noqa: E402
+import scenes  # noqa: E402
+
+from gsjax.numerics import in_float64  # noqa: E402
+
+
+def functions(gaussians, camera, config=gsjax.RasterConfig()) -> dict:  # noqa: B008
+    """Of a render, compiled: the picture and its derivatives."""
+    config = gsjax.exact_config(gaussians, camera, config.replace(outputs=("rgb",)))
+
+    def picture(params):
+        return gsjax.render(gaussians.replace(params=params), camera, config).rgb
+
+    def loss(params):
+        return jnp.mean((picture(params) - 0.5) ** 2)
+
+    params = gaussians.params
+    along = jax.tree.map(jnp.ones_like, params)
+    made = {
+        "forward": picture,
+        "jvp": lambda p: jax.jvp(picture, (p,), (along,)),
+        "value and gradient": jax.value_and_grad(loss),
+        "Hessian–vector product": lambda p: jax.jvp(jax.grad(loss), (p,), (along,)),
+    }
+    compiled = {name: jax.jit(function) for name, function in made.items()}
+    return {name: lambda f=f: f(params) for name, f in compiled.items()}
+
+
+def main() -> None:
+    """Measure and save."""
+    case = scenes.real_cases()[0]
+    gaussians, camera = case.gaussians, gsjax.resize_camera(case.camera, 400, 300)
+    plain = functions(gaussians, camera)
+    finer, alone = gsjax.RasterConfig.accurate(), gsjax.RasterConfig(devices=1)
+    calls = {
+        **plain,
+        "accurate, forward": functions(gaussians, camera, finer)["forward"],
+        "one device, forward": functions(gaussians, camera, alone)["forward"],
+    }
+    with jax.enable_x64(True):
+        wide = functions(*in_float64((gaussians, camera)))
+
+        def in_x64(call):
+            with jax.enable_x64(True):
+                return jax.block_until_ready(call())
+
+    for name in ("forward", "value and gradient"):
+        calls[f"float64, {name}"] = lambda call=wide[name]: in_x64(call)
+    ms = measure.interleaved(calls)
+    against = {
+        "Hessian–vector product": "value and gradient",
+        "float64, value and gradient": "value and gradient",
+    }
+    rows = [
+        {
+            "what": name,
+            "ms": value,
+            "against": against.get(name, "forward"),
+            "ratio": value / ms[against.get(name, "forward")],
+        }
+        for name, value in ms.items()
+    ]
+    measure.save(
+        "guarantees_queued" if QUEUED else "guarantees",
+        rows, claim=__doc__, scene=case.name, gaussians=int(gaussians.capacity),
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
