@@ -95,7 +95,14 @@ def put(matrix, place, value):
         ({"viewmat": 2 * EYE}, "transposed"),
         ({"viewmat": np.diag([2, 2, 2, 1.0])}, r"lengths \[2. 2. 2.\]"),
         ({"viewmat": put(EYE, (0, 1), 0.1)}, "no rotation"),
+        ({"viewmat": np.diag([1, -1, 1, 1.0])}, "mirrors"),
+        ({"viewmat": np.stack([EYE, np.diag([-1.0, -1, -1, 1])])}, "mirrors"),
         ({"K": np.eye(4)}, "K"),
+        ({"K": K.T}, "last row of K .*transpose"),
+        ({"K": 2 * K}, "last row of K .*divide"),
+        ({"K": put(K, (2, 2), 0.5)}, "last row of K .*divide"),
+        ({"K": put(K, (0, 1), 0.1)}, "skew is not rendered"),
+        ({"K": put(K, (1, 0), -0.1)}, "skew is not rendered"),
         ({"K": np.zeros((2, 3, 3))}, "K"),
         ({"K": put(K, (0, 2), np.nan)}, "K"),
         ({"K": put(K, (0, 0), 0.0)}, "focal"),
@@ -115,6 +122,23 @@ def test_cameras(changes, named):
     gsjax.make_camera(**good)
     with pytest.raises(InputError, match=named):
         gsjax.make_camera(**{**good, **changes})
+
+
+def test_rounding_of_intrinsics_is_no_skew():
+    """As a product with an inverse leaves it."""
+    near = K * (1 + 1e-7) + 1e-7
+    camera = gsjax.make_camera(viewmat=EYE, K=near, width=16, height=16)
+    np.testing.assert_allclose(camera.K, K, atol=1e-5)
+
+
+def test_tracers_are_not_looked_into():
+    """Under jit the numbers of a camera are not known, and so cannot be refused."""
+
+    @jax.jit
+    def focal(viewmat, K):
+        return gsjax.make_camera(viewmat=viewmat, K=K, width=16, height=16).K[0, 0]
+
+    assert focal(jnp.diag(jnp.array([1, -1, 1, 1.0])), jnp.asarray(K.T)) == 50
 
 
 def test_other_sizes_of_cameras():
