@@ -135,7 +135,7 @@ def make_camera(
       model: "pinhole", "orthographic", or a `CameraModel`.
 
     Raises:
-      InputError: on wrong shapes or sizes, an unknown model, values that are not
+      InputError: on wrong shapes or sizes, no camera, an unknown model, values not
         finite, a focal length of zero or below, skew, a rotation part that scales or
         shears by more than a hundredth or that mirrors, or a last row other than
         0 0 0 1, of K 0 0 1. Of tracers only shapes are known.
@@ -152,6 +152,10 @@ def make_camera(
     near, far = jnp.asarray(near, dtype), jnp.asarray(far, dtype)
     if viewmat.ndim not in (2, 3) or viewmat.shape[-2:] != (4, 4):
         raise InputError(f"viewmat has shape {viewmat.shape}; [4, 4] or [B, 4, 4]")
+    if not viewmat.size:
+        raise InputError(
+            f"viewmat has shape {viewmat.shape}: at least one camera is wanted"
+        )
     batch = viewmat.shape[:-2]
     if K.shape[-2:] != (3, 3) or K.shape[:-2] not in ((), batch):
         raise InputError(f"K has shape {K.shape}; [3, 3] or {(*batch, 3, 3)} is wanted")

@@ -55,7 +55,7 @@ def test_shapes_of_gaussians(name, shape):
 
 
 def test_other_errors_of_gaussians():
-    with pytest.raises(ValueError, match="5 spherical-harmonic"):
+    with pytest.raises(InputError, match="5 spherical-harmonic"):
         gsjax.make_gaussians(**{**GOOD, "sh": np.zeros((4, 5, 3))})
     with pytest.raises(InputError, match="means is complex"):
         gsjax.make_gaussians(**{**GOOD, "means": np.zeros((4, 3), complex)})
@@ -89,6 +89,7 @@ def put(matrix, place, value):
         ({"model": "fisheye"}, "unknown camera model 'fisheye'"),
         ({"viewmat": np.eye(3)}, "viewmat"),
         ({"viewmat": np.zeros((2, 3, 4, 4))}, "viewmat"),
+        ({"viewmat": np.zeros((0, 4, 4))}, "viewmat .*at least one camera"),
         ({"viewmat": EYE.T + put(0 * EYE, (3, 0), 1)}, "transposed"),
         ({"viewmat": put(EYE, (0, 3), np.nan)}, "viewmat"),
         ({"viewmat": put(EYE, (0, 0), np.inf)}, "viewmat"),
@@ -218,6 +219,23 @@ def test_arguments_of_render(named, kwargs):
         jax.eval_shape(
             lambda g, c: gsjax.render(g, c, config, **kwargs), *scene_of("random")
         )
+
+
+def test_nothing_to_render():
+    """No cameras, or no slots, which arrays that are cut can come to."""
+    gaussians, camera = scene_of("random")
+    none = jax.tree.map(lambda a: a[None][:0], camera)
+    empty = jax.tree.map(lambda a: a[:0], gaussians)
+    for draw in (gsjax.render, gsjax.render_exact, gsjax.exact_config):
+        with pytest.raises(InputError, match="no cameras: at least one"):
+            draw(gaussians, none)
+        with pytest.raises(InputError, match="no slots: at least one"):
+            draw(empty, camera)
+    unseen = gsjax.select(gaussians, np.zeros(COUNT, bool))
+    for capacity in (0, -1):
+        with pytest.raises(InputError, match=f"capacity {capacity}: at least 1"):
+            gsjax.compact(unseen, capacity)
+    assert gsjax.compact(unseen, 1).capacity == 1
 
 
 def test_slots_and_bands():
