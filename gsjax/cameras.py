@@ -27,6 +27,8 @@ NEAR = 0.01
 USUAL_EXTENT = 5.0
 # px, of focal lengths; the principal point lies within. Nothing is drawn beyond.
 LENS_RANGE = (1e-15, 1e15)
+# Rounding of K, per focal length: 1e-3 px, the bar of the projection, at 1000 px.
+_K_ROUNDING = 1e-6
 Array = jax.Array
 Point = tuple[Array, Array, Array]
 
@@ -97,7 +99,7 @@ class Camera:
 
     Attributes:
       viewmat: [4, 4] or [B, 4, 4], world → camera.
-      K: [3, 3] or [B, 3, 3] intrinsics in pixels (skew is not used).
+      K: [3, 3] or [B, 3, 3] intrinsics in pixels; there is no skew.
       near, far: [] or [B], range of camera z that is drawn, in world units.
       width, height: image size in pixels, static.
       model: the lens, static.
@@ -132,15 +134,16 @@ def make_camera(
     Args:
       viewmat: [4, 4] or [B, 4, 4] world → camera, OpenCV axes (see
         `gsjax.scene.transforms` for files in OpenGL axes).
-      K: [3, 3] (shared) or [B, 3, 3] intrinsics in pixels.
+      K: [3, 3] (shared) or [B, 3, 3] intrinsics in pixels, fx 0 cx, 0 fy cy, 0 0 1.
       width, height: image size in pixels, at least 1.
       near, far: range of z that is drawn, scalars or [B]; near > 0.
       model: "pinhole", "orthographic", or a `CameraModel`.
 
     Raises:
-      InputError: on wrong shapes or sizes, an unknown model, values that are not
-        finite, a focal length of zero or below, a rotation part that scales or shears
-        by more than a hundredth, or a last row other than 0 0 0 1.
+      InputError: on wrong shapes or sizes, no camera, an unknown model, values not
+        finite, a focal length of zero or below, skew, a rotation part that scales or
+        shears by more than a hundredth or that mirrors, or a last row other than
+        0 0 0 1, of K 0 0 1. Of tracers only shapes are known.
     """
     if isinstance(model, str):
         if model not in CAMERA_MODELS:
@@ -154,6 +157,10 @@ def make_camera(
     near, far = jnp.asarray(near, dtype), jnp.asarray(far, dtype)
     if viewmat.ndim not in (2, 3) or viewmat.shape[-2:] != (4, 4):
         raise InputError(f"viewmat has shape {viewmat.shape}; [4, 4] or [B, 4, 4]")
+    if not viewmat.size:
+        raise InputError(
+            f"viewmat has shape {viewmat.shape}: at least one camera is wanted"
+        )
     batch = viewmat.shape[:-2]
     if K.shape[-2:] != (3, 3) or K.shape[:-2] not in ((), batch):
         raise InputError(f"K has shape {K.shape}; [3, 3] or {(*batch, 3, 3)} is wanted")
@@ -188,16 +195,7 @@ def _check_values(viewmat, K, near, far) -> None:
     for name in ("viewmat", "K", "near"):
         if not np.isfinite(host[name]).all():
             raise InputError(f"{name} has a value that is not finite: {host[name]}")
-    if not (host["K"][..., (0, 1), (0, 1)] > 0).all():
-        raise InputError("K[0, 0] and K[1, 1], the focal lengths, must be above 0")
-    focal, centre = host["K"][..., (0, 1), (0, 1)], host["K"][..., :2, 2]
-    low, high = LENS_RANGE
-    if not ((focal > low) & (focal < high) & (np.abs(centre) < high)).all():
-        raise InputError(
-            f"K has a focal length of {focal.ravel()} px and a principal point at "
-            f"{centre.ravel()} px: within {low:g} and {high:g} is wanted, or nothing "
-            "could be drawn"
-        )
+    _check_intrinsics(host["K"])
     if not ((host["near"] > 0) & (host["far"] > host["near"])).all():
         raise InputError(
             f"near {host['near']} and far {host['far']}: 0 < near < far is wanted"
@@ -215,6 +213,37 @@ def _check_values(viewmat, K, near, far) -> None:
             "the rotation part of viewmat is no rotation: its rows have lengths "
             f"{lengths}; divide out a scale (from the translation too), or scale the "
             "scene instead"
+        )
+    if (np.linalg.det(rotation) < 0).any():
+        raise InputError(
+            "the rotation part of viewmat mirrors (determinant -1); a rotation is "
+            "wanted: flip one axis"
+        )
+
+
+def _check_intrinsics(K: np.ndarray) -> None:
+    """Of [3, 3] or [B, 3, 3] finite numbers."""
+    if not (K[..., (0, 1), (0, 1)] > 0).all():
+        raise InputError("K[0, 0] and K[1, 1], the focal lengths, must be above 0")
+    if not (np.abs(K[..., 2, :] - (0, 0, 1)) <= _K_ROUNDING).all():
+        raise InputError(
+            f"the last row of K must be 0 0 1: {K[..., 2, :]}; transpose a K that has "
+            "the principal point there, divide one with another number than 1 by it"
+        )
+    focal, centre = K[..., (0, 1), (0, 1)], K[..., :2, 2]
+    skew = np.abs(K[..., (0, 1), (1, 0)])
+    if not (skew <= _K_ROUNDING * focal.max(-1, keepdims=True)).all():
+        raise InputError(
+            f"K[0, 1] and K[1, 0] are {K[..., (0, 1), (1, 0)]}: skew is not rendered; "
+            "0 is wanted: undistort the photographs to square axes, or leave it out "
+            "where it is small"
+        )
+    low, high = LENS_RANGE
+    if not ((focal > low) & (focal < high) & (np.abs(centre) < high)).all():
+        raise InputError(
+            f"K has a focal length of {focal.ravel()} px and a principal point at "
+            f"{centre.ravel()} px: within {low:g} and {high:g} is wanted, or nothing "
+            "could be drawn"
         )
 
 

@@ -16,7 +16,7 @@ from gsjax.console import note, progress
 from gsjax.gaussians import Gaussians
 from gsjax.movies import check_movie, write_movie
 from gsjax.scene import paths
-from gsjax.scene.image_files import short_names
+from gsjax.scene.image_files import natural_order, short_names
 from gsjax.scene.image_header import image_size
 from gsjax.scene.transforms import CameraEntry
 from gsjax.scene.types import Scene, View
@@ -44,7 +44,8 @@ def path_entries(
     Args:
       data: of the run.
       path: of `PATHS`; "test" and "train" are the views themselves, the others go by
-        all of them, see `gsjax.scene.paths`.
+        all of them, in order of their names, in which IMG_2 is before IMG_10; see
+        `gsjax.scene.paths`.
       frames: F, of the others.
       max_size: px, longest side, as in training; None as the photographs are.
       size: (width, height) in px to scale to instead.
@@ -131,7 +132,8 @@ def _view_entries(views: Sequence[View], max_size: int | None) -> list[CameraEnt
 def _flight(
     scene: Scene, path: str, frames: int, max_size: int | None
 ) -> list[CameraEntry]:
-    viewmats = np.stack([view.viewmat for view in scene.views])
+    views = sorted(scene.views, key=lambda view: natural_order(view.name))
+    viewmats = np.stack([view.viewmat for view in views])
     fly = {
         "orbit": paths.orbit,
         "spiral": paths.spiral,
@@ -192,7 +194,9 @@ def _depth_limits(
         viewmat, K = np.asarray(camera.viewmat), np.asarray(camera.K)
         local = means @ viewmat[:3, :3].T + viewmat[:3, 3]
         local = local[local[:, 2] > float(camera.near)]
-        u, v = (K[i, i] * local[:, i] / local[:, 2] + K[i, 2] for i in (0, 1))
+        # On the host: there is another number of points each time.
+        seen_at = camera.model.project_point(K, tuple(local.T))  # pyright: ignore
+        u, v = map(np.asarray, seen_at)
         inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         seen.append(local[inside, 2])
     depths = np.concatenate(seen)

@@ -81,7 +81,7 @@ def make_gaussians(
         `capacity_bucket` for sizes that make growing recompile rarely.
 
     Raises:
-      InputError: if a shape is not as above or the capacity is below N.
+      InputError: if a shape is not as above or the capacity is below N or 1.
     """
     arrays = {
         "means": means,
@@ -232,9 +232,11 @@ def compact(gaussians: Gaussians, capacity: int | None = None) -> Gaussians:
     `num_active` with ``capacity``. Outside jit that raises.
 
     Raises:
-      InputError: outside jit, if more are active than ``capacity``.
+      InputError: if ``capacity`` is below 1, or outside jit if more are active.
     """
     capacity = gaussians.capacity if capacity is None else capacity
+    if capacity < 1:
+        raise InputError(f"capacity {capacity}: at least 1 slot is wanted")
     active = gaussians.active
     if not isinstance(active, Tracer):
         count = int(np.sum(np.asarray(active)))

@@ -10,6 +10,8 @@ import math
 import jax
 import jax.numpy as jnp
 
+from gsjax.errors import InputError
+
 Array = jax.Array
 
 C0 = 0.28209479177387814
@@ -25,12 +27,12 @@ def degree_of(bases: int) -> int:
     """Degree with ``bases`` basis functions.
 
     Raises:
-      ValueError: if there is none, from 0 to 4.
+      InputError: if there is none, from 0 to 4.
     """
     degree = math.isqrt(bases) - 1
     if degree < 0 or degree > MAX_DEGREE or num_bases(degree) != bases:
         wanted = [num_bases(d) for d in range(MAX_DEGREE + 1)]
-        raise ValueError(
+        raise InputError(
             f"{bases} spherical-harmonic coefficients a channel are no whole degree; "
             f"pass one of {wanted}"
         )

@@ -1,8 +1,10 @@
 """The house rules, read from the code and from the compiled programs."""
 
 import ast
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import jax
@@ -96,6 +98,24 @@ def test_importing_is_light():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_what_is_imported_is_declared():
+    """Not left to what another package happens to bring along."""
+    packages = {"cv2": "opencv-contrib-python-headless"}
+    brought = {"IPython": "a notebook", "rich": "viser"}  # in these alone it is used
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    lines = [*project["dependencies"], *project["optional-dependencies"]["viewer"]]
+    declared = {re.split("[^A-Za-z0-9_-]", line)[0] for line in lines}
+    found = set()
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                found.add(node.module.split(".")[0])
+    found -= {*sys.stdlib_module_names, "gsjax", *brought}
+    assert {packages.get(name, name) for name in found} == declared
 
 
 def test_public_names_come_when_asked_for():

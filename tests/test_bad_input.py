@@ -55,7 +55,7 @@ def test_shapes_of_gaussians(name, shape):
 
 
 def test_other_errors_of_gaussians():
-    with pytest.raises(ValueError, match="5 spherical-harmonic"):
+    with pytest.raises(InputError, match="5 spherical-harmonic"):
         gsjax.make_gaussians(**{**GOOD, "sh": np.zeros((4, 5, 3))})
     with pytest.raises(InputError, match="means is complex"):
         gsjax.make_gaussians(**{**GOOD, "means": np.zeros((4, 3), complex)})
@@ -89,13 +89,21 @@ def put(matrix, place, value):
         ({"model": "fisheye"}, "unknown camera model 'fisheye'"),
         ({"viewmat": np.eye(3)}, "viewmat"),
         ({"viewmat": np.zeros((2, 3, 4, 4))}, "viewmat"),
+        ({"viewmat": np.zeros((0, 4, 4))}, "viewmat .*at least one camera"),
         ({"viewmat": EYE.T + put(0 * EYE, (3, 0), 1)}, "transposed"),
         ({"viewmat": put(EYE, (0, 3), np.nan)}, "viewmat"),
         ({"viewmat": put(EYE, (0, 0), np.inf)}, "viewmat"),
         ({"viewmat": 2 * EYE}, "transposed"),
         ({"viewmat": np.diag([2, 2, 2, 1.0])}, r"lengths \[2. 2. 2.\]"),
         ({"viewmat": put(EYE, (0, 1), 0.1)}, "no rotation"),
+        ({"viewmat": np.diag([1, -1, 1, 1.0])}, "mirrors"),
+        ({"viewmat": np.stack([EYE, np.diag([-1.0, -1, -1, 1])])}, "mirrors"),
         ({"K": np.eye(4)}, "K"),
+        ({"K": K.T}, "last row of K .*transpose"),
+        ({"K": 2 * K}, "last row of K .*divide"),
+        ({"K": put(K, (2, 2), 0.5)}, "last row of K .*divide"),
+        ({"K": put(K, (0, 1), 0.1)}, "skew is not rendered"),
+        ({"K": put(K, (1, 0), -0.1)}, "skew is not rendered"),
         ({"K": np.zeros((2, 3, 3))}, "K"),
         ({"K": put(K, (0, 2), np.nan)}, "K"),
         ({"K": put(K, (0, 0), 0.0)}, "focal"),
@@ -115,6 +123,23 @@ def test_cameras(changes, named):
     gsjax.make_camera(**good)
     with pytest.raises(InputError, match=named):
         gsjax.make_camera(**{**good, **changes})
+
+
+def test_rounding_of_intrinsics_is_no_skew():
+    """As a product with an inverse leaves it."""
+    near = K * (1 + 1e-7) + 1e-7
+    camera = gsjax.make_camera(viewmat=EYE, K=near, width=16, height=16)
+    np.testing.assert_allclose(camera.K, K, atol=1e-5)
+
+
+def test_tracers_are_not_looked_into():
+    """Under jit the numbers of a camera are not known, and so cannot be refused."""
+
+    @jax.jit
+    def focal(viewmat, K):
+        return gsjax.make_camera(viewmat=viewmat, K=K, width=16, height=16).K[0, 0]
+
+    assert focal(jnp.diag(jnp.array([1, -1, 1, 1.0])), jnp.asarray(K.T)) == 50
 
 
 def test_other_sizes_of_cameras():
@@ -194,6 +219,23 @@ def test_arguments_of_render(named, kwargs):
         jax.eval_shape(
             lambda g, c: gsjax.render(g, c, config, **kwargs), *scene_of("random")
         )
+
+
+def test_nothing_to_render():
+    """No cameras, or no slots, which arrays that are cut can come to."""
+    gaussians, camera = scene_of("random")
+    none = jax.tree.map(lambda a: a[None][:0], camera)
+    empty = jax.tree.map(lambda a: a[:0], gaussians)
+    for draw in (gsjax.render, gsjax.render_exact, gsjax.exact_config):
+        with pytest.raises(InputError, match="no cameras: at least one"):
+            draw(gaussians, none)
+        with pytest.raises(InputError, match="no slots: at least one"):
+            draw(empty, camera)
+    unseen = gsjax.select(gaussians, np.zeros(COUNT, bool))
+    for capacity in (0, -1):
+        with pytest.raises(InputError, match=f"capacity {capacity}: at least 1"):
+            gsjax.compact(unseen, capacity)
+    assert gsjax.compact(unseen, 1).capacity == 1
 
 
 def test_slots_and_bands():

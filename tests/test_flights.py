@@ -81,6 +81,23 @@ def test_paths_have_frames_of_one_size_that_see_the_scene(data, path):
         np.testing.assert_array_equal(large.viewmat, small.viewmat)
 
 
+def test_interpolation_goes_by_the_numbers_in_names(data):
+    """In which they were taken, though the views are sorted as text."""
+    flown = []
+    for form in ("left/IMG_{}.png", "left/IMG_{:03}.png"):
+        views = [
+            replace(view, name=form.format(number))
+            for view, number in zip(data.scene.views, (10, 9, 100))
+        ]
+        views.sort(key=lambda view: view.name)
+        scene = replace(data.scene, views=tuple(views))
+        entries = path_entries(data._replace(scene=scene), "interpolate", frames=4)
+        flown.append(np.stack([entry.camera.viewmat for entry in entries]))
+    np.testing.assert_array_equal(*flown)
+    ends = [data.scene.views[index].viewmat for index in (1, 2)]
+    np.testing.assert_allclose(flown[0][[0, -1]], ends, atol=1e-6)
+
+
 def test_an_orbit_past_the_cameras_is_warned_of(data, capsys):
     path_entries(data, "orbit", frames=2)
     assert "warning: 245° of the orbit are on sides that" in capsys.readouterr().err
@@ -99,6 +116,31 @@ def test_no_views_and_no_points(data):
     assert len(path_entries(data._replace(scene=bare), "orbit", frames=2)) == 2
     with pytest.raises(gsjax.InputError, match="frames is 0"):
         path_entries(data, "orbit", frames=0)
+
+
+@pytest.mark.parametrize(("model", "focal"), [("pinhole", 90), ("orthographic", 25)])
+def test_limits_of_depth_are_of_what_the_picture_shows(model, focal):
+    """At any lens: those of the centres that cover a pixel of their own picture."""
+    x, z = np.linspace(-4, 4, 201), np.linspace(1, 5, 201)
+    gaussians = gsjax.make_gaussians(
+        means=np.column_stack([x, 0 * x, z]),
+        quats=np.tile([1.0, 0, 0, 0], (201, 1)),
+        log_scales=np.full((201, 3), -6.0),
+        logit_opacities=np.full(201, 3.0),
+        sh=np.zeros((201, 1, 3)),
+    )
+    camera = gsjax.make_camera(
+        viewmat=np.eye(4),
+        K=K * [[focal / 90], [focal / 91], [1]] + [[0, 0, 10], [0] * 3, [0] * 3],
+        width=101,
+        height=75,
+        model=model,
+    )
+    depth = np.asarray(gsjax.render_exact(gaussians, camera).depth)
+    shown = depth[depth > 0]
+    assert 1.2 < shown.min() < shown.max()
+    limits = depth_limits(gaussians, [CameraEntry("a", camera)])
+    np.testing.assert_allclose(limits, (shown.min(), shown.max()), atol=0.1)
 
 
 def test_limits_of_depth_are_of_what_is_seen():

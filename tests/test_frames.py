@@ -64,3 +64,15 @@ def test_one_that_is_opaque_is_averaged_as_one_without_opacity(view):
     opaque = shrunk(photo_of(pixels, np.full((24, 32), 255, np.uint8)), 3, view)
     assert (opaque[..., 3] == 255).all()
     assert np.abs(opaque[..., :3] - plain).max() <= 1  # of rounding at halves
+
+
+@pytest.mark.parametrize("divisor", [1, 2])
+def test_opacity_is_kept_where_any_photograph_has_it(view, divisor):
+    """The others are opaque; where none has it there is no such channel."""
+    pixels = np.full((24, 32, 3), 90, np.uint8)
+    clear = photo_of(pixels, np.full((24, 32), 60, np.uint8))
+    both = make_frames([view, view], [photo_of(pixels), clear], divisor).pixels
+    assert both.shape[-1] == 4
+    assert (both[0, ..., 3] == 255).all()
+    assert (both[1, ..., 3] == 60).all()
+    assert make_frames([view], [photo_of(pixels)], divisor).pixels.shape[-1] == 3

@@ -64,6 +64,27 @@ def test_alpha_is_kept(tmp_path):
     np.testing.assert_array_equal(photo.alpha, NOISE[..., 1])
 
 
+@pytest.mark.parametrize("suffix", [".png", ".tiff"])
+@pytest.mark.parametrize("one", [1, 257])
+def test_alpha_that_is_opaque_is_none(tmp_path, suffix, one):
+    """And one step of 8 bits less in one pixel is not opaque."""
+    rgba = np.dstack([NOISE, np.full((24, 32), 255)])
+    rgba = (rgba * one).astype(np.uint8 if one == 1 else np.uint16)
+    path = save_photo(tmp_path / f"a{suffix}", rgba)
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert stored is not None
+    assert stored.shape == (24, 32, 4)
+    photo = load_photo(view_of(path))
+    assert photo.alpha is None
+    np.testing.assert_array_equal(photo.pixels, NOISE)
+    rgba[3, 5, 3] -= one
+    photo = load_photo(view_of(save_photo(path, rgba)))
+    np.testing.assert_array_equal(photo.pixels, NOISE)
+    assert photo.alpha is not None
+    assert np.argwhere(photo.alpha != 255).tolist() == [[3, 5]]
+    assert photo.alpha[3, 5] == 254
+
+
 def with_orientation(jpeg: bytes, orientation: int) -> bytes:
     tiff = b"II*\0" + struct.pack("<IHHHII", 8, 1, 0x112, 3, 1, orientation)
     exif = b"Exif\0\0" + tiff + bytes(4)

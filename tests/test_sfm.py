@@ -2,11 +2,14 @@
 
 import json
 import os
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from captures import save_photo
 from conftest import DATA
 from corner_room import (
     COUNT,
@@ -22,12 +25,14 @@ from corner_room import (
     make_room,
     make_video,
     read,
+    texture,
     viewmat_at,
     write_photo,
 )
 
 from gsjax import InputError, cli
 from gsjax.scene.colmap import load_colmap
+from gsjax.scene.photos import load_photo
 from gsjax.scene.sfm import SfmSettings, run_sfm
 from gsjax.scene.sfm_colmap import exif_camera, extract
 from gsjax.scene.sfm_photos import Workshop, find_photos, prepare_photos
@@ -231,6 +236,119 @@ def test_masks(room, tmp_path, capsys):
         assert left.min() > 0.32 * WIDTH
     image = model.find_image_with_name(NAMES[-1])
     assert min(p.xy[0] for p in image.points2D) < 0.2 * WIDTH
+
+
+RED = (255, 0, 0)  # which is nowhere in the room
+
+
+def transparent(pixels: np.ndarray, left: int, top=0, size=HEIGHT) -> np.ndarray:
+    """RGBA in which a square is red, and not seen."""
+    rgba = np.dstack([pixels, np.full(pixels.shape[:2], 255, np.uint8)])
+    rgba[top : top + size, left : left + size] = (*RED, 127)
+    return rgba
+
+
+def grown(hidden: np.ndarray) -> np.ndarray:
+    return cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5))) > 0
+
+
+def png_turned(path: Path, orientation: int) -> None:
+    """Give a PNG an orientation in EXIF."""
+    body = b"eXIf" + b"II*\0" + struct.pack("<IHHHII", 8, 1, 0x112, 3, 1, orientation)
+    body += bytes(4)
+    chunk = struct.pack(">I", len(body) - 4) + body
+    chunk += struct.pack(">I", zlib.crc32(body))
+    data = path.read_bytes()
+    path.write_bytes(data[:33] + chunk + data[33:])
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_transparency_is_turned_as_the_colours_are(tmp_path, orientation):
+    work = Workshop(tmp_path)
+    for folder in work.photos, work.masks:
+        folder.mkdir()
+    path = tmp_path / "a.png"
+    save_photo(path, transparent(corner_view(viewmat_at(0)), 20, 30, 90))
+    png_turned(path, orientation)
+    (made,) = prepare_photos([path], None, work, 0)
+    pixels = read(work.photos / made.shot.file)
+    if int(cv2.__version__.split(".")[0]) >= 5:  # older ones turn no PNG
+        assert (pixels.shape[0] > pixels.shape[1]) == (orientation > 4)
+    red = (pixels == RED).all(-1)
+    assert red.sum() == 90 * 90
+    np.testing.assert_array_equal(read(work.mask(made.shot.file)) == 0, grown(red))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".webp"])
+def test_what_is_transparent_is_nowhere_to_be_seen(tmp_path, suffix):
+    """No colour of it is in a pixel that counts, however much the photo is shrunk."""
+    seen = []
+    for name, hidden in (("a", RED), ("b", (0, 0, 255))):
+        work = Workshop(tmp_path / name)
+        work.folder.mkdir()
+        for folder in work.photos, work.masks:
+            folder.mkdir()
+        rgba = transparent(corner_view(viewmat_at(0)), 21, 33, 90)
+        rgba[rgba[..., 3] < 128, :3] = hidden
+        encoding = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == ".webp" else []
+        path = work.folder / f"photo{suffix}"
+        cv2.imwrite(str(path), rgba[..., [2, 1, 0, 3]], encoding)
+        (made,) = prepare_photos([path], None, work, 150)
+        assert made.mask
+        mask = read(work.mask(made.shot.file))
+        pixels = read(work.photos / made.shot.file)
+        assert 0.05 < (mask == 0).mean() < 0.2
+        seen.append(np.where(mask[..., None] > 0, pixels, 0))
+    np.testing.assert_array_equal(*seen)
+
+
+def test_masks_and_transparency_both_count(tmp_path):
+    work, masks = Workshop(tmp_path), tmp_path / "drawn"
+    for folder in work.photos, work.masks, masks:
+        folder.mkdir()
+    plain = corner_view(viewmat_at(0))
+    opaque = np.dstack([plain, np.full(plain.shape[:2], 128, np.uint8)])
+    paths = [
+        save_photo(tmp_path / "both.png", transparent(plain, 0, 0, 50)),
+        save_photo(tmp_path / "alpha.png", transparent(plain, 0, 0, 50)),
+        save_photo(tmp_path / "opaque.png", opaque),
+        save_photo(tmp_path / "deep.png", opaque.astype(np.uint16) * 257),
+    ]
+    drawn = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    drawn[:, -60:] = 0
+    cv2.imwrite(str(masks / "both.png"), drawn)
+    made = prepare_photos(paths, masks, work, 0)
+    assert [photo.mask for photo in made] == [True, True, False, False]
+    both, alpha, *others = (read(work.mask(photo.shot.file)) for photo in made)
+    np.testing.assert_array_equal(both, np.minimum(alpha, drawn))
+    assert (alpha == 0).sum() == 52 * 52
+    assert all((mask == 255).all() for mask in others), "which COLMAP wants of each"
+
+
+def test_transparent_photos_to_dataset(tmp_path, capsys):
+    """What is hidden, the same in each photo, gives no features and is not learnt."""
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    for i in range(4):
+        pixels = corner_view(viewmat_at(i / (COUNT - 1)))
+        rgba = transparent(pixels, 0, 0, 110)
+        rgba[:110, :110, :3] = texture(7)[:110, :110]
+        save_photo(photos / f"{i}.png", rgba)
+    assert cli.main(["sfm", str(photos), "-o", str(out)]) == 0
+    assert "4 of 4 photos have a mask or are" in capsys.readouterr().err
+    model = pycolmap.Reconstruction(out / "sparse" / "0")
+    views = views_of(out)
+    assert len(views) == 4
+    for view in views:
+        photo = load_photo(view)
+        assert photo.alpha is None
+        assert photo.valid is not None
+        assert not photo.valid[:105, :105].any()
+        assert photo.valid[120:].all()
+        assert photo.valid[:, 120:].all()
+        image = model.find_image_with_name(view.name)
+        places = np.array([point.xy for point in image.points2D])
+        assert len(places) > 100
+        assert (places.max(1) > 105).all()
 
 
 def test_the_focal_length_of_exif_is_where_colmap_begins(room, tmp_path):

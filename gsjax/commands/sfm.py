@@ -31,7 +31,8 @@ class SfmCommand(Command):
     """How many frames of a video to take, the sharpest of each stretch."""
     masks: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder of masks, black where a photo is to be ignored: for IMG.jpg, IMG.png or
-    IMG.jpg.png, as large as the photo seen upright."""
+    IMG.jpg.png, as large as the photo seen upright. Where a photo is transparent it is
+    ignored too."""
     seed: int = 0
     """Of the random numbers."""
     overwrite: bool = False

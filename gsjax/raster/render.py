@@ -59,7 +59,7 @@ def render(
       ``demand.capacity`` is the `RasterConfig.pair_capacity` that would do.
 
     Raises:
-      InputError: if a shape does not fit.
+      InputError: if a shape does not fit, or there is no camera or no slot.
     """
     # Tracers cannot index what is NumPy's.
     gaussians = jax.tree.map(jnp.asarray, gaussians)
@@ -69,6 +69,9 @@ def render(
     )
     cameras = camera if camera.batched else jax.tree.map(lambda a: a[None], camera)
     count = cameras.viewmat.shape[0]
+    for name, size in (("cameras", count), ("slots", gaussians.capacity)):
+        if size < 1:
+            raise InputError(f"there are no {name}: at least one is wanted")
     probe = _with_batch("probe", probe, gaussians, camera)
     abs_probe = _with_batch("abs_probe", abs_probe, gaussians, camera)
     if (abs_probe is not None) != config.absgrad:

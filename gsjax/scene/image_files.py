@@ -169,6 +169,13 @@ def short_names(names: Sequence[str]) -> list[str]:
     return short if clear else list(names)
 
 
+def natural_order(name: str) -> tuple[list[str | int], str]:
+    """By which to sort names as people count: IMG_2 before IMG_10."""
+    # Words stand at even places and numbers at odd ones, so that like meets like.
+    parts = re.split("([0-9]+)", name)
+    return [int(p) if k % 2 else p for k, p in enumerate(parts)], name
+
+
 def check_name(path: Path) -> None:
     """See that the name of a file is UTF-8, in which datasets hold it.
 

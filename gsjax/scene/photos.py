@@ -30,7 +30,8 @@ Filter = Callable[[np.ndarray], np.ndarray]
 def load_photo(view: View, max_size: int | None = None) -> Photo:
     """Read a photograph, undo its lens, leave out its mask, make it small enough.
 
-    16 bits are rounded to 8, grey becomes RGB. The ideal pinhole keeps focal lengths
+    16 bits are rounded to 8, grey becomes RGB, and an alpha channel that is opaque
+    everywhere is dropped. The ideal pinhole keeps focal lengths
     and principal point; pixels that the lens did not see are not valid, nor is any
     pixel to which one that is masked or was not seen contributes. Damage that the
     decoder could mend is warned of.
@@ -113,7 +114,7 @@ def load_photos(
 
 
 def _to_rgb(path: Path, stored: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """RGB and alpha, both uint8."""
+    """RGB and alpha, both uint8; None for an alpha that lets nothing through."""
     if stored.dtype == np.uint16:
         # Nearest of 255·v/65535 = v/257; 257 is odd, so that there are no ties.
         stored = ((stored.astype(np.uint32) + 128) // 257).astype(np.uint8)
@@ -126,9 +127,12 @@ def _to_rgb(path: Path, stored: np.ndarray) -> tuple[np.ndarray, np.ndarray | No
     if channels == 1:
         return np.repeat(stored.reshape(*stored.shape[:2], 1), 3, axis=2), None
     if channels == 2:
-        return np.repeat(stored[..., :1], 3, axis=2), stored[..., 1].copy()
-    pixels = np.ascontiguousarray(stored[..., 2::-1])
-    return pixels, stored[..., 3].copy() if channels == 4 else None
+        pixels = np.repeat(stored[..., :1], 3, axis=2)
+    else:
+        pixels = np.ascontiguousarray(stored[..., 2::-1])
+    # Of CMYK, too, OpenCV makes four channels, the last of them opaque.
+    clear = channels in (2, 4) and (stored[..., -1] < 255).any()
+    return pixels, stored[..., -1].copy() if clear else None
 
 
 def _ratio(view: View, width: int, height: int) -> tuple[float, float]:

@@ -56,7 +56,8 @@ class SfmSettings:
         features and for the dataset. 0 leaves them as they are.
       frames: how many are taken from a video.
       masks: folder of masks for the photos; nothing is looked for where they are
-        black. IMG.png, IMG.jpg or IMG.jpg.png for IMG.jpg.
+        black, nor where the photos are less than half opaque. IMG.png, IMG.jpg or
+        IMG.jpg.png for IMG.jpg.
       seed: of COLMAP's random numbers.
     """
 
@@ -119,9 +120,10 @@ def run_sfm(
 ) -> SfmReport:
     """Find the cameras of photographs and write a dataset that can be trained on.
 
-    ``output`` gets ``images/`` (upright and undistorted), ``masks/`` if there are any,
-    ``sparse/0/`` (COLMAP's binary model, PINHOLE cameras) and ``sfm.json``. It appears
-    when all is done, or not at all; other files in it are left alone.
+    ``output`` gets ``images/`` (upright and undistorted), ``masks/`` of photographs
+    that have one or are transparent somewhere, ``sparse/0/`` (COLMAP's binary model,
+    PINHOLE cameras) and ``sfm.json``. It appears when all is done, or not at all; other
+    files in it are left alone.
 
     Args:
       source: a folder of photographs, or a video.
@@ -187,8 +189,10 @@ def _collect(
         paths = find_photos(source)
         tell(f"reading {len(paths)} photos")
         found = prepare_photos(paths, settings.masks, work, size)
-        if settings.masks is not None:
-            tell(f"{sum(p.mask for p in found)} of {len(found)} photos have a mask")
+        masked = sum(photo.mask for photo in found)
+        if masked or settings.masks is not None:
+            told = "have a mask or are transparent in part"
+            tell(f"{masked} of {len(found)} photos {told}")
     else:
         tell(f"choosing the sharpest {settings.frames} frames")
         found = []

@@ -2,18 +2,19 @@
 
 They are decoded by OpenCV, which turns them as EXIF says, scaled down, and written as
 PNG without EXIF: whatever reads those files sees the same pixels the same way up.
+Where a photograph is transparent is in its mask.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.files import write_file
+from gsjax.files import opened, write_file
 from gsjax.images import encode_png, opencv
-from gsjax.scene.decode import decode, telling_of_damage
+from gsjax.scene.decode import decode, libraries_heard, telling_of_damage
 from gsjax.scene.image_files import check_name, find_mask
 from gsjax.scene.sfm_colmap import Shot, exif_camera
 
@@ -23,6 +24,8 @@ _UNREAD = (
     *(".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"),
     *(".orf", ".rw2", ".gif", ".jxl"),
 )
+_JPEG = b"\xff\xd8"  # how such files, which have no alpha, begin
+_REACH = 2  # px, of the cubic interpolation that undoes the lens
 
 
 class Photograph(NamedTuple):
@@ -31,7 +34,7 @@ class Photograph(NamedTuple):
     Attributes:
       name: what the dataset calls it; the working file has a number for a name.
       shot: what COLMAP is told of it.
-      mask: whether it came with one.
+      mask: whether it came with one, or is transparent somewhere.
     """
 
     name: str
@@ -124,10 +127,46 @@ def read_upright(path: Path, grey: bool = False) -> np.ndarray:
         return decode(path, cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
 
 
+def _read_photo(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """What `read_upright` reads, and where that is less than half opaque.
+
+    Returns:
+      [H, W, 3] BGR uint8, and [H, W] bool, or None if that is nowhere.
+    """
+    upright = read_upright(path)
+    with opened(path, "a photograph") as file:
+        if file.read(2) == _JPEG:
+            return upright, None
+    cv2 = opencv()
+    with libraries_heard():  # all of which has been told
+        stored = decode(path, cv2.IMREAD_UNCHANGED)  # the only way to alpha
+        if stored.ndim < 3 or stored.shape[2] not in (2, 4):
+            return upright, None
+        alpha = stored[..., -1]
+        opaque = np.iinfo(alpha.dtype).max if alpha.dtype.kind == "u" else 1
+        hidden = alpha < opaque / 2
+        if not hidden.any():
+            return upright, None
+        colors = decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    # How OpenCV turned the colours depends on format and version, and it does not say.
+    both = zip(_turned(colors), _turned(hidden))
+    return upright, next(h for c, h in both if np.array_equal(c, upright))
+
+
+def _turned(pixels: np.ndarray) -> Iterator[np.ndarray]:
+    """In the eight ways of EXIF, as it is first."""
+    for picture in (pixels, pixels[:, ::-1]):
+        for quarters in range(4):
+            yield np.rot90(picture, quarters)
+
+
 def prepare_photos(
     paths: Sequence[Path], masks: Path | None, work: Workshop, max_size: int
 ) -> list[Photograph]:
     """Write the photographs, and their masks, into the working folder.
+
+    Left out is what a mask says and what is less than half opaque. Once any has a mask,
+    there is one of each photograph, as COLMAP wants it.
 
     Args:
       masks: folder of masks, or None.
@@ -140,7 +179,7 @@ def prepare_photos(
     made, bad = [], []
     for number, path in enumerate(paths):
         try:
-            pixels = read_upright(path)
+            pixels, hidden = _read_photo(path)
         except InputError as error:
             bad.append(str(error))
             continue
@@ -151,15 +190,19 @@ def prepare_photos(
             focal *= max(small.shape) / max(height, width)
         key = f"{camera} {width}x{height} {focal}"
         photo = work.add(number, dataset_name(path), small, focal, key)
-        if masks is not None:
-            mask = _mask(pairs.get(path), path, (height, width), small.shape[:2])
+        mask = _mask(pairs.get(path), hidden, path, small.shape[:2], (height, width))
+        if mask is not None:
             write_file(work.mask(photo.shot.file), encode_png(mask))
-        made.append(photo._replace(mask=path in pairs))
+        made.append(photo._replace(mask=mask is not None))
     if bad:
         raise InputError(
             f"{len(bad)} of {len(paths)} photos cannot be read; mend or remove: "
             + "; ".join([*bad[:5], *["…"] * (len(bad) > 5)])
         )
+    whole = [photo.shot for photo in made if not photo.mask]
+    for shot in whole if len(whole) < len(made) else ():
+        mask = np.full((shot.height, shot.width), 255, np.uint8)
+        write_file(work.mask(shot.file), encode_png(mask))
     return made
 
 
@@ -196,11 +239,38 @@ def find_masks(folder: Path, photos: Sequence[Path]) -> dict[Path, Path]:
 
 
 def _mask(
-    path: Path | None, photo: Path, full: tuple[int, int], size: tuple[int, ...]
+    path: Path | None,
+    hidden: np.ndarray | None,
+    photo: Path,
+    size: tuple[int, ...],
+    full: tuple[int, int],
+) -> np.ndarray | None:
+    """[h, w] of 0, to be left out, and 255; None where there is nothing to say so.
+
+    Args:
+      path: a drawn mask, or None.
+      hidden: [H, W] bool, where the photograph is transparent; or None.
+      photo: the photograph, for messages.
+      size: h, w of the result.
+      full: H, W of the photograph.
+    """
+    drawn = None if path is None else _drawn(path, photo, size, full)
+    if hidden is None:
+        return drawn
+    cv2 = opencv()
+    # Colours that are not seen count as none, so neither do pixels that they mix into.
+    share = cv2.resize(
+        hidden.astype(np.float32), size[::-1], interpolation=cv2.INTER_AREA
+    )
+    clear = np.where(share > 0, 0, 255).astype(np.uint8)
+    clear = cv2.erode(clear, np.ones((2 * _REACH + 1,) * 2, np.uint8))
+    return clear if drawn is None else np.minimum(clear, drawn)
+
+
+def _drawn(
+    path: Path, photo: Path, size: tuple[int, ...], full: tuple[int, int]
 ) -> np.ndarray:
     """[h, w] of 0, to be left out, and 255: whatever is not black in the file."""
-    if path is None:
-        return np.full(size, 255, np.uint8)
     mask = read_upright(path, grey=True)
     if mask.shape != full and mask.shape != size:
         raise InputError(

@@ -88,7 +88,7 @@ class Photo(NamedTuple):
 
     Attributes:
       pixels: [H, W, 3] uint8 RGB.
-      alpha: [H, W] uint8 opacity of the file, or None where it has none.
+      alpha: [H, W] uint8 opacity of the file, or None where nothing is transparent.
       valid: [H, W] bool, False where masked or where undistortion had nothing; or
         None where all is valid.
       K: [3, 3] float64, for this size and an ideal pinhole.
