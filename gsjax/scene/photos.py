@@ -31,10 +31,10 @@ def load_photo(view: View, max_size: int | None = None) -> Photo:
     """Read a photograph, undo its lens, leave out its mask, make it small enough.
 
     16 bits are rounded to 8, grey becomes RGB, and an alpha channel that is opaque
-    everywhere is dropped. The ideal pinhole keeps focal lengths
-    and principal point; pixels that the lens did not see are not valid, nor is any
-    pixel to which one that is masked or was not seen contributes. Damage that the
-    decoder could mend is warned of.
+    everywhere is dropped. The ideal pinhole keeps focal lengths and principal point;
+    pixels that the lens did not see are not valid, nor is any pixel to which one that
+    is masked or was not seen contributes. Damage that the decoder could mend is warned
+    of.
 
     Args:
       view: which photograph.
