@@ -194,10 +194,27 @@ def test_every_eighth():
     assert split_views(views_of(NAMES[:2])) == ([1], [0])
 
 
-def test_the_split_of_the_dataset_wins():
+def test_the_split_of_the_dataset_is_the_default():
+    """Names that are given go before it, and so does a distance."""
     views = views_of(NAMES[:4], ["train", "test", "train", "test"])
-    assert split_views(views, every=2) == ([0, 2], [1, 3])
+    assert split_views(views) == ([0, 2], [1, 3])
+    assert split_views(views, every=3) == ([1, 2], [0, 3])
+    assert split_views(views, every=0) == ([0, 1, 2, 3], [])
     assert split_views(views, test_names=[NAMES[0]]) == ([1, 2, 3], [0])
+
+
+@pytest.mark.parametrize("split", ["train", None])
+def test_a_dataset_without_test_views_has_some_held_out(split):
+    """As where it names no split at all."""
+    views = views_of(NAMES, ["train"] * 19 + [split])
+    assert split_views(views)[1] == [0, 8, 16]
+    assert split_views(views, every=5)[1] == [0, 5, 10, 15]
+
+
+def test_a_training_list_alone(tmp_path):
+    transforms(tmp_path, name="transforms_train.json")
+    views = load_dataset(tmp_path).views
+    assert split_views(views) == ([1, 2, 3, 4], [0])
 
 
 def test_names_win():

@@ -105,15 +105,39 @@ def test_a_dataset_with_other_views_is_refused(made):
     settings = load_settings(made / "run")
     assert (settings.held_out, settings.trained) == (("0.png",), ("1.png", "2.png"))
     evaluate_run(made / "run")
-    # As if the run had been made before the last one came, and another was held out.
-    change(made / "run" / "config.json", held_out=["1.png"], trained=["0.png"])
+    # As if the run had been made before the last one came, and others have gone.
+    held_out, trained = ["1.png", "3.png"], ["0.png", "4.png"]
+    change(made / "run" / "config.json", held_out=held_out, trained=trained)
     before = contents(made / "run")
     for go_on in (evaluate_run, resume_run):
         with pytest.raises(InputError, match="no longer the views") as caught:
             go_on(made / "run")
-        for told in ("+1.png +2.png -0.png (trained on)", "+0.png -1.png (held out)"):
+        for told in ("+2.png -4.png (trained on)", "-3.png (held out)"):
             assert told in str(caught.value)
     assert contents(made / "run") == before
+
+
+def test_a_run_keeps_the_views_that_it_held_out(made):
+    """Whatever rule would choose now: that of an older version was another."""
+    config = made / "run" / "config.json"
+    for every in (8, 2, 0, None):
+        held_out, trained = ["2.png"], ["0.png", "1.png"]
+        change(config, held_out=held_out, trained=trained, every=every)
+        data = load_data(load_settings(made / "run"))
+        assert (data.train, data.test) == ([0, 1], [2])
+        change(config, held_out=[], trained=["0.png", "1.png", "2.png"])
+        assert load_data(load_settings(made / "run")).test == []
+
+
+def test_an_old_run_without_names(made):
+    """Its 8 was no wish: the dataset's own split went before it."""
+    config = made / "run" / "config.json"
+    for every, wanted in ((8, None), (5, 5), (0, 0)):
+        change(config, every=every)
+        told = json.loads(config.read_text())
+        told = {k: v for k, v in told.items() if k not in ("trained", "held_out")}
+        config.write_text(json.dumps(told))
+        assert load_settings(made / "run").every == wanted
 
 
 def test_a_dataset_that_was_moved(made, capsys):
@@ -189,6 +213,19 @@ def test_the_same_options_again_go_on(made, monkeypatch):
     assert cli.main(["train", str(data), "-o", str(run), "--resume"]) == 130
     assert trained == ["started", "gone on with", "gone on with"]
     assert cli.main([*args, "--seed", "1", "--resume"]) == 2
+    # What is not given is the run's, as in one of before it could be left open.
+    change(run / "config.json", every=8)
+    assert cli.main([*args, "--resume"]) == 130
+
+
+def test_a_distance_and_names_exclude_each_other(whole, tmp_path, capsys):
+    args = ["train", str(whole / "data"), "-o", str(tmp_path / "run")]
+    args += ["--test-images", "0.png", "--test-every"]
+    for every in ("8", "0"):
+        assert cli.main([*args, every]) == 2
+        told = "--test-every and --test-images exclude each other"
+        assert told in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_that_stopped_early_is_told_as_one(made, capsys):
