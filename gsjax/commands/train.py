@@ -44,7 +44,8 @@ class TrainCommand(HeavyCommand):
     background: Literal["auto", "black", "white", "random"] | None = None
     """Behind the scene; auto: random where photographs are transparent, else black."""
     initial: Literal["points", "random"] | None = None
-    """Start from the dataset's points, or from anywhere in view."""
+    """Start from the dataset's points, or from anywhere in view; default: from its
+    points if it has any."""
     antialias: bool = False
     """Compensate thin splats for the blur of a pixel, to look right at other sizes."""
     absgrad: bool = False
@@ -156,8 +157,12 @@ class TrainCommand(HeavyCommand):
             and getattr(self, field.name) != field.default
         ]
         mine = self._settings()
-        if self.test_every is None:  # then it is the run's
+        # What is left open was decided when the run began.
+        if self.test_every is None:
             mine = replace(mine, every=settings.every)
+        if self.initial is None:
+            config = mine.config.replace(initial=settings.config.initial)
+            mine = replace(mine, config=config)
         same = {"dataset": None, "trained": (), "held_out": ()}
         if given and replace(mine, **same) != replace(settings, **same):
             raise UsageError(

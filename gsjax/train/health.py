@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from gsjax.cameras import NEAR
 from gsjax.errors import DivergedError, InputError
+from gsjax.scene.initialise import require_points
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.step import Metrics
 
@@ -53,13 +54,15 @@ def check_points(scene: Scene) -> None:
     """See that some point lies before some camera, and not too near to be drawn.
 
     Raises:
-      InputError: if none does: such Gaussians would never be seen, nor ever move.
+      InputError: if none does: such Gaussians would never be seen, nor ever move; or
+        if there are none.
     """
+    require_points(scene)
     points, farthest = scene.points, 0.0
     for view in scene.views:
         depth = points @ view.viewmat[2, :3] + view.viewmat[2, 3]
         farthest = max(farthest, depth.max(initial=0))
-        if len(points) == 0 or farthest > NEAR:
+        if farthest > NEAR:
             return
     if farthest > 0:
         raise InputError(
