@@ -107,7 +107,7 @@ def load_colmap(
     model = read_colmap(place)
     root = image_folder(folder, images, factor)
     names = [image.name for image in model.images]
-    files = find_files(place, root, names, skip_missing=skip_missing)
+    files = find_files(place, root, names, skip_missing=skip_missing, factor=factor)
     masks = find_masks(folder / "masks", list(files))
     views = []
     for image in model.images:

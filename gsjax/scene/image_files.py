@@ -93,11 +93,14 @@ def find_files(
     *,
     skip_missing: bool = False,
     elsewhere: bool = False,
+    factor: int | None = None,
 ) -> dict[str, Path]:
     """Files of photographs, by name; a name with no file is missing.
 
     A file of another suffix than its name stands in for it: smaller copies are often
-    of another type, and NeRF's lists leave suffixes out.
+    of another type, and NeRF's lists leave suffixes out. Copies of which none is called
+    like its original, as in the scenes of LLFF, go with the originals in the order of
+    their names, if they are as many; a warning says so.
 
     Args:
       source: the file that lists the names, for messages.
@@ -107,23 +110,18 @@ def find_files(
       elsewhere: ``root`` is not the folder that the names are of. Then the longest end
         of a name that has a file there counts: of ``images/left/1.png`` all, then
         ``left/1.png``, then ``1.png``.
+      factor: above 1, ``root`` is ``images_4``, of the copies of ``images``.
 
     Raises:
       InputError: on missing files, unless ``skip_missing``; on all files missing; on
         two names of one file; on a name that leads out of ``root``.
     """
-    found: dict[str, Path] = {}
-    missing: list[str] = []
-    stems = cache(_stems)
-    for name in names:
-        parts = inside(str(source), name).parts
-        ends = [parts[start:] for start in range(len(parts) if elsewhere else 1)]
-        files = (_file_at(root.joinpath(*end), stems) for end in ends)
-        path = next(filter(None, files), None)
-        if path is None:
-            missing.append(name)
-        else:
-            found[name] = path
+    names = list(names)
+    found = _called(source, root, names, elsewhere)
+    if not found and factor is not None and factor > 1:
+        whole = root.with_name(root.name.removesuffix(f"_{factor}"))
+        found = _in_order(whole, root, _called(source, whole, names, elsewhere))
+    missing = [name for name in names if name not in found]
     owner: dict[Path, str] = {}
     for name, path in found.items():
         if owner.setdefault(path, name) != name:
@@ -136,7 +134,14 @@ def find_files(
             f"{source}: {len(missing)} of {len(missing) + len(found)} photographs are "
             f"missing in {root}"
         )
-        if not skip_missing or not found:
+        if not found:
+            there = ", ".join(path.name for path in _photographs(root)[:_SHOWN])
+            raise InputError(
+                f"{message}, the first: {', '.join(missing[:_SHOWN])}, where there are "
+                f"{there or 'none'}; put them there, or pass images=, the folder that "
+                "they are in (--images)"
+            )
+        if not skip_missing:
             raise InputError(
                 f"{message}, the first: {', '.join(missing[:_SHOWN])}; put them there, "
                 "or leave them out with skip_missing=True (--skip-missing)"
@@ -144,6 +149,48 @@ def find_files(
         left = f"{message} and left out: {', '.join(missing)}"
         warnings.warn(left, UserWarning, stacklevel=3)
     return found
+
+
+def _called(
+    source: Path, root: Path, names: Sequence[str], elsewhere: bool
+) -> dict[str, Path]:
+    """Those of ``names`` that have a file in ``root``, see `find_files`."""
+    found: dict[str, Path] = {}
+    stems = cache(_stems)
+    for name in names:
+        parts = inside(str(source), name).parts
+        ends = [parts[start:] for start in range(len(parts) if elsewhere else 1)]
+        files = (_file_at(root.joinpath(*end), stems) for end in ends)
+        path = next(filter(None, files), None)
+        if path is not None:
+            found[name] = path
+    return found
+
+
+def _in_order(whole: Path, root: Path, found: dict[str, Path]) -> dict[str, Path]:
+    """For files ``found`` in ``whole`` the copies in ``root`` of the same place in the
+    order of all; none where the photographs of the two are not as many."""
+    originals, copies = _photographs(whole), _photographs(root)
+    if len(originals) != len(copies):
+        return {}
+    copy_of = dict(zip(originals, copies))
+    paired = {name: copy_of[path] for name, path in found.items() if path in copy_of}
+    if paired:
+        name = min(paired)
+        warnings.warn(
+            f"{root}: none of the {len(copies)} photographs is called as in {whole}; "
+            f"they are taken in the order of their names: {paired[name].name} is "
+            f"{name}",
+            UserWarning,
+            stacklevel=4,
+        )
+    return paired
+
+
+def _photographs(folder: Path) -> list[Path]:
+    """All photographs in a folder and in those within, in the order of their names."""
+    files = [p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES]
+    return sorted(files, key=lambda path: path.relative_to(folder).as_posix())
 
 
 def _file_at(path: Path, stems: Callable[[Path], dict[str, Path]]) -> Path | None:

@@ -70,7 +70,10 @@ def load_nerf(
     for path, frames in zip(paths, lists):
         names = [_file_path(frame) for frame in frames]
         files = find_files(
-            path, root, names, skip_missing=skip_missing, elsewhere=elsewhere
+            *(path, root, names),
+            skip_missing=skip_missing,
+            elsewhere=elsewhere,
+            factor=factor,
         )
         # A second list is of what is held out, transforms_val.json too.
         default = _SPLITS.get(path.stem) if path == paths[0] else "test"
