@@ -40,7 +40,8 @@ def load_dataset(
       path: folder of the dataset, or its .json or .npy file.
       images: name of the folder of the photographs in the dataset, or a path; None for
         ``images``, for a .json the folders in it. In another folder, or one of smaller
-        copies, the first folders of a .json's names may be left out.
+        copies, the first folders of a .json's names may be left out; names that lead
+        out of the dataset are looked for in ``images`` alone, by their ends.
       skip_missing: leave out photographs that are listed but not there, with a
         warning, instead of raising.
       factor: read the smaller copies in ``images_2``, ``images_4``, …

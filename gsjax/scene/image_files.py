@@ -65,8 +65,9 @@ def check_factor(factor: int | None) -> None:
         raise InputError(f"factor {factor!r}: a whole number ≥ 1 is wanted")
 
 
-def inside(where: str, name: str) -> PurePosixPath:
-    """A relative path that stays in its folder; raises on one that would leave it."""
+def inside(where: str, name: str, remedy: str = "") -> PurePosixPath:
+    """A relative path that stays in its folder; raises on one that would leave it, and
+    offers a ``remedy`` besides copying the file."""
     path = PurePosixPath(name.replace("\\", "/"))
     absolute = path.is_absolute() or re.match("[A-Za-z]:", name)
     strange = "\0" in name or any("\ud800" <= letter <= "\udfff" for letter in name)
@@ -74,6 +75,7 @@ def inside(where: str, name: str) -> PurePosixPath:
         raise InputError(
             f"{where}: the name {name[:120]!r} is not that of a file within the "
             "dataset's folder; copy the file there and name it relative to the folder"
+            f"{remedy}"
         )
     # Longer ones the system refuses, with an error of its own that names no remedy.
     sizes = [len(part.encode()) for part in path.parts]
@@ -84,6 +86,14 @@ def inside(where: str, name: str) -> PurePosixPath:
             "file"
         )
     return path
+
+
+def last_parts(name: str) -> str:
+    """What follows the root or the last ".." of a path, for another folder than its."""
+    path = PurePosixPath(re.sub("^[A-Za-z]:", "/", name.replace("\\", "/")))
+    parts = path.parts[1:] if path.is_absolute() else path.parts
+    ups = [index for index, part in enumerate(parts) if part == ".."]
+    return "/".join(parts[ups[-1] + 1 :] if ups else parts)
 
 
 def find_files(

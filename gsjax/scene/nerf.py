@@ -12,7 +12,13 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.io.point_cloud import read_point_cloud
-from gsjax.scene.image_files import check_factor, find_files, image_folder, inside
+from gsjax.scene.image_files import (
+    check_factor,
+    find_files,
+    image_folder,
+    inside,
+    last_parts,
+)
 from gsjax.scene.image_header import image_size
 from gsjax.scene.transforms_fields import (
     Frame,
@@ -68,7 +74,7 @@ def load_nerf(
     views: list[View] = []
     lists = [read_frames(path) for path in paths]
     for path, frames in zip(paths, lists):
-        names = [_file_path(frame) for frame in frames]
+        names = [_file_path(frame, moved=images is not None) for frame in frames]
         files = find_files(
             *(path, root, names),
             skip_missing=skip_missing,
@@ -94,12 +100,16 @@ def load_nerf(
     return Scene(source, "transforms", tuple(views), points, colors)
 
 
-def _file_path(frame: Frame) -> str:
-    """Where the photograph of a frame lies in the folder, by its list."""
+def _file_path(frame: Frame, moved: bool) -> str:
+    """Where the photograph of a frame lies in the folder, by its list; of one that was
+    ``moved`` to another, the end of it that does not lead out."""
     name = text_of(frame, "file_path")
     if not name:
         raise InputError(f"{frame.where}: file_path is {shown(name)}; text is wanted")
-    return str(inside(frame.where, name))
+    if moved:
+        return str(inside(frame.where, last_parts(name) or name))
+    offer = ", or pass images=, the folder that it is in (--images)"
+    return str(inside(frame.where, name, offer))
 
 
 def _name(file: Path, folder: Path, root: Path) -> str:
