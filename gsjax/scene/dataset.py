@@ -5,6 +5,7 @@ from functools import partial
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from gsjax.errors import InputError
 from gsjax.scene.colmap import find_colmap, load_colmap
@@ -20,6 +21,7 @@ def load_dataset(
     images: str | PathLike[str] | None = None,
     skip_missing: bool = False,
     factor: int | None = None,
+    poses_only: bool = False,
 ) -> Scene:
     """Read cameras, points and the names of the photographs of a dataset.
 
@@ -45,6 +47,8 @@ def load_dataset(
       skip_missing: leave out photographs that are listed but not there, with a
         warning, instead of raising.
       factor: read the smaller copies in ``images_2``, ``images_4``, …
+      poses_only: cameras and points are all that is wanted: photographs need not be
+        there, masks are left out, and a `View.image` may be no file.
 
     Returns:
       Views sorted by name.
@@ -55,8 +59,13 @@ def load_dataset(
         and what to do.
     """
     path = Path(path)
-    nerf = partial(load_nerf, images=images, factor=factor, skip_missing=skip_missing)
-    llff = partial(load_llff, images=images, factor=factor)
+    where: dict[str, Any] = {
+        "images": images,
+        "factor": factor,
+        "poses_only": poses_only,
+    }
+    nerf = partial(load_nerf, skip_missing=skip_missing, **where)
+    llff = partial(load_llff, **where)
     if not path.exists():
         raise InputError(f"{path}: does not exist; pass the folder of a dataset")
     if not path.is_dir():
@@ -66,10 +75,7 @@ def load_dataset(
             return _finished(llff(path))
         raise InputError(f"{path}: pass the folder of a dataset, a .json or a .npy")
     if find_colmap(path) is not None:
-        scene = load_colmap(
-            path, images=images, factor=factor, skip_missing=skip_missing
-        )
-        return _finished(scene)
+        return _finished(load_colmap(path, skip_missing=skip_missing, **where))
     lists = find_transforms(path)
     if lists:
         return _finished(nerf(lists))

@@ -16,7 +16,11 @@ _ENDING = re.compile(f"({'|'.join(map(re.escape, SUFFIXES))})+$", re.IGNORECASE)
 
 
 def image_folder(
-    folder: Path, images: str | PathLike[str] | None, factor: int | None
+    folder: Path,
+    images: str | PathLike[str] | None,
+    factor: int | None,
+    *,
+    poses_only: bool = False,
 ) -> Path:
     """The folder of the photographs: ``images``, or ``images_4`` for factor 4.
 
@@ -24,6 +28,7 @@ def image_folder(
       folder: of the dataset.
       images: its name in the dataset, or a path of its own; None for "images".
       factor: by how much the photographs were made smaller; None or 1 for not.
+      poses_only: the folder need not be there.
 
     Raises:
       InputError: if there is no such folder; the message offers a factor that is there.
@@ -32,7 +37,7 @@ def image_folder(
     suffix = f"_{factor}" if factor is not None and factor > 1 else ""
     whole = folder / ("images" if images is None else images)
     found = Path(f"{whole}{suffix}")
-    if found.is_dir():
+    if found.is_dir() or poses_only:
         return found
     names = sorted(entry.name for entry in folder.iterdir() if entry.is_dir())
     remedy = "pass images=, the folder of the photographs (--images)"
@@ -104,6 +109,7 @@ def find_files(
     skip_missing: bool = False,
     elsewhere: bool = False,
     factor: int | None = None,
+    poses_only: bool = False,
 ) -> dict[str, Path]:
     """Files of photographs, by name; a name with no file is missing.
 
@@ -121,6 +127,7 @@ def find_files(
         of a name that has a file there counts: of ``images/left/1.png`` all, then
         ``left/1.png``, then ``1.png``.
       factor: above 1, ``root`` is ``images_4``, of the copies of ``images``.
+      poses_only: nothing is missing; a name without a file has the path of one.
 
     Raises:
       InputError: on missing files, unless ``skip_missing``; on all files missing; on
@@ -128,6 +135,8 @@ def find_files(
     """
     names = list(names)
     found = _called(source, root, names, elsewhere)
+    if poses_only:
+        return {name: found.get(name, root / name) for name in names}
     if not found and factor is not None and factor > 1:
         whole = root.with_name(root.name.removesuffix(f"_{factor}"))
         found = _in_order(whole, root, _called(source, whole, names, elsewhere))
