@@ -164,8 +164,11 @@ def _entry(
 
 
 def _as_trained(view: View, max_size: int | None) -> View:
-    """The view at the size at which `load_photo` gives its photograph."""
-    width, height = image_size(view.image)
+    """The view at the size at which `load_photo` gives its photograph; where that is
+    not there, at the size that the camera is for."""
+    width, height = view.width, view.height
+    if view.image.exists():
+        width, height = image_size(view.image)
     longest = max(width, height)
     if max_size is not None and longest > max_size:
         width, height = (

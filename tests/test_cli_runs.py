@@ -159,6 +159,23 @@ def test_a_file_before_the_cameras_of_a_dataset(demo, tmp_path, capsys):
     assert "no such views" in error_of(capsys)
 
 
+def test_a_file_before_the_cameras_of_a_dataset_without_photographs(
+    demo, tmp_path, capsys
+):
+    dataset = tmp_path / "dataset"
+    shutil.copytree(demo / "dataset", dataset)
+    shutil.rmtree(dataset / "images")
+    args = ["render", str(demo / "run" / "splat.ply"), "--preset", "compat", "-o"]
+    assert cli.main([*args, str(tmp_path / "a"), "--cameras", str(dataset)]) == 0
+    whole = ["--cameras", str(demo / "dataset")]
+    assert cli.main([*args, str(tmp_path / "b"), *whole]) == 0
+    assert len(names(tmp_path / "a")) == PHOTOS
+    for name in names(tmp_path / "b"):
+        first, second = (tmp_path / x / name for x in "ab")
+        assert first.read_bytes() == second.read_bytes()
+    capsys.readouterr()
+
+
 @pytest.mark.long
 def test_a_path_to_a_folder(demo, tmp_path, capsys):
     more = ["--path", "interpolate", "--frames", "2", "--size", "32x24", "--npy"]

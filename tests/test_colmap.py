@@ -13,7 +13,9 @@ from gsjax.scene import colmap_binary, colmap_text
 from gsjax.scene.colmap import find_colmap, load_colmap, read_colmap
 from gsjax.scene.colmap_model import CAMERA_KINDS, quat_of, viewmat_of
 from gsjax.scene.colmap_writer import write_colmap
+from gsjax.scene.dataset import load_dataset
 from gsjax.scene.image_files import find_mask
+from gsjax.scene.photos import load_photo
 from gsjax.scene.types import Lens
 from gsjax.scene.undistort import distort
 
@@ -230,6 +232,52 @@ def test_smaller_copies(tmp_path):
         load_colmap(tmp_path)
 
 
+def as_llff(folder, count=5):
+    """The scenes of NeRF-LLFF: copies that are numbered, whatever the originals are."""
+    scene = scene_of_views(count)
+    names = [f"IMG_{4026 + (7 * n) % 11}.JPG" for n in range(count)]
+    views = [replace(v, name=name) for v, name in zip(scene.views, names)]
+    write_colmap(folder / "sparse/0", replace(scene, views=tuple(views)))
+    for name in names:
+        save_photo(folder / "images" / name)
+    for index in range(count):
+        small = np.full((SIZE[1] // 4, SIZE[0] // 4, 3), index, np.uint8)
+        save_photo(folder / f"images_4/image{index:03d}.png", small)
+    return sorted(names)
+
+
+def test_copies_of_other_names_go_by_their_order(tmp_path):
+    names = as_llff(tmp_path)
+    wanted = r"images_4: none of the 5 .* order of their names: image000\.png is IMG_"
+    with pytest.warns(UserWarning, match=wanted):
+        views = load_dataset(tmp_path, factor=4).views
+    assert [view.name for view in views] == names
+    for index, view in enumerate(views):
+        assert view.image == tmp_path / f"images_4/image{index:03d}.png"
+        photo = load_photo(view)
+        assert (photo.pixels == index).all()
+        np.testing.assert_allclose(photo.K[:2], view.K[:2] / 4)
+    # Order counts among all photographs, of which the model may have few.
+    save_photo(tmp_path / "images/IMG_4000.JPG")
+    save_photo(tmp_path / "images_4/image005.png")
+    with pytest.warns(UserWarning, match="image001"):
+        views = load_dataset(tmp_path, factor=4).views
+    assert views[0].image == tmp_path / "images_4/image001.png"
+
+
+def test_copies_of_other_names_and_another_number_are_none(tmp_path):
+    as_llff(tmp_path)
+    copy = tmp_path / "images_4/image000.png"
+    copy.unlink()
+    for skip_missing in (False, True):
+        with pytest.raises(InputError, match=r"5 of 5 .* missing in .*images_4.*image"):
+            load_dataset(tmp_path, factor=4, skip_missing=skip_missing)
+    # One that is called as in the model: names count then.
+    save_photo(tmp_path / "images_4/IMG_4026.png")
+    with pytest.raises(InputError, match=r"4 of 5 .*--skip-missing"):
+        load_dataset(tmp_path, factor=4)
+
+
 def test_masks(tmp_path):
     scene = dataset(tmp_path)
     names = [view.name for view in scene.views]
@@ -278,8 +326,12 @@ def test_missing_photographs(tmp_path):
     assert names == ["view_00.png", "view_02.png", "view_04.png"]
     for path in (tmp_path / "images").iterdir():
         path.unlink()
-    with pytest.raises(InputError, match="5 of 5 photographs are missing"):
-        load_colmap(tmp_path, skip_missing=True)
+    save_photo(tmp_path / "images/other.png")
+    for skip_missing in (False, True):
+        wanted = r"5 of 5 photographs are missing .* there are other\.png; .*--images"
+        with pytest.raises(InputError, match=wanted) as caught:
+            load_colmap(tmp_path, skip_missing=skip_missing)
+        assert "skip" not in str(caught.value), "that would leave none"
 
 
 def test_missing_files(tmp_path):

@@ -68,6 +68,56 @@ def test_one_view(tmp_path):
     assert scene.points.shape == (0, 3)
 
 
+def as_llff(folder):
+    scene = scene_of_views()
+    rows = []
+    for view in scene.views:
+        right, down, forward = view.viewmat[:3, :3]
+        size = np.asarray([24, 32, 40.0])
+        matrix = np.stack([down, right, -forward, view.centre, size], -1)
+        rows.append([*matrix.ravel(), 1, 9])
+        save_photo(folder / "images" / view.name)
+    np.save(folder / "poses_bounds.npy", np.asarray(rows))
+
+
+def as_transforms(folder):
+    transforms(folder)
+    path = folder / "transforms.json"
+    told = json.loads(path.read_text())
+    told["frames"][0]["mask_path"] = "masks/none.png"
+    path.write_text(json.dumps({**told, "w": 32, "h": 24}))
+
+
+@pytest.mark.parametrize("make", [colmap, as_transforms, as_llff])
+def test_poses_want_no_photographs(tmp_path, make):
+    """They are the same with all, some or none of them, or their folder, there."""
+    make(tmp_path)
+    images = sorted((tmp_path / "images").iterdir())
+    whole = load_dataset(tmp_path, poses_only=True)
+    assert len(whole.views) == 5
+    for path in (*images[1:3], *images[:1], *images[3:], tmp_path / "images"):
+        path.rmdir() if path.is_dir() else path.unlink()
+        with pytest.raises(InputError):
+            load_dataset(tmp_path, skip_missing=path == tmp_path / "images")
+        bare = load_dataset(tmp_path, poses_only=True)
+        for view, wanted in zip(bare.views, whole.views, strict=True):
+            assert (view.width, view.height, view.lens, view.mask) == (
+                *(wanted.width, wanted.height, wanted.lens),
+                None,
+            )
+            np.testing.assert_array_equal(view.viewmat, wanted.viewmat)
+            np.testing.assert_array_equal(view.K, wanted.K)
+        np.testing.assert_array_equal(bare.points, whole.points)
+
+
+def test_without_photographs_a_size_is_wanted(tmp_path):
+    transforms(tmp_path)
+    load_dataset(tmp_path, poses_only=True)
+    (tmp_path / "images/view_00.png").unlink()
+    with pytest.raises(InputError, match=r"w and h are missing, and .*view_00\.png"):
+        load_dataset(tmp_path, poses_only=True)
+
+
 def test_names_are_sorted_and_unique(tmp_path):
     made = scene_of_views()
     names = ["b.png", "a.png", "B.png", "a/a.png", "a10.png"]
@@ -194,10 +244,27 @@ def test_every_eighth():
     assert split_views(views_of(NAMES[:2])) == ([1], [0])
 
 
-def test_the_split_of_the_dataset_wins():
+def test_the_split_of_the_dataset_is_the_default():
+    """Names that are given go before it, and so does a distance."""
     views = views_of(NAMES[:4], ["train", "test", "train", "test"])
-    assert split_views(views, every=2) == ([0, 2], [1, 3])
+    assert split_views(views) == ([0, 2], [1, 3])
+    assert split_views(views, every=3) == ([1, 2], [0, 3])
+    assert split_views(views, every=0) == ([0, 1, 2, 3], [])
     assert split_views(views, test_names=[NAMES[0]]) == ([1, 2, 3], [0])
+
+
+@pytest.mark.parametrize("split", ["train", None])
+def test_a_dataset_without_test_views_has_some_held_out(split):
+    """As where it names no split at all."""
+    views = views_of(NAMES, ["train"] * 19 + [split])
+    assert split_views(views)[1] == [0, 8, 16]
+    assert split_views(views, every=5)[1] == [0, 5, 10, 15]
+
+
+def test_a_training_list_alone(tmp_path):
+    transforms(tmp_path, name="transforms_train.json")
+    views = load_dataset(tmp_path).views
+    assert split_views(views) == ([1, 2, 3, 4], [0])
 
 
 def test_names_win():

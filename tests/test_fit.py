@@ -39,6 +39,7 @@ from gsjax.train.fit import (
     fit,
     initial_state,
     subset,
+    with_initial,
 )
 from gsjax.train.room import grow_state, roomy_pairs
 from gsjax.train.step import init_state
@@ -296,6 +297,24 @@ def test_first_states():
         many = config.replace(initial="random", initial_count=500)
         state = initial_state(scene(), many)
         assert int(state.gaussians.active.sum()) == 200, name
+
+
+def test_what_a_run_starts_from():
+    """Points that are no numbers are none."""
+    config, bare = CONFIGS["mcmc"], replace(scene(), points=np.zeros((0, 3)))
+    wild = replace(scene(), points=np.full((POINTS, 3), np.nan))
+    assert config.initial == "auto"
+    assert with_initial(scene(), config).initial == "points"
+    for initial in ("points", "random"):
+        told = config.replace(initial=initial)
+        assert with_initial(scene(), told) == told
+    for without in (bare, wild):
+        random = with_initial(without, config)
+        assert random == config.replace(initial="random")
+        first, second = (initial_state(without, c) for c in (config, random))
+        assert changed(first, second) == []
+        with pytest.raises(InputError, match="no points to start from"):
+            with_initial(without, config.replace(initial="points"))
 
 
 def test_a_photograph_for_each_view():

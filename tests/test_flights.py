@@ -47,6 +47,17 @@ def test_views_have_the_size_and_camera_of_their_photographs(data, max_size):
             np.testing.assert_allclose(camera.viewmat, wanted, atol=1e-6)
 
 
+def test_without_its_photograph_a_view_has_the_size_of_its_camera(data):
+    view = data.scene.views[0]
+    wanted = path_entries(data, "train", max_size=64)
+    view.image.unlink()
+    for (_, found), (_, camera) in zip(
+        path_entries(data, "train", max_size=64), wanted, strict=True
+    ):
+        assert (found.width, found.height) == (camera.width, camera.height)
+        np.testing.assert_array_equal(found.K, camera.K)
+
+
 def test_names_are_those_of_the_views_without_what_all_share(data):
     assert [e.name for e in path_entries(data, "train")] == ["0", "1"]
     everything = data._replace(test=[0, 1, 2])

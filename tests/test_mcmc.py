@@ -189,6 +189,13 @@ def test_they_are_drawn_by_opacity():
         (40, 1.5, 30, 30, 40),  # more than the cap are there already
         (80, 1.5, 1000, 120, 96),  # not enough slots
         (0, 1.5, 1000, 0, 0),
+        # Of few the factor alone would be none more: by one at least.
+        (1, 1.05, 1000, 2, 2),
+        (9, 1.1, 1000, 10, 10),
+        (19, 1.05, 1000, 20, 20),
+        (20, 1.05, 1000, 21, 21),
+        (19, 1.05, 19, 19, 19),
+        (19, 1.0, 1000, 19, 19),
     ],
 )
 def test_growth(count, growth, cap, wanted, got):

@@ -21,7 +21,7 @@ from gsjax.memory import Estimate, require, size_text, system_available, unlimit
 from gsjax.raster.render import render_estimate
 from gsjax.raster.types import Demand
 from gsjax.train.config import preset
-from gsjax.train.footprint import first_slots, run_estimate
+from gsjax.train.footprint import check_memory, first_slots, run_estimate
 
 GB = 10**9
 
@@ -218,13 +218,22 @@ def test_the_estimate_of_a_run_is_what_runs_took(name, changes, measured, report
     config = preset(name).replace(**changes)
     made = scene_of_views(21, points=20_000)
     views = tuple(replace(view, width=800, height=600) for view in made.views)
-    count = 20_000 if config.initial == "points" else config.initial_count
+    count = config.initial_count if config.initial == "random" else 20_000
     slots = first_slots(count, config)
     if name == "quality":  # it was run with --max-gaussians 100000
         slots = 131_072
     found = run_estimate(replace(made, views=views), config, count, slots, begins=True)
     report(f"memory of {name}", abs(np.log(found.total / 1e6 / measured)), np.log(1.5))
     assert 1 / 1.5 < found.total / 1e6 / measured < 1.5
+
+
+def test_one_is_told_as_one(capsys):
+    config = preset("fast")
+    few = config.replace(mcmc=replace(config.mcmc, max_gaussians=1))
+    check_memory(scene_of_views(), few, None)
+    told = capsys.readouterr().err
+    assert "for 1 Gaussian, " in told
+    assert "1 Gaussians" not in told
 
 
 def test_files_are_refused_before_they_are_read(tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ from gsjax.errors import InputError
 from gsjax.io.point_cloud import read_point_cloud
 from gsjax.scene.dataset import load_dataset
 from gsjax.scene.photos import load_photo
+from gsjax.scene.transforms import load_transforms
 from gsjax.scene.types import Lens
 
 PIXELS = {"fl_x": 40.0, "fl_y": 42.0, "cx": 15.5, "cy": 12.25, "w": 32, "h": 24}
@@ -164,6 +165,35 @@ def test_a_list_by_itself(tmp_path):
 # --- parts ---
 
 
+@pytest.mark.parametrize("at", ["top", "frame"])
+@pytest.mark.parametrize(
+    "angles",
+    [
+        {"x_fov": 60.0},
+        {"y_fov": 50.0},
+        {"x_fov": 60.0, "y_fov": 50.0},
+        {"camera_angle_x": math.radians(60), "camera_angle_y": math.radians(50)},
+        {"camera_angle_y": math.radians(50)},
+        {"fl_y": 12 / math.tan(math.radians(25))},
+    ],
+    ids=" ".join,
+)
+def test_angles_of_view(tmp_path, angles, at):
+    """One alone is that of both axes, as instant-ngp has it."""
+    frames = frames_of(scene_of_views(2), "images/{}.png", **angles)
+    if at == "top":
+        frames = frames_of(scene_of_views(2), "images/{}.png")
+    none = {"fl_x": None, "fl_y": None}
+    nerfstudio(tmp_path, frames=frames, **(none | angles if at == "top" else none))
+    fx = 16 / math.tan(math.radians(30)) if any("x" in k for k in angles) else None
+    fy = 12 / math.tan(math.radians(25)) if any("y" in k for k in angles) else fx
+    wanted = [[fx or fy, 0, 15.5], [0, fy, 12.25], [0, 0, 1]]
+    for view in load_dataset(tmp_path).views:
+        np.testing.assert_allclose(view.K, wanted, rtol=1e-14)
+    for _, camera in load_transforms(tmp_path / "transforms.json"):
+        np.testing.assert_allclose(camera.K, wanted, rtol=1e-6)
+
+
 def test_intrinsics_of_frames(tmp_path):
     made = scene_of_views(3)
     frames = frames_of(made, "images/{}.png")
@@ -224,6 +254,38 @@ def test_photographs_elsewhere(tmp_path):
     assert views[0].name == "moved/frame_0.png"
 
 
+@pytest.mark.parametrize(
+    "form",
+    [
+        "../photos/a/{}.png",
+        "/data/photos/a/{}.png",
+        "C:\\photos\\a\\{}.png",
+        "a/../../{}",
+    ],
+)
+def test_names_that_lead_out_of_the_dataset(tmp_path, form):
+    """Never followed; with a folder that is told they are looked for within it."""
+    folder, elsewhere = tmp_path / "data", tmp_path / "photos"
+    for index in range(3):
+        save_photo(elsewhere / "a" / f"{index}.png")
+    folder.mkdir()
+    frames = frames_of(scene_of_views(3), form)
+    put(folder, frames, **PIXELS)
+    with pytest.raises(InputError, match=r"frames\[0\]: .* pass images=.*--images"):
+        load_dataset(folder)
+    with pytest.raises(InputError, match="3 of 3 photographs are missing"):
+        load_dataset(folder, images=folder)
+    for images in (elsewhere / "a", "../photos/a"):
+        views = load_dataset(folder, images=images).views
+        assert [view.name for view in views] == ["0.png", "1.png", "2.png"]
+        for view in views:
+            assert view.image.samefile(elsewhere / "a" / view.name)
+    for bad in ("..", "/", "../../x\0"):
+        put(folder, [{**frames[0], "file_path": bad}], **PIXELS)
+        with pytest.raises(InputError, match="not that of a file within"):
+            load_dataset(folder, images=elsewhere)
+
+
 @pytest.mark.parametrize("more", [{"factor": 2}, {"images": "images_2"}])
 @pytest.mark.parametrize("place", ["{}/0.png", "images/{}/0.png"])
 def test_folders_within_folders(tmp_path, more, place):
@@ -268,6 +330,11 @@ def test_scaled_rotations_are_warned_of(tmp_path):
     ("more", "wanted"),
     [
         ({"camera_model": "EQUIRECTANGULAR"}, "'EQUIRECTANGULAR' is not supported"),
+        ({"ftheta_p0": 0.1}, "ftheta_p0 is 0.1, of a lens that is not supported"),
+        ({"latlong": True}, "latlong is True, of a lens that is not supported"),
+        ({"equirectangular": 1}, "equirectangular is 1, of a lens"),
+        ({"fl_x": None, "fl_y": None}, "no focal length; fl_x, camera_angle_x or x_"),
+        ({"fl_x": None, "x_fov": 180}, "x_fov is 180; degrees between 0 and 180"),
         ({"k1": 0.1, "k4": 0.1}, "k4 of a lens that is no fisheye"),
         ({"k1": 0.1, "k6": 0.1}, "k6 of a lens that is no fisheye"),
         ({"is_fisheye": True, "p1": 0.1}, "a fisheye has no p1, p2"),

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -80,8 +81,9 @@ def test_only_a_run_is_replaced(whole, tmp_path, config):
 def test_a_run_is_replaced_once_the_next_can_begin(made, tmp_path):
     bad = write_hostile(tmp_path / "bad", HOSTILE["no points"]())
     before = contents(made / "run")
+    points = CONFIG.replace(initial="points")
     with pytest.raises(InputError, match="no points to start from"):
-        start_run(RunSettings(bad, CONFIG), made / "run", overwrite=True)
+        start_run(RunSettings(bad, points), made / "run", overwrite=True)
     assert contents(made / "run") == before
     other = RunSettings(made / "data", CONFIG.replace(seed=1))
     assert start_run(other, made / "run", overwrite=True).finished
@@ -90,12 +92,45 @@ def test_a_run_is_replaced_once_the_next_can_begin(made, tmp_path):
     assert contents(made / "run")[splat] != before[splat]
 
 
-def test_a_start_that_fails_leaves_nothing(tmp_path):
+def test_a_start_that_fails_leaves_nothing(tmp_path, monkeypatch):
+    """And does so before photographs are read, which may take minutes."""
     bad = write_hostile(tmp_path / "bad", HOSTILE["no points"]())
-    run = tmp_path / "run"
+    run, loaded = tmp_path / "run", []
+    monkeypatch.setattr(run_module, "load_photos", lambda *_: loaded.append(1))
     with pytest.raises(InputError, match="--initial random"):
-        start_run(RunSettings(bad, CONFIG), run)
+        start_run(RunSettings(bad, CONFIG.replace(initial="points")), run)
     assert not run.exists()
+    assert not loaded
+
+
+# --- what it starts from ---
+
+
+def test_without_points_it_starts_from_random_ones(tmp_path, capsys):
+    """It says so, and stays with it, also where points come before it goes on."""
+    bare, run = HOSTILE["no points"](), tmp_path / "run"
+    data = write_hostile(tmp_path / "data", bare)
+    config = CONFIG.replace(initial_count=50, every_checkpoint=0)
+    assert start_run(RunSettings(data, config), run).finished
+    told = capsys.readouterr().err
+    assert "no points: starting from random ones (--initial random)" in told
+    assert "for 50 Gaussians, " in told
+    assert load_settings(run).config == config.replace(initial="random")
+    splat = (run / "splat.ply").read_bytes()
+    explicit = RunSettings(data, config.replace(initial="random"))
+    start_run(explicit, tmp_path / "explicit")
+    assert (tmp_path / "explicit" / "splat.ply").read_bytes() == splat
+    shutil.rmtree(run / "checkpoints")
+    shutil.rmtree(data)
+    write_hostile(data, replace(bare, scene=harmless().scene))
+    capsys.readouterr()
+    assert resume_run(run).finished
+    assert (run / "splat.ply").read_bytes() == splat
+    assert "--initial" not in capsys.readouterr().err
+
+
+def test_with_points_it_starts_from_them(whole):
+    assert load_settings(whole / "run").config == CONFIG.replace(initial="points")
 
 
 # --- true to its dataset ---
@@ -105,15 +140,39 @@ def test_a_dataset_with_other_views_is_refused(made):
     settings = load_settings(made / "run")
     assert (settings.held_out, settings.trained) == (("0.png",), ("1.png", "2.png"))
     evaluate_run(made / "run")
-    # As if the run had been made before the last one came, and another was held out.
-    change(made / "run" / "config.json", held_out=["1.png"], trained=["0.png"])
+    # As if the run had been made before the last one came, and others have gone.
+    held_out, trained = ["1.png", "3.png"], ["0.png", "4.png"]
+    change(made / "run" / "config.json", held_out=held_out, trained=trained)
     before = contents(made / "run")
     for go_on in (evaluate_run, resume_run):
         with pytest.raises(InputError, match="no longer the views") as caught:
             go_on(made / "run")
-        for told in ("+1.png +2.png -0.png (trained on)", "+0.png -1.png (held out)"):
+        for told in ("+2.png -4.png (trained on)", "-3.png (held out)"):
             assert told in str(caught.value)
     assert contents(made / "run") == before
+
+
+def test_a_run_keeps_the_views_that_it_held_out(made):
+    """Whatever rule would choose now: that of an older version was another."""
+    config = made / "run" / "config.json"
+    for every in (8, 2, 0, None):
+        held_out, trained = ["2.png"], ["0.png", "1.png"]
+        change(config, held_out=held_out, trained=trained, every=every)
+        data = load_data(load_settings(made / "run"))
+        assert (data.train, data.test) == ([0, 1], [2])
+        change(config, held_out=[], trained=["0.png", "1.png", "2.png"])
+        assert load_data(load_settings(made / "run")).test == []
+
+
+def test_an_old_run_without_names(made):
+    """Its 8 was no wish: the dataset's own split went before it."""
+    config = made / "run" / "config.json"
+    for every, wanted in ((8, None), (5, 5), (0, 0)):
+        change(config, every=every)
+        told = json.loads(config.read_text())
+        told = {k: v for k, v in told.items() if k not in ("trained", "held_out")}
+        config.write_text(json.dumps(told))
+        assert load_settings(made / "run").every == wanted
 
 
 def test_a_dataset_that_was_moved(made, capsys):
@@ -189,6 +248,25 @@ def test_the_same_options_again_go_on(made, monkeypatch):
     assert cli.main(["train", str(data), "-o", str(run), "--resume"]) == 130
     assert trained == ["started", "gone on with", "gone on with"]
     assert cli.main([*args, "--seed", "1", "--resume"]) == 2
+    # What is not given is the run's, as in one of before it could be left open.
+    change(run / "config.json", every=8)
+    assert cli.main([*args, "--resume"]) == 130
+    for initial, other in (("random", "points"), ("points", "random")):
+        train = json.loads((run / "config.json").read_text())["train"]
+        change(run / "config.json", train={**train, "initial": initial})
+        assert cli.main([*args, "--resume"]) == 130
+        assert cli.main([*args, "--resume", "--initial", initial]) == 130
+        assert cli.main([*args, "--resume", "--initial", other]) == 2
+
+
+def test_a_distance_and_names_exclude_each_other(whole, tmp_path, capsys):
+    args = ["train", str(whole / "data"), "-o", str(tmp_path / "run")]
+    args += ["--test-images", "0.png", "--test-every"]
+    for every in ("8", "0"):
+        assert cli.main([*args, every]) == 2
+        told = "--test-every and --test-images exclude each other"
+        assert told in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_that_stopped_early_is_told_as_one(made, capsys):

@@ -30,7 +30,8 @@ class RenderCommand(HeavyCommand):
     """Folder for the images, created if missing; or a movie: .gif, .webp or .webm."""
     cameras: Path | None = None
     """The cameras: a transforms.json (NeRF, instant-ngp, nerfstudio), or the folder of
-    a dataset, whose views they are, or what --path makes of them."""
+    a dataset, whose views they are, or what --path makes of them; its photographs
+    need not be there."""
     path: Literal["test", "train", "orbit", "spiral", "interpolate"] | None = None
     """Of a run: its held-out or its training views; once around what they look at; a
     spiral before it; or a flight through all of them. Default of a run: orbit, of a
@@ -89,7 +90,7 @@ class RenderCommand(HeavyCommand):
             data = refined_data(load_data(settings), run_files(self.scene))
             largest = settings.config.max_size
         elif self.cameras.is_dir():
-            scene = load_dataset(self.cameras)
+            scene = load_dataset(self.cameras, poses_only=True)
             data = Data(scene, train=list(range(len(scene.views))), test=[])
         if data is None:
             assert self.cameras is not None, "else it is a run's"

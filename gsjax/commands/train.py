@@ -44,7 +44,8 @@ class TrainCommand(HeavyCommand):
     background: Literal["auto", "black", "white", "random"] | None = None
     """Behind the scene; auto: random where photographs are transparent, else black."""
     initial: Literal["points", "random"] | None = None
-    """Start from the dataset's points, or from anywhere in view."""
+    """Start from the dataset's points, or from anywhere in view; default: from its
+    points if it has any."""
     antialias: bool = False
     """Compensate thin splats for the blur of a pixel, to look right at other sizes."""
     absgrad: bool = False
@@ -63,8 +64,9 @@ class TrainCommand(HeavyCommand):
     """Use images_2, images_4 or images_8."""
     skip_missing: bool = False
     """Leave out photographs that are listed but not there."""
-    test_every: int = 8
-    """Hold out every so many-th view to measure with; 0 for none."""
+    test_every: int | None = None
+    """Hold out every so many-th view to measure with, 0 for none; default: the test
+    views that the dataset names, or every 8th where it names none."""
     test_images: tuple[str, ...] = ()
     """Hold out these views instead."""
     checkpoint_every: int | None = None
@@ -83,6 +85,8 @@ class TrainCommand(HeavyCommand):
     def run(self) -> int:
         if self.resume and self.overwrite:
             raise UsageError("--resume and --overwrite exclude each other")
+        if self.test_images and self.test_every is not None:
+            raise UsageError("--test-every and --test-images exclude each other")
         if not 1 <= self.viewer_port < 2**16:
             raise UsageError(f"--viewer-port {self.viewer_port}: from 1 to 65535")
         start_jax()
@@ -152,8 +156,15 @@ class TrainCommand(HeavyCommand):
             if field.name not in _OF_A_SITTING
             and getattr(self, field.name) != field.default
         ]
+        mine = self._settings()
+        # What is left open was decided when the run began.
+        if self.test_every is None:
+            mine = replace(mine, every=settings.every)
+        if self.initial is None:
+            config = mine.config.replace(initial=settings.config.initial)
+            mine = replace(mine, config=config)
         same = {"dataset": None, "trained": (), "held_out": ()}
-        if given and replace(self._settings(), **same) != replace(settings, **same):
+        if given and replace(mine, **same) != replace(settings, **same):
             raise UsageError(
                 f"--resume goes on with the settings that {self.out} has, and they are "
                 f"others; leave out {', '.join(given)}"

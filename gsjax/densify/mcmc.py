@@ -39,7 +39,7 @@ class McmcSettings:
       start, stop, every: relocate and grow after every ``every``-th step in
         (start, stop].
       max_gaussians: the cap.
-      growth: factor of the count at each edit.
+      growth: factor of the count at each edit; above 1, it grows by one at least.
       dead_opacity: at or below it a Gaussian is dead.
       noise: factor on the rate of the means.
       opacity_penalty, scale_penalty: weights of the means over all Gaussians.
@@ -99,7 +99,9 @@ def mcmc(settings: McmcSettings, extent: float = USUAL_EXTENT) -> Densifier:
         moved = spawn(by_move, gaussians, active & ~alive, alive, settings)
         count = jnp.sum(active, dtype=jnp.int32)
         grown = jnp.floor(settings.growth * count.astype(jnp.float32))
-        target = jnp.clip(grown.astype(jnp.int32), count, settings.max_gaussians)
+        # By one at least, where there is any: of few, a factor alone makes no more.
+        least = count + jnp.minimum(count, 1) if settings.growth > 1 else count
+        target = jnp.clip(grown.astype(jnp.int32), least, settings.max_gaussians)
         free = ~active
         chosen = free & (jnp.cumsum(free, dtype=jnp.int32) <= target - count)
         after = Gaussians(params=moved.params, active=active)  # pyright: ignore

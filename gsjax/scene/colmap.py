@@ -99,16 +99,22 @@ def load_colmap(
     images: str | PathLike[str] | None = None,
     skip_missing: bool = False,
     factor: int | None = None,
+    poses_only: bool = False,
 ) -> Scene:
     """The scene of a dataset that has a COLMAP model; see `load_dataset`."""
     place = find_colmap(folder)
     if place is None:
         raise InputError(f"{folder}: no cameras.bin or cameras.txt in {_PLACES}")
     model = read_colmap(place)
-    root = image_folder(folder, images, factor)
+    root = image_folder(folder, images, factor, poses_only=poses_only)
     names = [image.name for image in model.images]
-    files = find_files(place, root, names, skip_missing=skip_missing)
-    masks = find_masks(folder / "masks", list(files))
+    files = find_files(
+        *(place, root, names),
+        skip_missing=skip_missing,
+        factor=factor,
+        poses_only=poses_only,
+    )
+    masks = {} if poses_only else find_masks(folder / "masks", list(files))
     views = []
     for image in model.images:
         if image.name not in files:

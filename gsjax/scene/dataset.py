@@ -5,6 +5,7 @@ from functools import partial
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ def load_dataset(
     images: str | PathLike[str] | None = None,
     skip_missing: bool = False,
     factor: int | None = None,
+    poses_only: bool = False,
 ) -> Scene:
     """Read cameras, points and the names of the photographs of a dataset.
 
@@ -43,10 +45,13 @@ def load_dataset(
       path: folder of the dataset, or its .json or .npy file.
       images: name of the folder of the photographs in the dataset, or a path; None for
         ``images``, for a .json the folders in it. In another folder, or one of smaller
-        copies, the first folders of a .json's names may be left out.
+        copies, the first folders of a .json's names may be left out; names that lead
+        out of the dataset are looked for in ``images`` alone, by their ends.
       skip_missing: leave out photographs that are listed but not there, with a
         warning, instead of raising.
       factor: read the smaller copies in ``images_2``, ``images_4``, …
+      poses_only: cameras and points are all that is wanted: photographs need not be
+        there, masks are left out, and a `View.image` may be no file.
 
     Returns:
       Views sorted by name.
@@ -57,8 +62,13 @@ def load_dataset(
         and what to do.
     """
     path = Path(path)
-    nerf = partial(load_nerf, images=images, factor=factor, skip_missing=skip_missing)
-    llff = partial(load_llff, images=images, factor=factor)
+    where: dict[str, Any] = {
+        "images": images,
+        "factor": factor,
+        "poses_only": poses_only,
+    }
+    nerf = partial(load_nerf, skip_missing=skip_missing, **where)
+    llff = partial(load_llff, **where)
     if not path.exists():
         raise InputError(f"{path}: does not exist; pass the folder of a dataset")
     if not path.is_dir():
@@ -68,10 +78,7 @@ def load_dataset(
             return _finished(llff(path))
         raise InputError(f"{path}: pass the folder of a dataset, a .json or a .npy")
     if find_colmap(path) is not None:
-        scene = load_colmap(
-            path, images=images, factor=factor, skip_missing=skip_missing
-        )
-        return _finished(scene)
+        return _finished(load_colmap(path, skip_missing=skip_missing, **where))
     lists = find_transforms(path)
     if lists:
         return _finished(nerf(lists))

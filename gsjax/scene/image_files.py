@@ -16,7 +16,11 @@ _ENDING = re.compile(f"({'|'.join(map(re.escape, SUFFIXES))})+$", re.IGNORECASE)
 
 
 def image_folder(
-    folder: Path, images: str | PathLike[str] | None, factor: int | None
+    folder: Path,
+    images: str | PathLike[str] | None,
+    factor: int | None,
+    *,
+    poses_only: bool = False,
 ) -> Path:
     """The folder of the photographs: ``images``, or ``images_4`` for factor 4.
 
@@ -24,6 +28,7 @@ def image_folder(
       folder: of the dataset.
       images: its name in the dataset, or a path of its own; None for "images".
       factor: by how much the photographs were made smaller; None or 1 for not.
+      poses_only: the folder need not be there.
 
     Raises:
       InputError: if there is no such folder; the message offers a factor that is there.
@@ -32,7 +37,7 @@ def image_folder(
     suffix = f"_{factor}" if factor is not None and factor > 1 else ""
     whole = folder / ("images" if images is None else images)
     found = Path(f"{whole}{suffix}")
-    if found.is_dir():
+    if found.is_dir() or poses_only:
         return found
     names = sorted(entry.name for entry in folder.iterdir() if entry.is_dir())
     remedy = "pass images=, the folder of the photographs (--images)"
@@ -65,8 +70,9 @@ def check_factor(factor: int | None) -> None:
         raise InputError(f"factor {factor!r}: a whole number ≥ 1 is wanted")
 
 
-def inside(where: str, name: str) -> PurePosixPath:
-    """A relative path that stays in its folder; raises on one that would leave it."""
+def inside(where: str, name: str, remedy: str = "") -> PurePosixPath:
+    """A relative path that stays in its folder; raises on one that would leave it, and
+    offers a ``remedy`` besides copying the file."""
     path = PurePosixPath(name.replace("\\", "/"))
     absolute = path.is_absolute() or re.match("[A-Za-z]:", name)
     strange = "\0" in name or any("\ud800" <= letter <= "\udfff" for letter in name)
@@ -74,6 +80,7 @@ def inside(where: str, name: str) -> PurePosixPath:
         raise InputError(
             f"{where}: the name {name[:120]!r} is not that of a file within the "
             "dataset's folder; copy the file there and name it relative to the folder"
+            f"{remedy}"
         )
     # Longer ones the system refuses, with an error of its own that names no remedy.
     sizes = [len(part.encode()) for part in path.parts]
@@ -86,6 +93,14 @@ def inside(where: str, name: str) -> PurePosixPath:
     return path
 
 
+def last_parts(name: str) -> str:
+    """What follows the root or the last ".." of a path, for another folder than its."""
+    path = PurePosixPath(re.sub("^[A-Za-z]:", "/", name.replace("\\", "/")))
+    parts = path.parts[1:] if path.is_absolute() else path.parts
+    ups = [index for index, part in enumerate(parts) if part == ".."]
+    return "/".join(parts[ups[-1] + 1 :] if ups else parts)
+
+
 def find_files(
     source: Path,
     root: Path,
@@ -93,11 +108,15 @@ def find_files(
     *,
     skip_missing: bool = False,
     elsewhere: bool = False,
+    factor: int | None = None,
+    poses_only: bool = False,
 ) -> dict[str, Path]:
     """Files of photographs, by name; a name with no file is missing.
 
     A file of another suffix than its name stands in for it: smaller copies are often
-    of another type, and NeRF's lists leave suffixes out.
+    of another type, and NeRF's lists leave suffixes out. Copies of which none is called
+    like its original, as in the scenes of LLFF, go with the originals in the order of
+    their names, if they are as many; a warning says so.
 
     Args:
       source: the file that lists the names, for messages.
@@ -107,23 +126,21 @@ def find_files(
       elsewhere: ``root`` is not the folder that the names are of. Then the longest end
         of a name that has a file there counts: of ``images/left/1.png`` all, then
         ``left/1.png``, then ``1.png``.
+      factor: above 1, ``root`` is ``images_4``, of the copies of ``images``.
+      poses_only: nothing is missing; a name without a file has the path of one.
 
     Raises:
       InputError: on missing files, unless ``skip_missing``; on all files missing; on
         two names of one file; on a name that leads out of ``root``.
     """
-    found: dict[str, Path] = {}
-    missing: list[str] = []
-    stems = cache(_stems)
-    for name in names:
-        parts = inside(str(source), name).parts
-        ends = [parts[start:] for start in range(len(parts) if elsewhere else 1)]
-        files = (_file_at(root.joinpath(*end), stems) for end in ends)
-        path = next(filter(None, files), None)
-        if path is None:
-            missing.append(name)
-        else:
-            found[name] = path
+    names = list(names)
+    found = _called(source, root, names, elsewhere)
+    if poses_only:
+        return {name: found.get(name, root / name) for name in names}
+    if not found and factor is not None and factor > 1:
+        whole = root.with_name(root.name.removesuffix(f"_{factor}"))
+        found = _in_order(whole, root, _called(source, whole, names, elsewhere))
+    missing = [name for name in names if name not in found]
     owner: dict[Path, str] = {}
     for name, path in found.items():
         if owner.setdefault(path, name) != name:
@@ -136,7 +153,14 @@ def find_files(
             f"{source}: {len(missing)} of {len(missing) + len(found)} photographs are "
             f"missing in {root}"
         )
-        if not skip_missing or not found:
+        if not found:
+            there = ", ".join(path.name for path in _photographs(root)[:_SHOWN])
+            raise InputError(
+                f"{message}, the first: {', '.join(missing[:_SHOWN])}, where there are "
+                f"{there or 'none'}; put them there, or pass images=, the folder that "
+                "they are in (--images)"
+            )
+        if not skip_missing:
             raise InputError(
                 f"{message}, the first: {', '.join(missing[:_SHOWN])}; put them there, "
                 "or leave them out with skip_missing=True (--skip-missing)"
@@ -144,6 +168,48 @@ def find_files(
         left = f"{message} and left out: {', '.join(missing)}"
         warnings.warn(left, UserWarning, stacklevel=3)
     return found
+
+
+def _called(
+    source: Path, root: Path, names: Sequence[str], elsewhere: bool
+) -> dict[str, Path]:
+    """Those of ``names`` that have a file in ``root``, see `find_files`."""
+    found: dict[str, Path] = {}
+    stems = cache(_stems)
+    for name in names:
+        parts = inside(str(source), name).parts
+        ends = [parts[start:] for start in range(len(parts) if elsewhere else 1)]
+        files = (_file_at(root.joinpath(*end), stems) for end in ends)
+        path = next(filter(None, files), None)
+        if path is not None:
+            found[name] = path
+    return found
+
+
+def _in_order(whole: Path, root: Path, found: dict[str, Path]) -> dict[str, Path]:
+    """For files ``found`` in ``whole`` the copies in ``root`` of the same place in the
+    order of all; none where the photographs of the two are not as many."""
+    originals, copies = _photographs(whole), _photographs(root)
+    if len(originals) != len(copies):
+        return {}
+    copy_of = dict(zip(originals, copies))
+    paired = {name: copy_of[path] for name, path in found.items() if path in copy_of}
+    if paired:
+        name = min(paired)
+        warnings.warn(
+            f"{root}: none of the {len(copies)} photographs is called as in {whole}; "
+            f"they are taken in the order of their names: {paired[name].name} is "
+            f"{name}",
+            UserWarning,
+            stacklevel=4,
+        )
+    return paired
+
+
+def _photographs(folder: Path) -> list[Path]:
+    """All photographs in a folder and in those within, in the order of their names."""
+    files = [p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES]
+    return sorted(files, key=lambda path: path.relative_to(folder).as_posix())
 
 
 def _file_at(path: Path, stems: Callable[[Path], dict[str, Path]]) -> Path | None:

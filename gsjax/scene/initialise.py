@@ -37,6 +37,25 @@ def near_plane(centres: np.ndarray) -> float:
     return NEAR * min(1.0, extent / USUAL_EXTENT)
 
 
+def _finite(scene: Scene) -> np.ndarray:
+    """[M] bool, of its points."""
+    return np.asarray(np.isfinite(scene.points).all(1))
+
+
+def has_points(scene: Scene) -> bool:
+    """Whether there are any to start from."""
+    return bool(_finite(scene).any())
+
+
+def require_points(scene: Scene) -> None:
+    """Raise unless there are points to start from."""
+    if not has_points(scene):
+        raise InputError(
+            f"{scene.source}: no points to start from; start from random ones "
+            "(--initial random)"
+        )
+
+
 def init_gaussians(
     scene: Scene,
     *,
@@ -68,14 +87,9 @@ def init_gaussians(
     if random_count is not None:
         points, colors = _random_points(scene, random_count, rng)
     else:
-        points, colors = scene.points, scene.colors / 255.0
-        finite = np.isfinite(points).all(1)
-        points, colors = points[finite], colors[finite]
-        if len(points) == 0:
-            raise InputError(
-                f"{scene.source}: no points to start from; start from random ones "
-                "(--initial random)"
-            )
+        require_points(scene)
+        finite = _finite(scene)
+        points, colors = scene.points[finite], scene.colors[finite] / 255.0
     if len(points) > max_count:
         chosen = np.sort(rng.choice(len(points), max_count, replace=False))
         points, colors = points[chosen], colors[chosen]

@@ -26,16 +26,20 @@ def load_llff(
     *,
     images: str | PathLike[str] | None = None,
     factor: int | None = None,
+    poses_only: bool = False,
 ) -> Scene:
-    """The scene of a `poses_bounds.npy` and the folder beside it.
+    """The scene of a `poses_bounds.npy` and the folder beside it; see `load_dataset`.
 
     Raises:
       InputError: if the file is no such array, is truncated, has poses that are none,
         or the number of photographs is not that of its rows.
     """
     table = read_poses(path)
-    root = image_folder(path.parent, images, factor)
-    files = sorted(p for p in root.iterdir() if p.suffix.lower() in SUFFIXES)
+    root = image_folder(path.parent, images, factor, poses_only=poses_only)
+    there = root.iterdir() if root.is_dir() else ()
+    files = sorted(p for p in there if p.suffix.lower() in SUFFIXES)
+    if poses_only and len(files) != len(table):
+        files = [root / f"row_{index:04d}.png" for index in range(len(table))]
     if len(files) != len(table):
         raise InputError(
             f"{path}: {len(table)} rows, but {root} has {len(files)} photographs; as "

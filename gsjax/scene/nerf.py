@@ -12,7 +12,13 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.io.point_cloud import read_point_cloud
-from gsjax.scene.image_files import check_factor, find_files, image_folder, inside
+from gsjax.scene.image_files import (
+    check_factor,
+    find_files,
+    image_folder,
+    inside,
+    last_parts,
+)
 from gsjax.scene.image_header import image_size
 from gsjax.scene.transforms_fields import (
     Frame,
@@ -57,6 +63,7 @@ def load_nerf(
     images: str | PathLike[str] | None = None,
     skip_missing: bool = False,
     factor: int | None = None,
+    poses_only: bool = False,
 ) -> Scene:
     """The scene of camera lists in one folder; see `load_dataset`."""
     check_factor(factor)
@@ -64,13 +71,18 @@ def load_nerf(
     elsewhere = images is not None or (factor is not None and factor > 1)
     if elsewhere:
         # As nerfstudio: smaller copies lie in a folder of their own, images_4.
-        root = image_folder(folder, images, factor)
+        root = image_folder(folder, images, factor, poses_only=poses_only)
     views: list[View] = []
     lists = [read_frames(path) for path in paths]
     for path, frames in zip(paths, lists):
-        names = [_file_path(frame) for frame in frames]
+        moved = images is not None or poses_only
+        names = [_file_path(frame, moved) for frame in frames]
         files = find_files(
-            path, root, names, skip_missing=skip_missing, elsewhere=elsewhere
+            *(path, root, names),
+            skip_missing=skip_missing,
+            elsewhere=elsewhere,
+            factor=factor,
+            poses_only=poses_only,
         )
         # A second list is of what is held out, transforms_val.json too.
         default = _SPLITS.get(path.stem) if path == paths[0] else "test"
@@ -84,19 +96,24 @@ def load_nerf(
                 scaled.append((index, scale))
             file = files[name]
             called = _name(file, folder, root)
-            views.append(_view(frame, file, called, folder, viewmat, splits[index]))
+            mask = None if poses_only else _mask(frame, folder)
+            views.append(_view(frame, file, called, viewmat, mask, splits[index]))
         warn_of_scaled(path, scaled)
     points, colors = _points(lists[0][0], folder)
     source = paths[0] if len(paths) == 1 else folder
     return Scene(source, "transforms", tuple(views), points, colors)
 
 
-def _file_path(frame: Frame) -> str:
-    """Where the photograph of a frame lies in the folder, by its list."""
+def _file_path(frame: Frame, moved: bool) -> str:
+    """Where the photograph of a frame lies in the folder, by its list; of one that was
+    ``moved`` to another, the end of it that does not lead out."""
     name = text_of(frame, "file_path")
     if not name:
         raise InputError(f"{frame.where}: file_path is {shown(name)}; text is wanted")
-    return str(inside(frame.where, name))
+    if moved:
+        return str(inside(frame.where, last_parts(name) or name))
+    offer = ", or pass images=, the folder that it is in (--images)"
+    return str(inside(frame.where, name, offer))
 
 
 def _name(file: Path, folder: Path, root: Path) -> str:
@@ -124,20 +141,17 @@ def _view(
     frame: Frame,
     file: Path,
     name: str,
-    folder: Path,
     viewmat: np.ndarray,
+    mask: Path | None,
     split: str | None,
 ) -> View:
     lens = _lens(frame)
     # The size of the file is that of the camera unless the list says otherwise.
-    width, height = size_of(frame) or image_size(file)
+    width, height = size_of(frame) or _size_of_file(frame, file)
     model = "fisheye" if lens is not None and lens.kind == "fisheye" else "pinhole"
     fx, fy = focal_lengths(frame, width, height, model)
     cx, cy = first_number(frame, "cx"), first_number(frame, "cy")
     cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
-    mask = text_of(frame, "mask_path")
-    if mask is not None and not (folder / inside(frame.where, mask)).is_file():
-        raise InputError(f"{frame.where}: mask_path {mask!r}: no such file in {folder}")
     return View(
         name=name,
         image=file,
@@ -146,9 +160,30 @@ def _view(
         width=width,
         height=height,
         lens=lens,
-        mask=None if mask is None else folder / inside(frame.where, mask),
+        mask=mask,
         split=split,
     )
+
+
+def _size_of_file(frame: Frame, file: Path) -> tuple[int, int]:
+    if not file.exists():  # where poses are all that is wanted
+        raise InputError(
+            f"{frame.where}: no image size: w and h are missing, and {file} is not "
+            "there; give w and h in the file, or render from the file itself with a "
+            "size (--cameras FILE --size WxH)"
+        )
+    return image_size(file)
+
+
+def _mask(frame: Frame, folder: Path) -> Path | None:
+    """The file that a frame names, if it does."""
+    name = text_of(frame, "mask_path")
+    if name is None:
+        return None
+    mask = folder / inside(frame.where, name)
+    if not mask.is_file():
+        raise InputError(f"{frame.where}: mask_path {name!r}: no such file in {folder}")
+    return mask
 
 
 def _lens(frame: Frame) -> Lens | None:

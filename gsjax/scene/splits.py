@@ -7,19 +7,22 @@ from pathlib import PurePosixPath
 from gsjax.errors import InputError
 from gsjax.scene.types import View
 
+_EVERY = 8
+
 
 def split_views(
-    views: Sequence[View], every: int = 8, test_names: Sequence[str] = ()
+    views: Sequence[View], every: int | None = None, test_names: Sequence[str] = ()
 ) -> tuple[list[int], list[int]]:
     """Indices of the views to train with, and of those to test with.
 
-    Names that are given win; else the dataset's own split, if it has one; else every
-    8th view in the order of names, the first included, is for testing, as in the
-    papers of the field.
+    Names that are given win; else a distance that is given; else the dataset's own
+    test views, if it names any; else every 8th view in the order of names, the first
+    included, is for testing, as in the papers of the field.
 
     Args:
       views: all views.
-      every: distance of test views; 0 for none.
+      every: distance of test views in the order of names; 0 for none. None leaves it
+        to the dataset, else 8.
       test_names: names of test views; the part behind the last "/" is enough where
         no other view has it.
 
@@ -27,23 +30,22 @@ def split_views(
       InputError: on an unknown or ambiguous name, a negative ``every``, or if no view
         is left to train with.
     """
-    if every < 0:
+    if every is not None and every < 0:
         raise InputError(f"every {every}: 0 (no test views) or more is wanted")
     if test_names:
         test = {_index_of(views, name) for name in test_names}
-    elif any(view.split for view in views):
+    elif every is None and any(view.split == "test" for view in views):
         test = {index for index, view in enumerate(views) if view.split == "test"}
-    elif every:
+    else:
+        every = _EVERY if every is None else every
         order = sorted(range(len(views)), key=lambda index: views[index].name)
         # A lone view is trained with: there is nothing to hold it against.
-        test = set(order[::every]) if len(views) > 1 else set()
-    else:
-        test = set()
+        test = set(order[::every]) if every and len(views) > 1 else set()
     train = [index for index in range(len(views)) if index not in test]
     if not train:
         raise InputError(
             f"all {len(views)} views are test views; leave some to train with: name "
-            "fewer, or choose a larger distance between them"
+            "fewer, or choose a larger distance between them (--test-every)"
         )
     return train, sorted(test)
 

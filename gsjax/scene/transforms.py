@@ -52,9 +52,9 @@ def load_transforms(
     """Cameras of a `transforms.json`, in the order of the file.
 
     Intrinsics stand in the frame or, for all frames, at the top: fl_x, fl_y, cx, cy,
-    w, h in pixels, or camera_angle_x and camera_angle_y in radians. A missing fl_y is
-    fl_x; a missing cx, cy is the image centre. Lens distortion is not rendered: a
-    warning says so.
+    w, h in pixels, or camera_angle_x and camera_angle_y in radians, or x_fov and y_fov
+    in degrees. One alone is that of both axes; a missing cx, cy is the image centre.
+    Lens distortion is not rendered: a warning says so.
 
     Args:
       path: the JSON file.

@@ -17,6 +17,7 @@ from gsjax.files import read_json
 from gsjax.scene.colmap_model import MAX_COORDINATE, MAX_SIDE
 
 _RIGID_TOLERANCE = 1e-3
+_OTHER_LENSES = ("ftheta_", "latlong", "equirectangular")
 
 
 class Frame(NamedTuple):
@@ -84,7 +85,18 @@ def text_of(frame: Frame, key: str) -> str | None:
 
 
 def model_of(frame: Frame) -> str:
-    """The camera model in upper case; "PINHOLE" where the file names none."""
+    """The camera model in upper case; "PINHOLE" where the file names none.
+
+    Raises:
+      InputError: on a lens of instant-ngp that is not among ours.
+    """
+    keys = {key for source in frame.sources for key in source}
+    for key in sorted(keys):
+        if key.startswith(_OTHER_LENSES) and frame.get(key) not in (None, False):
+            raise InputError(
+                f"{frame.where}: {key} is {shown(frame.get(key))}, of a lens that is "
+                "not supported; undistort the photographs to a pinhole first"
+            )
     if frame.get("is_fisheye") is True:  # instant-ngp
         return "OPENCV_FISHEYE"
     return str(frame.get("camera_model") or "PINHOLE").upper()
@@ -192,35 +204,46 @@ def rigid(where: str, block: np.ndarray) -> tuple[np.ndarray, float]:
 def focal_lengths(
     frame: Frame, width: int, height: int, model: str
 ) -> tuple[float, float]:
-    """Focal lengths in pixels; those of the frame go before those of the file."""
-    fy = None
+    """Focal lengths in pixels; those of the frame go before those of the file.
+
+    One alone is that of both axes.
+
+    Raises:
+      InputError: if there is none, or one is out of its range.
+    """
+    fx = fy = None
     for source in frame.sources:
-        fx = number(frame, source, "fl_x")
-        fy = number(frame, source, "fl_y") if fy is None else fy
-        if fx is None and model == "pinhole":
-            fx = _focal_of_angle(frame, source, "camera_angle_x", width)
-        if fy is None and model == "pinhole":
-            fy = _focal_of_angle(frame, source, "camera_angle_y", height)
-        if fx is None:
-            continue
-        fy = fx if fy is None else fy
-        if fx <= 0 or fy <= 0:
-            raise InputError(
-                f"{frame.where}: focal lengths {fx:g}, {fy:g}; above 0 is wanted"
-            )
-        return fx, fy
-    wanted = "fl_x" if model == "orthographic" else "fl_x or camera_angle_x"
-    raise InputError(f"{frame.where}: no focal length; {wanted} is wanted")
-
-
-def _focal_of_angle(
-    frame: Frame, source: dict[str, Any], key: str, size: int
-) -> float | None:
-    angle = number(frame, source, key)
-    if angle is None:
-        return None
-    if not 1e-6 < angle < math.pi:
+        fx = _focal(frame, source, "x", width, model) if fx is None else fx
+        fy = _focal(frame, source, "y", height, model) if fy is None else fy
+        if fx is not None:
+            break
+    fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
+    if fx is None or fy is None:
+        angles = "" if model != "pinhole" else ", camera_angle_x or x_fov"
+        raise InputError(f"{frame.where}: no focal length; fl_x{angles} is wanted")
+    if fx <= 0 or fy <= 0:
         raise InputError(
-            f"{frame.where}: {key} is {angle:g}; radians between 0 and π are wanted"
+            f"{frame.where}: focal lengths {fx:g}, {fy:g}; above 0 is wanted"
         )
-    return 0.5 * size / math.tan(0.5 * angle)
+    return fx, fy
+
+
+def _focal(
+    frame: Frame, source: dict[str, Any], axis: str, size: int, model: str
+) -> float | None:
+    """In pixels or, of a pinhole, by the angle of view: in radians or, as instant-ngp
+    has it besides, in degrees."""
+    focal = number(frame, source, f"fl_{axis}")
+    if focal is not None or model != "pinhole":
+        return focal
+    for key, wanted, unit in (
+        (f"camera_angle_{axis}", "radians between 0 and π", 1.0),
+        (f"{axis}_fov", "degrees between 0 and 180", math.pi / 180),
+    ):
+        angle = number(frame, source, key)
+        if angle is None:
+            continue
+        if not 1e-6 < unit * angle < math.pi:
+            raise InputError(f"{frame.where}: {key} is {angle:g}; {wanted} are wanted")
+        return 0.5 * size / math.tan(0.5 * unit * angle)
+    return None

@@ -17,6 +17,7 @@ from gsjax.raster.types import RasterConfig
 
 STRATEGIES = ("adaptive", "mcmc")
 BACKGROUNDS = ("auto", "black", "white", "random")
+INITIALS = ("auto", "points", "random")
 _MAX_WHOLE = 1 << 63
 
 
@@ -49,7 +50,8 @@ class TrainConfig:
         step, so that nothing hides in it. "auto" is random where photographs are
         transparent, which tells what is nothing, else black. But for "white", views
         and files have it black.
-      initial: "points" of the dataset, or "random" where it has too few.
+      initial: "points" of the dataset, or "random" ones in view; "auto" is points
+        where there are any.
       initial_count: how many random ones.
       max_initial: of more points than that, that many are drawn.
       rates: of Adam.
@@ -76,7 +78,7 @@ class TrainConfig:
     sh_every: int = 1000
     ssim_weight: float = 0.2
     background: str = "auto"
-    initial: str = "points"
+    initial: str = "auto"
     initial_count: int = 100_000
     max_initial: int = 1_000_000
     rates: Rates = field(default_factory=Rates)
@@ -107,7 +109,7 @@ class TrainConfig:
             "ssim_weight": 0 <= self.ssim_weight <= 1,
             "rates' cooling": 0 < self.rates.cooling <= 1,
             "background": self.background in BACKGROUNDS,
-            "initial": self.initial in ("points", "random"),
+            "initial": self.initial in INITIALS,
             "initial_count": self.initial_count >= 1,
             "strategy's initial_opacity": 0 < self.chosen.initial_opacity < 1,
             "strategy's initial_scale": self.chosen.initial_scale > 0,

@@ -16,7 +16,7 @@ from gsjax.errors import CapacityError
 from gsjax.gaussians import Gaussians, grow, make_gaussians
 from gsjax.memory import require
 from gsjax.raster.types import RasterConfig
-from gsjax.scene.initialise import init_gaussians, scene_extent
+from gsjax.scene.initialise import has_points, init_gaussians, scene_extent
 from gsjax.scene.types import Photo, Scene
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
@@ -105,15 +105,27 @@ def extent_of(scene: Scene) -> float:
     return scene_extent(np.stack([view.centre for view in scene.views]))
 
 
+def with_initial(scene: Scene, config: TrainConfig) -> TrainConfig:
+    """The same settings, with "auto" of `TrainConfig.initial` decided for this scene.
+
+    Raises:
+      InputError: if it is to start from its points, and has none, or none before any
+        camera.
+    """
+    if config.initial == "auto":
+        config = config.replace(initial="points" if has_points(scene) else "random")
+    if config.initial == "points":
+        check_points(scene)
+    return config
+
+
 def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
     """A run on this scene before its first step.
 
     Raises:
-      InputError: if the settings ask for its points, and it has none, or none before
-        any camera.
+      InputError: as `with_initial`.
     """
-    if config.initial == "points":
-        check_points(scene)
+    config = with_initial(scene, config)
     gaussians = init_gaussians(
         scene,
         sh_degree=config.sh_degree,

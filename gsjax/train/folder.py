@@ -46,10 +46,10 @@ class RunSettings:
       dataset: folder or file.
       config: of the training.
       images, factor, skip_missing: as for `load_dataset`.
-      every: hold out every so many-th view; 0 for none.
+      every: hold out every so many-th view; 0 for none, None as the dataset says.
       test_images: hold out these instead.
-      trained, held_out: names of the views, once they were split; what a dataset holds
-        later is held against them.
+      trained, held_out: names of the views, once they were split; they stay so, and
+        what a dataset holds later is held against them.
     """
 
     dataset: Path
@@ -57,7 +57,7 @@ class RunSettings:
     images: str | None = None
     factor: int | None = None
     skip_missing: bool = False
-    every: int = 8
+    every: int | None = None
     test_images: tuple[str, ...] = ()
     trained: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ()
@@ -126,9 +126,13 @@ def load_data(settings: RunSettings) -> Data:
         skip_missing=settings.skip_missing,
         factor=settings.factor,
     )
-    data = Data(scene, *split_views(scene.views, settings.every, settings.test_images))
-    if settings.trained:
-        _check_same(settings, with_views(settings, data))
+    if not settings.trained:
+        split = split_views(scene.views, settings.every, settings.test_images)
+        return Data(scene, *split)
+    data, held_out = Data(scene, [], []), set(settings.held_out)
+    for index, view in enumerate(scene.views):
+        (data.test if view.name in held_out else data.train).append(index)
+    _check_same(settings, with_views(settings, data))
     return data
 
 
@@ -194,6 +198,8 @@ def load_settings(folder: Path) -> RunSettings:
         rest = {k: v for k, v in data.items() if k not in ("format", "train")}
         check_kinds(RunSettings, rest)
         rest["dataset"] = Path(rest["dataset"])
+        if "trained" not in rest and rest.get("every") == 8:
+            rest["every"] = None  # an old run: the dataset's own split went before
         for name in ("test_images", "trained", "held_out"):
             rest[name] = tuple(rest.get(name, ()))
         config = from_json(json.dumps(data["train"]))

@@ -133,15 +133,19 @@ def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) ->
     free = available()
     told = "" if free is None else f"; {size_text(free)} is free"
     note(
-        f"memory: about {size_text(now.total)} for {count:,} Gaussians, "
+        f"memory: about {size_text(now.total)} for {_gaussians(count)}, "
         f"{size_text(then)} for {most:,}, which is the most there may be{told}"
     )
     require(now, "this run", "lower --max-size or --max-gaussians")
     if free is not None and then > free:
         note(
-            f"warning: {most:,} Gaussians would not fit; the run is saved and stops "
+            f"warning: {_gaussians(most)} would not fit; the run is saved and stops "
             "where it would take more than there is: lower --max-gaussians to avoid it"
         )
+
+
+def _gaussians(count: int) -> str:
+    return "1 Gaussian" if count == 1 else f"{count:,} Gaussians"
 
 
 def _scaled(width: int, height: int, longest: int | None) -> tuple[int, int]:

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from gsjax.errors import DivergedError, InputError
+from gsjax.scene.initialise import require_points
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.step import Metrics
 
@@ -54,17 +55,17 @@ def check_points(scene: Scene) -> None:
     Warns where half of those that lie before a camera are too near to it.
 
     Raises:
-      InputError: if no camera sees one: such Gaussians would never be drawn, nor move.
+      InputError: if no camera sees one: such Gaussians would never be drawn, nor
+        move; or if there are none.
     """
+    require_points(scene)
     points = scene.points
-    if len(points) == 0:
-        return
     before, drawn, farthest = 0, 0, 0.0
     for view in scene.views:
         depth = points @ view.viewmat[2, :3] + view.viewmat[2, 3]
         before += int((depth > 0).sum())
         drawn += int((depth > view.near).sum())
-        farthest = max(farthest, depth.max())
+        farthest = max(farthest, depth.max(initial=0, where=depth > 0))
     near = max(view.near for view in scene.views)
     unit = "are points and poses in one unit of length?"
     if 0 < drawn < before / 2:

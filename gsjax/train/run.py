@@ -24,8 +24,10 @@ from gsjax.train.fit import (
     fit,
     initial_state,
     subset,
+    with_initial,
 )
 from gsjax.train.folder import (
+    Data,
     RunFiles,
     RunSettings,
     load_data,
@@ -104,7 +106,7 @@ def start_run(
     if ours:
         load_settings(folder)  # refuses what is no run
     data = load_data(settings)
-    settings = with_views(settings, data)
+    settings = replace(with_views(settings, data), config=_begun(settings.config, data))
     sitting = Sitting(settings.config, data, files, Start())
     photos = _photographs(sitting)
     state = initial_state(sitting.scene, settings.config)
@@ -113,6 +115,14 @@ def start_run(
     make_folder(folder)
     save_settings(folder, settings)
     return _train(sitting, photos, state, watch)
+
+
+def _begun(config: TrainConfig, data: Data) -> TrainConfig:
+    """With what the run starts from, which it keeps when it is gone on with."""
+    decided = with_initial(subset(data.scene, data.train), config)
+    if config.initial == "auto" and decided.initial == "random":
+        note("the dataset has no points: starting from random ones (--initial random)")
+    return decided
 
 
 def resume_run(

@@ -390,7 +390,7 @@ BAD = {
         "config.json", changed(lambda c: c.pop("train")), "'train' is missing"
     ),
     "config type": Bad(
-        "config.json", at("every", to="8"), "every is '8'; int is wanted"
+        "config.json", at("every", to="8"), r"every is '8'; int \| None is wanted"
     ),
     "config names": Bad(
         "config.json", at("test_images", to="ab"), "test_images is 'ab'"

@@ -63,7 +63,6 @@ CONFIG = TrainConfig(
 # Of another shape: with one strategy, to compile less.
 ONE_PROGRAM_MORE = "one photograph"
 REFUSED = {
-    "no points": "no points to start from; start from random ones",
     "all behind the cameras": "all 5,000 points lie behind all 2 cameras",
     "all masked": "all 2 photographs are masked altogether",
 }
