@@ -4,8 +4,10 @@ import io
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -182,6 +184,19 @@ BAD = {
     "suffix": (3, lambda _s, _t: ["info", "a.spz"], "no known format"),
     "command": (2, lambda _s, _t: ["xyz"], "xyz: no such command (there are demo"),
     "like a command": (2, lambda _s, _t: ["rendr", "x"], "(did you mean render?); see"),
+    "like a command, with more": (
+        2,
+        lambda _s, _t: ["trian", "a", "-o", "b"],
+        "error: trian: no such command (did you mean train?); see gsjax --help",
+    ),
+    "like the version": (2, lambda _s, _t: ["--verison"], "(did you mean --version?)"),
+    "version and more": (2, lambda _s, _t: ["--version", "a"], "--version: alone"),
+    "before the command": (
+        2,
+        lambda _s, _t: ["--seed", "1", "demo"],
+        "--seed: no such option without a command; see",
+    ),
+    "nothing": (2, lambda _s, _t: [""], "'': no such command (there are demo"),
     "like an option": (
         2,
         lambda _s, _t: ["train", "a", "-o", "b", "--step", "9"],
@@ -289,6 +304,7 @@ def test_process_has_the_code_and_no_traceback(tmp_path):
 
 
 PROGRAMS = {
+    "package": ["-m", "gsjax"],
     "module": ["-m", "gsjax.cli"],
     "script": ["-c", "import sys; from gsjax.cli import main; sys.exit(main())"],
 }
@@ -318,6 +334,21 @@ def test_ctrl_c_while_importing_is_one_line(module, program, scene, tmp_path):
     process = started(program, "info", str(scene / "scene.ply"), path=str(tmp_path))
     assert process.communicate() == ("", "gsjax: error: interrupted\n")
     assert process.returncode == 130
+
+
+def test_each_line_is_written_as_it_is_said(scene):
+    """Where stdout is no terminal, too: the address of a server is wanted at once."""
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    path = str(scene / "scene.ply")
+    process = started("package", "view", path, PYTHONUNBUFFERED="")
+    at_last = threading.Timer(120, process.kill)
+    at_last.start()
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("http://127.0.0.1:")
+    at_last.cancel()
+    process.send_signal(signal.SIGINT)
+    process.communicate()
+    assert process.returncode == 0
 
 
 @pytest.mark.parametrize("args", [["info"], ["--help"]], ids=lambda args: args[-1])

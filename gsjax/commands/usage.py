@@ -7,6 +7,8 @@ from difflib import get_close_matches
 
 from gsjax.console import one_line
 
+_ALONE = ("--help", "--version")  # options without a command
+
 
 def explained(told: str, argv: list[str], commands: Mapping[str, type]) -> str:
     """One line for a line of arguments that tyro refused.
@@ -16,11 +18,9 @@ def explained(told: str, argv: list[str], commands: Mapping[str, type]) -> str:
       argv: the arguments.
       commands: dataclasses that hold the options, by the commands' names.
     """
-    command = argv[0] if argv and argv[0] in commands else None
-    lines = _unframed(told)
-    if command is None:
-        said = _unknown_command(lines, commands)
-        return f"{said or _plain(lines)}; see gsjax --help"
+    command, lines = argv[0], _unframed(told)
+    if command not in commands:
+        return f"{_unknown_command(command, commands)}; see gsjax --help"
     names = [f.name.replace("_", "-") for f in fields(commands[command])]
     parts = [_unknown_option(word, names) for word in _unrecognized(lines)]
     parts += [f"{option} is missing" for option in _missing(lines)]
@@ -61,15 +61,17 @@ def _unknown_option(word: str, names: list[str]) -> str:
     return f"{word}: no such option" + (f" (did you mean --{like[0]}?)" if like else "")
 
 
-def _unknown_command(lines: list[str], commands: Mapping[str, type]) -> str | None:
-    words = _unrecognized(lines)
-    if not words:
-        return None
-    if words[0].startswith("-"):
-        return f"{words[0]}: no such option without a command"
-    like = get_close_matches(words[0], commands, 1)
+def _unknown_command(word: str, commands: Mapping[str, type]) -> str:
+    """What stands first, where only a command, or one of `_ALONE` alone, may."""
+    if word in _ALONE:
+        return f"{word}: alone, or behind a command"
+    if word.startswith("-"):
+        like = get_close_matches(word, _ALONE, 1, 0.7)
+        hint = f" (did you mean {like[0]}?)" if like else ""
+        return f"{word}: no such option without a command{hint}"
+    like = get_close_matches(word.lower(), commands, 1)
     hint = f"did you mean {like[0]}?" if like else f"there are {', '.join(commands)}"
-    return f"{words[0]}: no such command ({hint})"
+    return f"{word or repr(word)}: no such command ({hint})"
 
 
 def _missing(lines: list[str]) -> list[str]:
