@@ -157,6 +157,7 @@ def _parse(argv: list[str]):
     import tyro
 
     from gsjax.commands.common import UsageError
+    from gsjax.commands.options import OPTIONAL
     from gsjax.commands.usage import explained
 
     commands, told = _commands(), io.StringIO()
@@ -173,6 +174,7 @@ def _parse(argv: list[str]):
                 "gsjax --version prints the version.",
                 args=argv or ["--help"],
                 config=(tyro.conf.FlagCreatePairsOff,),
+                registry=OPTIONAL,
             )
     except SystemExit as exit_:
         if exit_.code in (0, None):

@@ -208,12 +208,36 @@ BAD = {
         "(did you mean --preset?); -o RUN, --out RUN is missing; see gsjax train --h",
     ),
     "too many": (2, lambda _s, _t: ["info", "a", "b"], "error: b: not expected; see"),
-    "no value": (2, lambda _s, _t: ["info", "a", "--plot"], "'--plot'"),
+    "no value": (
+        2,
+        lambda _s, _t: ["info", "a", "--plot"],
+        "--plot: a value is wanted; see",
+    ),
     "no command": (2, lambda _s, _t: ["--foo"], "no such option without a command"),
     "option": (2, lambda s, _t: ["info", str(s / "scene.ply"), "--foo"], "foo"),
     "no cameras": (2, lambda _s, t: ["render", "a.ply", "-o", str(t)], "--cameras"),
     "missing option": (2, lambda _s, _t: ["render", "a.ply"], "--out"),
-    "choice": (2, lambda s, t: render_args(s, t, "--preset", "best"), "best"),
+    "choice": (
+        2,
+        lambda s, t: render_args(s, t, "--preset", "best"),
+        "--preset best: no such choice (there are compat, accurate, fast); see gsjax r",
+    ),
+    "like a choice": (
+        2,
+        lambda s, t: render_args(s, t, "--path", "orbti"),
+        "--path orbti: no such choice (did you mean orbit?); see",
+    ),
+    "short choice": (2, lambda _s, _t: ["view", "a", "--up", "z"], "(there are +x, -x"),
+    "None": (
+        2,
+        lambda s, t: render_args(s, t, "--frames", "None"),
+        "--frames 'None': a whole number is wanted; see",
+    ),
+    "option of another": (
+        2,
+        lambda _s, _t: ["train", "a", "-o", "b", "--path", "orbit"],
+        "error: --path: no such option; see gsjax train --help",
+    ),
     "size": (2, lambda s, t: render_args(s, t, "--size", "0x3"), "--size '0x3'"),
     "what": (2, lambda s, t: render_args(s, t, "--what", "rgb,x"), "--what"),
     "colour": (2, lambda s, t: render_args(s, t, "--background", "1,2"), "R,G,B"),
@@ -429,6 +453,17 @@ def test_doctor(capsys, monkeypatch):
     monkeypatch.setattr("gsjax.doctor.render_error", lambda: (float("nan"), 9))
     assert cli.main(["doctor"]) == 1
     assert "NOT WELL" in capsys.readouterr().out
+
+
+def test_help_has_no_default_that_nobody_types(capsys):
+    """What is off or left open; a default that is a value is there."""
+    for command in cli._commands():
+        assert cli.main([command, "--help"]) == 0
+        told = " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
+        assert not re.search(r"None|False|\(default: ?\)", told), command
+        if command == "train":
+            assert "--test-every INT" in told
+            assert "for none. (default: 8)" in told
 
 
 def test_help_and_version(capsys):
