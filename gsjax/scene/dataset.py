@@ -94,3 +94,9 @@ def _finished(scene: Scene) -> Scene:
                 "once; remove all but one"
             )
     return rebase(replace(scene, views=tuple(views)))
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a folder has what `load_dataset` knows a dataset by."""
+    known = find_colmap(path) is not None or bool(find_transforms(path))
+    return known or (path / "poses_bounds.npy").exists()
