@@ -53,9 +53,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: list[str]) -> int:
     # OpenCV warns of what is no harm; of what is, `scene.decode` hears and tells.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
-    # Where there is no ∞, a ?; stderr has a way of its own, and so may stdout.
-    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors="replace")
+    # Each line as it is said, into a file too: a server's address, say. Where there is
+    # no ∞, a ?; stderr has a way of its own, and so may stdout.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        errors = "replace" if sys.stdout.errors == "strict" else sys.stdout.errors
+        sys.stdout.reconfigure(errors=errors, line_buffering=True)
     try:
         with warnings_as_lines():
             code = _result(argv)
@@ -155,6 +157,7 @@ def _parse(argv: list[str]):
     import tyro
 
     from gsjax.commands.common import UsageError
+    from gsjax.commands.options import OPTIONAL
     from gsjax.commands.usage import explained
 
     commands, told = _commands(), io.StringIO()
@@ -171,6 +174,7 @@ def _parse(argv: list[str]):
                 "gsjax --version prints the version.",
                 args=argv or ["--help"],
                 config=(tyro.conf.FlagCreatePairsOff,),
+                registry=OPTIONAL,
             )
     except SystemExit as exit_:
         if exit_.code in (0, None):

@@ -13,21 +13,22 @@ from gsjax.raster.reference import reference_render
 from gsjax.raster.render import DEFAULT_CONFIG, render_exact
 from gsjax.scene.synthetic import torus_knot_scene
 
-# Package that is installed, module that is imported, what needs it.
+# Package that is installed, module that is imported, what is not without it.
 _PACKAGES = (
-    ("jax", "jax", "everything"),
-    ("jaxlib", "jaxlib", "everything"),
-    ("numpy", "numpy", "everything"),
-    ("opencv-contrib-python-headless", "cv2", "photographs and images"),
-    ("pycolmap", "pycolmap", "gsjax sfm"),
+    ("jax", "jax", "everything needs it"),
+    ("jaxlib", "jaxlib", "everything needs it"),
+    ("numpy", "numpy", "everything needs it"),
+    ("opencv-contrib-python-headless", "cv2", "photographs and images need it"),
+    ("pycolmap", "pycolmap", "gsjax sfm needs it"),
 )
 _TOLERANCE = 1e-4
 
 
 def doctor_lines() -> tuple[list[str], bool]:
-    """The report as lines, and whether rendering works."""
+    """The report as lines, and whether all packages are there and rendering works."""
     lines = [f"gsjax     {version('gsjax')}", f"python    {platform.python_version()}"]
-    lines += [f"{name:<9} {_package(*rest)}" for name, *rest in _package_rows()]
+    packages = {name: _package(*rest) for name, *rest in _package_rows()}
+    lines += [f"{name:<9} {told}" for name, (told, _) in packages.items()]
     devices = jax.local_devices()
     kinds = sorted({f"{d.platform} ({d.device_kind})" for d in devices})
     lines.append(f"devices   {len(devices)} × {', '.join(kinds)}")
@@ -41,7 +42,7 @@ def doctor_lines() -> tuple[list[str], bool]:
         f"render    {error:.2g} from the reference at most, over {compared} pixels: "
         f"{verdict}"
     )
-    return lines, good
+    return lines, good and all(there for _, there in packages.values())
 
 
 def version(package: str) -> str:
@@ -57,14 +58,15 @@ def _package_rows():
         yield {"cv2": "opencv"}.get(module, module), package, module, use
 
 
-def _package(package: str, module: str, use: str) -> str:
-    """Version, or why the package cannot be used and what then is missing."""
+def _package(package: str, module: str, use: str) -> tuple[str, bool]:
+    """Version, or why the package cannot be used and what then is missing; whether it
+    can."""
     try:
         loaded = importlib.import_module(module)
     except Exception as error:  # a broken binary may raise anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        return f"absent ({reason}); {use} needs it: pip install {package}"
-    return getattr(loaded, "__version__", version(package))
+        return f"NOT WELL, absent ({reason}); {use}: pip install {package}", False
+    return getattr(loaded, "__version__", version(package)), True
 
 
 def _cores() -> str:

@@ -4,8 +4,10 @@ import io
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -182,6 +184,19 @@ BAD = {
     "suffix": (3, lambda _s, _t: ["info", "a.spz"], "no known format"),
     "command": (2, lambda _s, _t: ["xyz"], "xyz: no such command (there are demo"),
     "like a command": (2, lambda _s, _t: ["rendr", "x"], "(did you mean render?); see"),
+    "like a command, with more": (
+        2,
+        lambda _s, _t: ["trian", "a", "-o", "b"],
+        "error: trian: no such command (did you mean train?); see gsjax --help",
+    ),
+    "like the version": (2, lambda _s, _t: ["--verison"], "(did you mean --version?)"),
+    "version and more": (2, lambda _s, _t: ["--version", "a"], "--version: alone"),
+    "before the command": (
+        2,
+        lambda _s, _t: ["--seed", "1", "demo"],
+        "--seed: no such option without a command; see",
+    ),
+    "nothing": (2, lambda _s, _t: [""], "'': no such command (there are demo"),
     "like an option": (
         2,
         lambda _s, _t: ["train", "a", "-o", "b", "--step", "9"],
@@ -193,12 +208,36 @@ BAD = {
         "(did you mean --preset?); -o RUN, --out RUN is missing; see gsjax train --h",
     ),
     "too many": (2, lambda _s, _t: ["info", "a", "b"], "error: b: not expected; see"),
-    "no value": (2, lambda _s, _t: ["info", "a", "--plot"], "'--plot'"),
+    "no value": (
+        2,
+        lambda _s, _t: ["info", "a", "--plot"],
+        "--plot: a value is wanted; see",
+    ),
     "no command": (2, lambda _s, _t: ["--foo"], "no such option without a command"),
     "option": (2, lambda s, _t: ["info", str(s / "scene.ply"), "--foo"], "foo"),
     "no cameras": (2, lambda _s, t: ["render", "a.ply", "-o", str(t)], "--cameras"),
     "missing option": (2, lambda _s, _t: ["render", "a.ply"], "--out"),
-    "choice": (2, lambda s, t: render_args(s, t, "--preset", "best"), "best"),
+    "choice": (
+        2,
+        lambda s, t: render_args(s, t, "--preset", "best"),
+        "--preset best: no such choice (there are compat, accurate, fast); see gsjax r",
+    ),
+    "like a choice": (
+        2,
+        lambda s, t: render_args(s, t, "--path", "orbti"),
+        "--path orbti: no such choice (did you mean orbit?); see",
+    ),
+    "short choice": (2, lambda _s, _t: ["view", "a", "--up", "z"], "(there are +x, -x"),
+    "None": (
+        2,
+        lambda s, t: render_args(s, t, "--frames", "None"),
+        "--frames 'None': a whole number is wanted; see",
+    ),
+    "option of another": (
+        2,
+        lambda _s, _t: ["train", "a", "-o", "b", "--path", "orbit"],
+        "error: --path: no such option; see gsjax train --help",
+    ),
     "size": (2, lambda s, t: render_args(s, t, "--size", "0x3"), "--size '0x3'"),
     "what": (2, lambda s, t: render_args(s, t, "--what", "rgb,x"), "--what"),
     "colour": (2, lambda s, t: render_args(s, t, "--background", "1,2"), "R,G,B"),
@@ -289,6 +328,7 @@ def test_process_has_the_code_and_no_traceback(tmp_path):
 
 
 PROGRAMS = {
+    "package": ["-m", "gsjax"],
     "module": ["-m", "gsjax.cli"],
     "script": ["-c", "import sys; from gsjax.cli import main; sys.exit(main())"],
 }
@@ -318,6 +358,21 @@ def test_ctrl_c_while_importing_is_one_line(module, program, scene, tmp_path):
     process = started(program, "info", str(scene / "scene.ply"), path=str(tmp_path))
     assert process.communicate() == ("", "gsjax: error: interrupted\n")
     assert process.returncode == 130
+
+
+def test_each_line_is_written_as_it_is_said(scene):
+    """Where stdout is no terminal, too: the address of a server is wanted at once."""
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    path = str(scene / "scene.ply")
+    process = started("package", "view", path, PYTHONUNBUFFERED="")
+    at_last = threading.Timer(120, process.kill)
+    at_last.start()
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("http://127.0.0.1:")
+    at_last.cancel()
+    process.send_signal(signal.SIGINT)
+    process.communicate()
+    assert process.returncode == 0
 
 
 @pytest.mark.parametrize("args", [["info"], ["--help"]], ids=lambda args: args[-1])
@@ -390,14 +445,40 @@ def test_info_of_an_empty_scene(tmp_path, capsys):
 
 
 def test_doctor(capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
     assert cli.main(["doctor"]) == 0
     text = capsys.readouterr().out
     assert re.search(r"render .*: well$", text, re.M)
-    assert re.search(r"pycolmap  absent .*pip install pycolmap$", text, re.M)
+    assert "NOT WELL" not in text
     monkeypatch.setattr("gsjax.doctor.render_error", lambda: (float("nan"), 9))
     assert cli.main(["doctor"]) == 1
     assert "NOT WELL" in capsys.readouterr().out
+
+
+ABSENT = {
+    "pycolmap": r"pycolmap  NOT WELL, absent .*; gsjax sfm needs it: pip install pycol",
+    "cv2": r"opencv    NOT WELL, absent .*; photographs and images need it: pip inst",
+}
+
+
+@pytest.mark.parametrize("module", ABSENT)
+def test_doctor_misses_what_the_package_requires(module, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setattr("gsjax.doctor.render_error", lambda: (0.0, 9))
+    assert cli.main(["doctor"]) == 1
+    text = capsys.readouterr().out
+    assert re.search(ABSENT[module], text)
+    assert re.search(r"render .*: well$", text, re.M)
+
+
+def test_help_has_no_default_that_nobody_types(capsys):
+    """What is off or left open; a default that is a value is there."""
+    for command in cli._commands():
+        assert cli.main([command, "--help"]) == 0
+        told = " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
+        assert not re.search(r"None|False|\(default: ?\)", told), command
+        if command == "train":
+            assert "--test-every INT" in told
+            assert "for none. (default: 8)" in told
 
 
 def test_help_and_version(capsys):

@@ -321,7 +321,21 @@ def render(*more: str):
 
 BAD = {
     "no run": (3, no_run, "no run is here"),
-    "missing run": (3, lambda _d, t: ["info", str(t / "none")], "no run is here"),
+    "missing run": (
+        3,
+        lambda _d, t: ["info", str(t / "none")],
+        "none: does not exist; pass what `gsjax train -o` made",
+    ),
+    "dataset for a run": (
+        3,
+        lambda d, _: ["info", str(d / "dataset")],
+        "dataset: a dataset; train on it first (gsjax train ",
+    ),
+    "file for a run": (
+        3,
+        lambda d, _: ["eval", str(d / "run" / "splat.ply")],
+        "splat.ply: a file, where the folder of a run is wanted; pass what `gsjax tr",
+    ),
     "no splat": (3, no_splat, "--resume"),
     "bad evaluation": (3, bad_eval, "eval.json: the top is [], an object is wanted"),
     "no dataset": (3, no_dataset, "gone: does not exist"),

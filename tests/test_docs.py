@@ -3,11 +3,14 @@
 `mkdocs build` itself is held to say nothing, and its pages to fetch nothing.
 """
 
+import html
 import importlib.util
 import io
+import os
 import re
 import subprocess
 import sys
+import tomllib
 from contextlib import redirect_stdout
 from inspect import isclass, isfunction, ismodule
 from pathlib import Path
@@ -166,9 +169,11 @@ def site(tmp_path_factory) -> Path:
     pytest.importorskip("mkdocstrings", reason="needs gsjax[docs]")
     pytest.importorskip("material", reason="needs gsjax[docs]")
     out = tmp_path_factory.mktemp("site")
+    usual = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(out)],
         cwd=ROOT,
+        env=usual,
         capture_output=True,
         text=True,
     )
@@ -200,6 +205,37 @@ def test_reference_shows_what_docstrings_say(site):
     options = (site / "cli.html").read_text(encoding="utf-8")
     assert "--refine-poses" in options
     assert "options: train" not in options
+
+
+def test_reference_has_the_types_of_several_names_at_once(site):
+    def entries(page: str) -> dict[str, str]:
+        text = (site / "reference" / page).read_text(encoding="utf-8")
+        items = re.findall(r'<li class="doc-section-item.*?</li>', text, re.S)
+        plain = [html.unescape(re.sub(r"<[^>]+>", "", item)) for item in items]
+        heads = [" ".join(item.split()).partition(" – ")[0] for item in plain]
+        parts = [head.rstrip(")").partition(" (") for head in heads]
+        return {name: kind for name, _, kind in parts if ", " in name}
+
+    training = entries("training.html")
+    assert training["refine_poses, refine_intrinsics"] == "bool"
+    assert training["pose_rate, intrinsics_rate, exposure_rate"] == "float"
+    assert training["trained, held_out"] == "tuple[str, ...]"
+    assert training["images, factor, skip_missing"] == "", "they differ"
+    assert entries("cameras.html")["width, height"] == "int"
+    assert entries("measures.html")["image, target"] == "Array"
+
+
+def test_signatures_are_broken_into_lines(site):
+    page = (site / "reference" / "rendering.html").read_text(encoding="utf-8")
+    blocks = re.findall(r"<code>(.*?)</code>", page, re.S)
+    signatures = [re.sub("<[^>]+>", "", x) for x in blocks if "render_exact" in x]
+    assert any(signature.count("\n") > 4 for signature in signatures)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert any(x.startswith("ruff") for x in project["optional-dependencies"]["docs"])
+
+
+def test_no_bytecode_is_published(site):
+    assert list(site.rglob("*.py*")) == []
 
 
 def test_blocks_know_their_lines():

@@ -7,7 +7,10 @@ is heavy to import is imported there.
 import contextlib
 import re
 from dataclasses import dataclass
+from inspect import get_annotations
+from typing import Annotated
 
+from gsjax.commands.options import TOLD
 from gsjax.errors import GsjaxError
 
 _KINDS = ("rgb", "alpha", "depth")
@@ -21,8 +24,13 @@ class UsageError(GsjaxError):
 
 @dataclass(kw_only=True)
 class Command:
-    debug: bool = False
+    debug: Annotated[bool, TOLD] = False
     """Show the whole traceback of an error."""
+
+    def __init_subclass__(cls) -> None:
+        """All options of commands are told of alike in their help."""
+        for name, kind in get_annotations(cls).items():
+            cls.__annotations__[name] = Annotated[kind, TOLD]
 
 
 @dataclass(kw_only=True)

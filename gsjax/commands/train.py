@@ -32,17 +32,20 @@ class TrainCommand(HeavyCommand):
     preset: Literal["fast", "default", "quality"] = "default"
     """fast: minutes on two cores; quality: 30 000 steps as in the papers."""
     strategy: Literal["adaptive", "mcmc"] | None = None
-    """How Gaussians are added and removed; default: that of the preset."""
+    """How Gaussians are added and removed; default: the preset's."""
     steps: int | None = None
-    """How many; the schedules of the preset are stretched to them."""
+    """How many, default: the preset's; its schedules are stretched to them."""
     max_size: int | None = None
-    """Longest side of the photographs in px; larger ones are scaled down."""
+    """Longest side of the photographs in px, to which larger ones are scaled down;
+    default: the preset's."""
     max_gaussians: int | None = None
-    """Never more than that."""
+    """Never more than that; default: the preset's."""
     sh_degree: Literal[0, 1, 2, 3, 4] | None = None
-    """Degree of the spherical harmonics; 0 is one colour from all sides."""
+    """Degree of the spherical harmonics; 0 is one colour from all sides; default: the
+    preset's."""
     background: Literal["auto", "black", "white", "random"] | None = None
-    """Behind the scene; auto: random where photographs are transparent, else black."""
+    """Behind the scene; default: auto, which is random where photographs are
+    transparent, else black."""
     initial: Literal["points", "random"] | None = None
     """Start from the dataset's points, or from anywhere in view; default: from its
     points if it has any."""
@@ -61,7 +64,7 @@ class TrainCommand(HeavyCommand):
     images: str | None = None
     """Folder of the photographs, if not as usual."""
     factor: int | None = None
-    """Use images_2, images_4 or images_8."""
+    """2, 4, 8: use the smaller copies in images_2, images_4, images_8."""
     skip_missing: bool = False
     """Leave out photographs that are listed but not there."""
     test_every: int | None = None
@@ -70,9 +73,9 @@ class TrainCommand(HeavyCommand):
     test_images: tuple[str, ...] = ()
     """Hold out these views instead."""
     checkpoint_every: int | None = None
-    """Steps between checkpoints; 0 only at the end."""
+    """Steps between checkpoints, 0 only at the end; default: the preset's."""
     eval_every: int | None = None
-    """Steps between measurements on the held-out views; 0 only at the end."""
+    """Steps between measurements on the held-out views; default: 0, only at the end."""
     viewer: bool = False
     """Show the scene in the browser as it grows; needs the extra gsjax[viewer]."""
     viewer_port: int = 8080

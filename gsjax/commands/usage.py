@@ -1,11 +1,13 @@
 """What is wrong with a command line, in one line: tyro's boxes read and put shortly."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import fields
 from difflib import get_close_matches
 
 from gsjax.console import one_line
+
+_ALONE = ("--help", "--version")  # options without a command
 
 
 def explained(told: str, argv: list[str], commands: Mapping[str, type]) -> str:
@@ -16,11 +18,9 @@ def explained(told: str, argv: list[str], commands: Mapping[str, type]) -> str:
       argv: the arguments.
       commands: dataclasses that hold the options, by the commands' names.
     """
-    command = argv[0] if argv and argv[0] in commands else None
-    lines = _unframed(told)
-    if command is None:
-        said = _unknown_command(lines, commands)
-        return f"{said or _plain(lines)}; see gsjax --help"
+    command, lines = argv[0], _unframed(told)
+    if command not in commands:
+        return f"{_unknown_command(command, commands)}; see gsjax --help"
     names = [f.name.replace("_", "-") for f in fields(commands[command])]
     parts = [_unknown_option(word, names) for word in _unrecognized(lines)]
     parts += [f"{option} is missing" for option in _missing(lines)]
@@ -49,8 +49,10 @@ def _section(lines: list[str], title: str) -> list[str]:
 
 def _unrecognized(lines: list[str]) -> list[str]:
     """Options that do not exist, or if all do, words that nothing was expected for."""
-    found = _section(lines, "Unrecognized options:")
-    words = [word for line in found for word in re.split(r"[,\s]+", line) if word]
+    elsewhere = _section(lines, "Unrecognized or misplaced options:")  # of a command
+    found = " ".join(_section(lines, "Unrecognized options:") or elsewhere)
+    text = re.sub(r"\(applied to [^)]*\)", "", found)
+    words = [word for word in re.split(r"[,\s]+", text) if word]
     return [word for word in words if word.startswith("-")] or words
 
 
@@ -61,15 +63,15 @@ def _unknown_option(word: str, names: list[str]) -> str:
     return f"{word}: no such option" + (f" (did you mean --{like[0]}?)" if like else "")
 
 
-def _unknown_command(lines: list[str], commands: Mapping[str, type]) -> str | None:
-    words = _unrecognized(lines)
-    if not words:
-        return None
-    if words[0].startswith("-"):
-        return f"{words[0]}: no such option without a command"
-    like = get_close_matches(words[0], commands, 1)
-    hint = f"did you mean {like[0]}?" if like else f"there are {', '.join(commands)}"
-    return f"{words[0]}: no such command ({hint})"
+def _unknown_command(word: str, commands: Mapping[str, type]) -> str:
+    """What stands first, where only a command, or one of `_ALONE` alone, may."""
+    if word in _ALONE:
+        return f"{word}: alone, or behind a command"
+    if word.startswith("-"):
+        like = get_close_matches(word, _ALONE, 1, 0.7)
+        hint = f" (did you mean {like[0]}?)" if like else ""
+        return f"{word}: no such option without a command{hint}"
+    return f"{word or repr(word)}: no such command ({_hint(word, commands)})"
 
 
 def _missing(lines: list[str]) -> list[str]:
@@ -84,14 +86,30 @@ def _plain(lines: list[str]) -> str:
     parts = [one_line(part) for part in text.split("\n\n")]
     advice = ("For full helptext", "Argument helptext")
     parts = [part for part in parts if part and not part.startswith(advice)]
-    return _shortened("; ".join(parts)) or "wrong usage"
+    return _shortened("; ".join(parts)).rstrip(".") or "wrong usage"
 
 
 def _shortened(text: str) -> str:
-    """Of a value that is no number, only what it is and which kind is wanted."""
+    """Of a value that cannot be, only what it is and what is wanted."""
+    choice = re.search(
+        r"invalid choice '(.*)' for argument '(.+)'\. Exp.*\((.*)\)", text
+    )
+    if choice is not None:
+        value, option, listed = choice.groups()
+        there = re.findall(r"'([^']*)'", listed)
+        return f"{option} {value}: no such choice ({_hint(value, there)})"
+    missing = re.search(r"Missing value for argument '(.+?)'", text)
+    if missing is not None:
+        return f"{missing[1]}: a value is wanted"
     why = r"(?:literal for (int)\(\) with base 10|convert string to (float)): (.+)"
     found = re.search(rf"Error parsing (\S+): .*{why}", text)
     if found is None:
         return text
     option, whole, _, value = found.groups()
     return f"{option} {value}: a {'whole ' if whole else ''}number is wanted"
+
+
+def _hint(word: str, there: Collection[str]) -> str:
+    """What may have been meant, or else what there is."""
+    like = get_close_matches(word.lower(), there, 1) if len(word) > 2 else []
+    return f"did you mean {like[0]}?" if like else f"there are {', '.join(there)}"

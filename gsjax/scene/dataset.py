@@ -106,3 +106,9 @@ def _finished(scene: Scene) -> Scene:
     near = near_plane(np.stack([view.centre for view in views]))
     views = tuple(replace(view, near=near) for view in views)
     return rebase(replace(scene, views=views))
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a folder has what `load_dataset` knows a dataset by."""
+    known = find_colmap(path) is not None or bool(find_transforms(path))
+    return known or (path / "poses_bounds.npy").exists()

@@ -28,7 +28,7 @@ from gsjax.errors import InputError
 from gsjax.files import read_json, write_json
 from gsjax.gaussians import Gaussians
 from gsjax.io import load, save
-from gsjax.scene.dataset import load_dataset
+from gsjax.scene.dataset import is_dataset, load_dataset
 from gsjax.scene.splits import split_views
 from gsjax.scene.types import Scene
 from gsjax.train.config import TrainConfig, check_kinds, from_json, to_json
@@ -188,9 +188,7 @@ def load_settings(folder: Path) -> RunSettings:
     """
     path, wanted = run_files(folder).config, "what `gsjax train -o` made"
     if not path.exists():
-        raise InputError(
-            f"{folder}: no run is here ({path.name} is missing); pass {wanted}"
-        )
+        raise InputError(f"{folder}: {_no_run(folder)}; pass {wanted}")
     data = read_json(path, wanted)
     try:
         if data["format"] != _FORMAT:
@@ -210,6 +208,17 @@ def load_settings(folder: Path) -> RunSettings:
         ) from error
     except (ValueError, TypeError) as error:
         raise InputError(f"{path}: damaged: {error}; pass {wanted}") from error
+
+
+def _no_run(path: Path) -> str:
+    """What is there in place of a run's folder."""
+    if not path.exists():
+        return "does not exist"
+    if not path.is_dir():
+        return "a file, where the folder of a run is wanted"
+    if is_dataset(path):
+        return f"a dataset; train on it first (gsjax train {path} -o RUN)"
+    return "no run is here (config.json is missing)"
 
 
 def save_settings(folder: Path, settings: RunSettings) -> None:
