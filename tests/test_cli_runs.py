@@ -13,6 +13,7 @@ import pytest
 
 import gsjax
 from gsjax import cli
+from gsjax.commands import common
 from gsjax.gaussians import activate
 
 WIDTH, HEIGHT, PHOTOS, STEPS = 64, 48, 9, 20
@@ -98,7 +99,16 @@ def test_demo(made, capsys):
         assert cli.main(line) == 0
     capsys.readouterr()
     assert cli.main(["demo", "-o", str(out), *DEMO]) == 3
-    assert "exists; pass --overwrite" in error_of(capsys)
+    told = "exists; pass --overwrite, or another folder with -o"
+    assert told in error_of(capsys)
+
+
+def test_a_hint_says_what_it_needs(monkeypatch):
+    monkeypatch.setattr(common, "find_spec", lambda _: None)
+    needs = "gsjax view a/run  (needs pip install 'gsjax[viewer]')"
+    assert common.view_hint(Path("a/run")) == needs
+    monkeypatch.setattr(common, "find_spec", lambda _: object())
+    assert common.view_hint(Path("a/run")) == "gsjax view a/run"
 
 
 # --- render ---
@@ -129,7 +139,7 @@ def test_a_path_to_movies(demo, tmp_path, capsys):
         assert cli.main([*args, "-o", str(path), "--what", kind]) == 0
         said = capsys.readouterr()
         assert said.out.splitlines() == [str(path)]
-        assert "3 frames, 1.5 s" in said.err
+        assert "3 frames, a movie of 1.5 s" in said.err
         assert read_movie(path).shape == (3, HEIGHT, WIDTH, 3)
     depth = read_movie(tmp_path / "new" / "depth.webp").astype(int)
     seen = (depth.max(-1) - depth.min(-1)) > 100

@@ -30,7 +30,9 @@ class InfoCommand(Command):
         if self.plot is not None:
             if self.plot.suffix.lower() != ".png":
                 raise UsageError(f"--plot {self.plot}: a name in .png is wanted")
-            files.refuse_existing([self.plot], self.overwrite)
+            files.refuse_existing(
+                [self.plot], self.overwrite, "another name with --plot"
+            )
         start_jax()
         from gsjax.histograms import histograms_png
         from gsjax.info import describe, info_text

@@ -154,7 +154,12 @@ def test_exit_codes(monkeypatch, capsys):
     assert len(capsys.readouterr().out.splitlines()) == 3
     assert stress(monkeypatch, "well over", "--only", "a/") == 0
     assert stress(monkeypatch, "well over", "--only", "z") == 2
-    assert "there are a/well, c/over" in capsys.readouterr().err
+    told = "no case; there are a/well, c/over; more with --full\n"
+    assert capsys.readouterr().err.endswith(told)
+    assert stress(monkeypatch, "well full", "--only", "full") == 2
+    assert "--only 'full': only with --full: f/full" in capsys.readouterr().err
+    assert stress(monkeypatch, "well full", "--full", "--only", "z") == 2
+    assert "there are a/well, f/full\n" in capsys.readouterr().err
 
 
 def test_json_and_markdown(monkeypatch, tmp_path, capsys):
