@@ -57,7 +57,8 @@ class InfoCommand(Command):
             texts.append(info_text(str(splat), facts))
             if self.plot is not None:
                 files.make_folder(self.plot.parent)
-                histograms_png(self.plot, gaussians, title=splat.name)
+                named = self.scene.resolve() if "run" in told else splat
+                histograms_png(self.plot, gaussians, title=named.name)
                 told["plot"] = str(self.plot)
                 texts.append(str(self.plot))
         say(json.dumps(told, indent=2) if self.json else "\n".join(texts))
