@@ -278,7 +278,7 @@ def test_export(demo, tmp_path, capsys):
     assert not (tmp_path / "c.ply").exists()
 
 
-def test_info_of_a_run(demo, tmp_path, capsys):
+def test_info_of_a_run(demo, tmp_path, capsys, monkeypatch):
     assert cli.main(["info", str(demo / "run"), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     run, gaussians = facts["run"], gsjax.load(demo / "run" / "splat.ply")
@@ -291,6 +291,17 @@ def test_info_of_a_run(demo, tmp_path, capsys):
     assert f"steps             {STEPS} of {STEPS}" in text
     assert f"PSNR {run['evaluation']['psnr']:.2f} dB" in text
     assert f"Gaussians         {facts['count']:,}" in text
+    with monkeypatch.context() as patch:  # its plot has the name of the run
+        titles = []
+        patch.setattr(
+            "gsjax.histograms.histograms_png",
+            lambda *_, title: titles.append(title),
+        )
+        plot = ["--plot", str(tmp_path / "a.png")]
+        for scene in (demo / "run", demo / "run" / "splat.ply"):
+            assert cli.main(["info", str(scene), *plot]) == 0
+        assert titles == ["run", "splat.ply"]
+        capsys.readouterr()
     # A run that was killed has no Gaussians yet, and is told of all the same.
     young = tmp_path / "young"
     young.mkdir()

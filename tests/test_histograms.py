@@ -58,6 +58,19 @@ def test_ticks_of_decades_leave_room_for_one_another(decades):
         assert abs(np.log10(value) - place) < 1e-6
 
 
+def test_what_is_counted_is_said(monkeypatch):
+    said = []
+
+    def axes(*args, title="", y_label="", **more):
+        said.append((title, y_label))
+        return curves.axes(*args, title=title, y_label=y_label, **more)
+
+    monkeypatch.setattr("gsjax.histograms.axes", axes)
+    histograms(scene(0.1), title="a")
+    # A legend stands where the second would have the label.
+    assert said == [("a: 64 Gaussians", "count"), ("count by axis", ""), ("", "count")]
+
+
 def test_any_scene_is_a_picture():
     good = scene(0.1)
     broken = good.params.replace(

@@ -98,6 +98,7 @@ def test_a_page_holds_the_scene_and_needs_nothing_else(ply, tmp_path, capsys):
     assert not links
     assert "SH degree 0" in text
     assert "Drag to turn" in text
+    assert re.search(r"<div style=[^>]*background:[^>]*>[^<]*Gaussians", text)
     _, packed = told_by(text)
     rgb = packed[:, 7:].copy().view(np.uint8)[:, :3] / 255
     np.testing.assert_allclose(rgb, [[0.9, 0.5, 0.1]] * COUNT, atol=1 / 255)

@@ -51,6 +51,10 @@ def test_what_is_left_out_has_a_reason():
     left_out = set(run.chosen(True)) - set(SHORT)
     assert left_out
     assert all(case.full_only for case in left_out)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    said = re.search(r"short form, (\d+) of the (\d+)", " ".join(readme.split()))
+    assert said is not None
+    assert [*map(int, said.groups())] == [len(SHORT), len(run.CASES)]
     assert len(poison.VALUES) >= 22
     assert len(poison.entries()) == 59
 
