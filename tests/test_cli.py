@@ -495,8 +495,8 @@ def test_help_has_no_default_that_nobody_types(capsys):
         told = " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
         assert not re.search(r"None|False|\(default: ?\)", told), command
         if command == "train":
-            assert "--test-every INT" in told
-            assert "for none. (default: 8)" in told
+            assert "--steps INT How many" in told
+            assert "same bits on a CPU. (default: 0)" in told
 
 
 def test_help_and_version(capsys):
