@@ -165,7 +165,7 @@ def _range(values: np.ndarray, margin: float) -> tuple[float, float]:
 def _ticks(low: float, high: float, most: int, log: bool) -> list[tuple[float, str]]:
     """Where they are, and what they say: within the range, about ``most`` of them."""
     if log:
-        return _decades(low, high)
+        return _decades(low, high, most)
     least = (high - low) / max(most, 1)
     power = 10 ** np.floor(np.log10(least))
     step = power * next((m for m in (1, 2, 5) if m * power >= least), 10)
@@ -173,14 +173,17 @@ def _ticks(low: float, high: float, most: int, log: bool) -> list[tuple[float, s
     return [(float(place), short_number(place)) for place in places]
 
 
-def _decades(low: float, high: float) -> list[tuple[float, str]]:
-    """Powers of ten from 10^low to 10^high, and between them where there is room."""
+def _decades(low: float, high: float, most: int) -> list[tuple[float, str]]:
+    """Powers of ten from 10^low to 10^high, and between them where there is room; of
+    too many, each second, third, …"""
     wide = high - low > 2
     factors = (1,) if high - low > 4 else (1, 3) if wide else (1, 2, 5)
-    powers = range(int(np.floor(low)), int(np.ceil(high)) + 1)
+    step = int(np.ceil((high - low) / most)) if high - low > 4 else 1
+    first = step * int(np.floor(low / step))
+    powers = range(first, int(np.ceil(high)) + 1, step)
     found = [(k + float(np.log10(f)), f, k) for k in powers for f in factors]
     return [
-        (place, short_number(f * 10.0**k) if k >= -4 else f"{f}e{k}")
+        (place, short_number(f * 10.0**k) if -4 <= k < 6 else f"{f}e{k}")
         for place, f, k in found
         if low <= place <= high
     ]

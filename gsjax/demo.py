@@ -96,7 +96,8 @@ def run_demo(
 
 def _refuse_existing(files: DemoFiles, overwrite: bool) -> None:
     photos = files.dataset / "transforms.json"
-    refuse_existing([photos, run_files(files.run).config, files.turntable], overwrite)
+    made = [photos, run_files(files.run).config, files.turntable]
+    refuse_existing(made, overwrite, "another folder with -o")
 
 
 def _turn(files: DemoFiles, run: RunSettings, overwrite: bool) -> None:

@@ -183,8 +183,13 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
 
 
-def refuse_existing(paths: Iterable[Path], overwrite: bool) -> None:
+def refuse_existing(
+    paths: Iterable[Path], overwrite: bool, instead: str = "another name"
+) -> None:
     """Check names before the work that would fill them.
+
+    Args:
+      instead: what to pass in place of ``--overwrite``, for the message.
 
     Raises:
       InputError: if one exists and ``overwrite`` is not set, or is a folder.
@@ -195,4 +200,4 @@ def refuse_existing(paths: Iterable[Path], overwrite: bool) -> None:
         raise InputError(f"{folders[0]}: is a folder; a file is to be written there")
     if found and not overwrite:
         more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-        raise InputError(f"{found[0]}{more}: exists; pass --overwrite, or another name")
+        raise InputError(f"{found[0]}{more}: exists; pass --overwrite, or {instead}")

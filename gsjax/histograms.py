@@ -51,7 +51,7 @@ def histograms(gaussians: Gaussians, *, title: str = "") -> np.ndarray:
     return np.concatenate(
         [
             _histogram([Group("", opacity)], heading, "opacity", (0.0, 1.0)),
-            _histogram(scales, "", "scale, world units", None),
+            _histogram(scales, "count by axis", "scale, world units", None),
             _histogram([Group("", ratio)], "", "longest / shortest axis", None),
         ]
     )
@@ -70,7 +70,7 @@ def _histogram(
     top = 1.06 * max(1, *(int(each.max()) for each in counts))
     plot, place = axes(
         bounds, (0.0, top), title=title, x_label=x_label, size=_SIZE,
-        log=(not x, False),
+        log=(not x, False), y_label="" if len(groups) > 1 else "count",
     )  # fmt: skip
     for index, each in enumerate(counts):
         steps = np.stack(

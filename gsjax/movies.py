@@ -36,7 +36,7 @@ def check_movie(path: Path, *, overwrite: bool = False) -> None:
         )
     folder = _png_folder(path)
     if folder is None:
-        refuse_existing([path], overwrite)
+        refuse_existing([path], overwrite, "another name with -o")
     elif folder.exists():
         _refuse_folder(folder, overwrite)
 

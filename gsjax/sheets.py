@@ -110,7 +110,9 @@ def _row(row: SheetRow, width: int, with_depth: bool) -> np.ndarray:
     ]
     if row.depth is not None:
         pixels, near, far = depth_colors(row.depth)
-        cells.append(_cell(pixels, f"depth  {near:.3g} to {far:.3g}", width))
+        cells.append(
+            _cell(pixels, f"depth, 2 to 98 %:  {near:.3g} to {far:.3g}", width)
+        )
     elif with_depth:
         cells.append(np.full_like(cells[0], _PAPER))
     return np.concatenate(cells, axis=1)

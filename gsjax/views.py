@@ -21,6 +21,7 @@ from gsjax.scene.transforms import CameraEntry
 from gsjax.subjects import Subject
 
 _MARGIN = 1.5  # room for views that show more than the first
+_LISTED = 10  # images that are named each; of more, the first and the last
 
 
 class _Target(NamedTuple):
@@ -40,7 +41,10 @@ def write_views(
     npy: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Render every camera to files of its name; one result line for each image.
+    """Render every camera to files of its name.
+
+    The results are a line for each image, or for many without depth, which has its
+    range there, one for all.
 
     Args:
       subject: what to render.
@@ -63,9 +67,15 @@ def write_views(
     gaussians, config = prepared(subject, cameras, kinds)
     make_folder(folder)
     views = rendered(gaussians, cameras, config, subject.background)
+    pictures = [target.png for of_view in targets for target in of_view]
+    each = len(pictures) <= _LISTED or "depth" in kinds
     for of_view, view in zip(progress(targets, "views"), views):
         for target in of_view:
-            _write(target, np.asarray(getattr(view, target.kind), np.float32))
+            line = _write(target, np.asarray(getattr(view, target.kind), np.float32))
+            if each:
+                say(line)
+    if not each:
+        say(f"{pictures[0]} … {pictures[-1].name}, {len(pictures)} images")
 
 
 def prepared(
@@ -146,10 +156,11 @@ def _refuse_conflicts(targets: list[list[_Target]], overwrite: bool) -> None:
                 "camera file, or ask for one kind of image at a time"
             )
         seen.add(str(path).casefold())
-    refuse_existing(paths, overwrite)
+    refuse_existing(paths, overwrite, "another folder with -o")
 
 
-def _write(target: _Target, image: np.ndarray) -> None:
+def _write(target: _Target, image: np.ndarray) -> str:
+    """Write the files of an image; returns what is said of it."""
     line = str(target.png)
     if target.kind == "depth":
         depth = images.depth_picture(image)
@@ -160,4 +171,4 @@ def _write(target: _Target, image: np.ndarray) -> None:
     write_file(target.png, images.encode_png(pixels))
     if target.npy is not None:
         write_file(target.npy, images.encode_npy(image))
-    say(line)
+    return line

@@ -120,6 +120,8 @@ def row(ms: float, error: float, knob: str = "cut", inside: bool = True) -> dict
 def test_the_front_is_what_nothing_beats():
     rows = [row(3, 1e-3), row(1, 1e-1), row(2, 1e-2), row(2.5, 2e-2), row(9, 1e-3)]
     assert front(rows) == [1, 2, 0]
+    hardly = {**rows[0], "forward ms": 9.0, "max": 0.999 * rows[0]["max"]}
+    assert front([*rows, hardly]) == [1, 2, 0], "not for a thousandth"
 
 
 def test_table_and_plot():

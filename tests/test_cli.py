@@ -110,6 +110,23 @@ def test_kinds_size_preset_and_background(scene, tmp_path, capsys):
     assert (rgb[empty] == np.float32([0.25, 0.5, 1])).all()
 
 
+def test_of_many_images_the_first_and_the_last_are_named(
+    scene, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr("gsjax.views._LISTED", 3)
+    few, many = tmp_path / "few", tmp_path / "many"
+    assert cli.main(render_args(scene, few)) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 2
+    assert cli.main(render_args(scene, many, "--what", "rgb,alpha")) == 0
+    told = f"{many / 'view 0.png'} … view 1.alpha.png, 4 images\n"
+    assert capsys.readouterr().out == told
+    assert len(list(many.iterdir())) == 4
+    more = ["--what", "rgb,depth", "--overwrite"]
+    assert cli.main(render_args(scene, many, *more)) == 0
+    told = capsys.readouterr().out
+    assert len(re.findall(r"view .*\.png  depth \S+ \(1\) to", told)) == 2
+
+
 def test_capacity_grows_once_and_stays(scene, tmp_path, monkeypatch):
     used = []
 
@@ -138,7 +155,8 @@ def test_capacity_grows_once_and_stays(scene, tmp_path, monkeypatch):
 def test_nothing_is_overwritten_unasked(scene, tmp_path, capsys):
     (tmp_path / "view 1.png").write_text("mine")
     assert cli.main(render_args(scene, tmp_path)) == 3
-    assert "view 1.png: exists; pass --overwrite" in error_of(capsys)
+    told = "view 1.png: exists; pass --overwrite, or another folder with -o"
+    assert told in error_of(capsys)
     assert [p.name for p in tmp_path.iterdir()] == ["view 1.png"]
     assert cli.main(render_args(scene, tmp_path, "--overwrite")) == 0
     assert read_image(tmp_path / "view 1.png").shape == (HEIGHT, WIDTH, 3)
@@ -477,8 +495,8 @@ def test_help_has_no_default_that_nobody_types(capsys):
         told = " ".join(re.sub("[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
         assert not re.search(r"None|False|\(default: ?\)", told), command
         if command == "train":
-            assert "--test-every INT" in told
-            assert "for none. (default: 8)" in told
+            assert "--steps INT How many" in told
+            assert "same bits on a CPU. (default: 0)" in told
 
 
 def test_help_and_version(capsys):

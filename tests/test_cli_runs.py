@@ -13,6 +13,7 @@ import pytest
 
 import gsjax
 from gsjax import cli
+from gsjax.commands import common
 from gsjax.gaussians import activate
 
 WIDTH, HEIGHT, PHOTOS, STEPS = 64, 48, 9, 20
@@ -98,7 +99,16 @@ def test_demo(made, capsys):
         assert cli.main(line) == 0
     capsys.readouterr()
     assert cli.main(["demo", "-o", str(out), *DEMO]) == 3
-    assert "exists; pass --overwrite" in error_of(capsys)
+    told = "exists; pass --overwrite, or another folder with -o"
+    assert told in error_of(capsys)
+
+
+def test_a_hint_says_what_it_needs(monkeypatch):
+    monkeypatch.setattr(common, "find_spec", lambda _: None)
+    needs = "gsjax view a/run  (needs pip install 'gsjax[viewer]')"
+    assert common.view_hint(Path("a/run")) == needs
+    monkeypatch.setattr(common, "find_spec", lambda _: object())
+    assert common.view_hint(Path("a/run")) == "gsjax view a/run"
 
 
 # --- render ---
@@ -129,7 +139,7 @@ def test_a_path_to_movies(demo, tmp_path, capsys):
         assert cli.main([*args, "-o", str(path), "--what", kind]) == 0
         said = capsys.readouterr()
         assert said.out.splitlines() == [str(path)]
-        assert "3 frames, 1.5 s" in said.err
+        assert "3 frames, a movie of 1.5 s" in said.err
         assert read_movie(path).shape == (3, HEIGHT, WIDTH, 3)
     depth = read_movie(tmp_path / "new" / "depth.webp").astype(int)
     seen = (depth.max(-1) - depth.min(-1)) > 100
@@ -268,7 +278,7 @@ def test_export(demo, tmp_path, capsys):
     assert not (tmp_path / "c.ply").exists()
 
 
-def test_info_of_a_run(demo, tmp_path, capsys):
+def test_info_of_a_run(demo, tmp_path, capsys, monkeypatch):
     assert cli.main(["info", str(demo / "run"), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     run, gaussians = facts["run"], gsjax.load(demo / "run" / "splat.ply")
@@ -281,6 +291,17 @@ def test_info_of_a_run(demo, tmp_path, capsys):
     assert f"steps             {STEPS} of {STEPS}" in text
     assert f"PSNR {run['evaluation']['psnr']:.2f} dB" in text
     assert f"Gaussians         {facts['count']:,}" in text
+    with monkeypatch.context() as patch:  # its plot has the name of the run
+        titles = []
+        patch.setattr(
+            "gsjax.histograms.histograms_png",
+            lambda *_, title: titles.append(title),
+        )
+        plot = ["--plot", str(tmp_path / "a.png")]
+        for scene in (demo / "run", demo / "run" / "splat.ply"):
+            assert cli.main(["info", str(scene), *plot]) == 0
+        assert titles == ["run", "splat.ply"]
+        capsys.readouterr()
     # A run that was killed has no Gaussians yet, and is told of all the same.
     young = tmp_path / "young"
     young.mkdir()

@@ -1,13 +1,16 @@
 """Histograms: ink where the values are, for any scene; and `gsjax info --plot`."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
 from conftest import frustum_points, gaussians_at
 
 import gsjax
-from gsjax import cli
+from gsjax import cli, curves
 from gsjax.histograms import histograms
+from gsjax.sheets import text_width
 
 BLUE = np.array((38, 98, 186))
 
@@ -37,6 +40,35 @@ def test_scales_and_their_ratio_are_on_logarithmic_axes():
     plot = histograms(scene((0.02, 0.1, 0.5)))
     assert abs(columns(plot, 1).mean() - np.log10(2) / 2) < 0.03  # of the shortest
     assert abs(columns(plot, 2).mean() - np.log10(2.5)) < 0.03
+
+
+@pytest.mark.parametrize("decades", [1, 2, 3, 4, 4.5, 7, 8, 12, 20, 40])
+def test_ticks_of_decades_leave_room_for_one_another(decades):
+    low, room = -4.5, 720 - curves.LEFT - curves.RIGHT
+    ticks = curves._ticks(low, low + decades, room // 90, True)
+    assert len(ticks) >= 2
+    spans = [
+        (room * (place - low) / decades, text_width(text) / 2) for place, text in ticks
+    ]
+    for (a, half_a), (b, half_b) in pairwise(spans):
+        assert b - a >= half_a + half_b + 6, [text for _, text in ticks]
+    assert not any(text.endswith("M") for _, text in ticks), "1e9, not 1000M"
+    for place, text in ticks:
+        value = float(text.replace("k", "e3"))
+        assert abs(np.log10(value) - place) < 1e-6
+
+
+def test_what_is_counted_is_said(monkeypatch):
+    said = []
+
+    def axes(*args, title="", y_label="", **more):
+        said.append((title, y_label))
+        return curves.axes(*args, title=title, y_label=y_label, **more)
+
+    monkeypatch.setattr("gsjax.histograms.axes", axes)
+    histograms(scene(0.1), title="a")
+    # A legend stands where the second would have the label.
+    assert said == [("a: 64 Gaussians", "count"), ("count by axis", ""), ("", "count")]
 
 
 def test_any_scene_is_a_picture():

@@ -66,3 +66,4 @@ def test_that_there_may_be_no_more_is_said_once(capsys):
         reporter.tell_if_full(wanted)
     (told,) = capsys.readouterr().err.splitlines()
     assert f"{CONFIG.max_gaussians + 1:,} Gaussians are wanted" in told
+    assert "(train --max-gaussians)" in told, "the demonstration has no such option"

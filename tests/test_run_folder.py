@@ -182,7 +182,10 @@ def test_a_dataset_that_was_moved(made, capsys):
         evaluate_run(run)
     before = contents(run)
     assert cli.main(["train", str(there), "-o", str(run), "--resume"]) == 0
-    assert f"dataset is now {there}" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert f"dataset is now {there}" in told
+    assert "nothing is left to train; its results are made anew" in told
+    assert "going on" not in told
     assert load_settings(run).dataset == there
     assert before[run / "splat.ply"] == contents(run)[run / "splat.ply"]
     evaluate_run(run)

@@ -176,7 +176,7 @@ def photos_and(*more: str):
 
 BAD = {
     "missing": (3, lambda f: [str(f / "none")], "no such folder"),
-    "one photo": (3, one_photo, "1 photos"),
+    "one photo": (3, one_photo, "1 photo ("),
     "subfolders": (3, in_subfolders, "subfolders are not searched, 4 photos lie there"),
     "damaged": (3, damaged, "3 of 5 photos cannot be read; mend or remove: "),
     "half": (3, damaged, "half.jpg: the image is truncated or damaged"),
@@ -208,6 +208,12 @@ def test_an_error_is_one_line_a_code_and_no_file(name, tmp_path, capfd):
     assert all(line.startswith("gsjax: ") for line in lines)
     assert not (tmp_path / "out").exists()
     assert not leftovers(tmp_path)
+
+
+def test_what_is_refused_is_not_begun(tmp_path, capsys):
+    photo = two_photos(tmp_path) / "0.jpg"
+    assert cli.main(["sfm", str(photo), "-o", str(tmp_path / "out")]) == 3
+    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_without_pycolmap_the_remedy_is_named(room, tmp_path, capsys, monkeypatch):

@@ -46,6 +46,15 @@ def test_the_cells_are_the_pictures():
     assert sheet[52:66].max() > 120  # captions
 
 
+def test_the_caption_says_which_depths_are_coloured(monkeypatch):
+    """Not the least and the greatest, which a depth picture has."""
+    said = []
+    monkeypatch.setattr("gsjax.sheets.put_text", lambda _, text, *__: said.append(text))
+    comparison([row()], width=300)
+    (told,) = [text for text in said if text.startswith("depth")]
+    assert told.startswith("depth, 2 to 98 %:  ")
+
+
 def test_rows_of_several_sizes_and_without_depth():
     rows = [row(), row(128, 40), row(33, 70, depth=False, name="Ünï" + 90 * "x")]
     sheet = comparison(rows, width=100)

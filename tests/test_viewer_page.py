@@ -97,6 +97,8 @@ def test_a_page_holds_the_scene_and_needs_nothing_else(ply, tmp_path, capsys):
     links = set(re.findall(r"(?:src|href)=.?https?://[^\"' ]+", text))
     assert not links
     assert "SH degree 0" in text
+    assert "Drag to turn" in text
+    assert re.search(r"<div style=[^>]*background:[^>]*>[^<]*Gaussians", text)
     _, packed = told_by(text)
     rgb = packed[:, 7:].copy().view(np.uint8)[:, :3] / 255
     np.testing.assert_allclose(rgb, [[0.9, 0.5, 0.1]] * COUNT, atol=1 / 255)
@@ -104,10 +106,24 @@ def test_a_page_holds_the_scene_and_needs_nothing_else(ply, tmp_path, capsys):
     assert "exists" in capsys.readouterr().err
     args = ["--overwrite", "--max-gaussians", "20", "--min-opacity", "0.5"]
     assert cli.main(["view", str(ply), "--html", str(out), *args]) == 0
-    assert f"20 of {COUNT} Gaussians" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert f"20 of {COUNT} Gaussians" in said.out
+    assert "left out" not in said.err, "it was asked for"
     args = ["--overwrite", "--min-opacity", "0.999"]
     assert cli.main(["view", str(ply), "--html", str(out), *args]) == 3
     assert "lower --min-opacity" in capsys.readouterr().err
+
+
+def test_faint_gaussians_that_are_left_out_are_said_to_be_faint(ply, tmp_path, capsys):
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    whole = gsjax.load(ply)
+    faint = whole.params.logit_opacities.at[:3].set(-9.0)
+    changed = whole.replace(params=whole.params.replace(logit_opacities=faint))
+    gsjax.save(tmp_path / "faint.ply", changed)
+    args = ["view", str(tmp_path / "faint.ply"), "--html", str(tmp_path / "a.html")]
+    assert cli.main(args) == 0
+    told = f"3 of {COUNT} Gaussians left out: too faint (opacity below 0.01), or not"
+    assert told in capsys.readouterr().err
 
 
 COLORS = np.array([[200, 40, 30], [30, 180, 60], [40, 60, 190], [120, 120, 120]])

@@ -33,6 +33,7 @@ _EXACT = RasterConfig.accurate(
 )
 _PIXELS = 48
 _LEAST = 1e-30
+_BETTER = 0.05  # a share
 
 
 class Point(NamedTuple):
@@ -260,11 +261,15 @@ def stages(trial: Trial, repeats: int = 5) -> dict[str, float]:
 
 
 def front(rows: Sequence[dict], time: str = "forward ms", error: str = "max"):
-    """Indices of rows that no other beats in both, by time."""
+    """Indices of rows that no other beats in both, by time.
+
+    To be slower, a row has to be better by `_BETTER`: an error that is less by a
+    thousandth is worth no time.
+    """
     order = sorted(range(len(rows)), key=lambda i: (rows[i][time], rows[i][error]))
     best, kept = float("inf"), []
     for index in order:
-        if rows[index][error] < best:
+        if rows[index][error] < (1 - _BETTER) * best:
             best = rows[index][error]
             kept.append(index)
     return kept

@@ -20,8 +20,9 @@ from gsjax.console import note, say
 class BenchCommand(Command):
     """Measure run time against error: every knob of accuracy and size, one at a time.
 
-    Five minutes or so, most of them compiling. Exit code 1 if a point is outside of
-    the error that theory allows it."""
+    Minutes, most of them compiling: of the built-in knot on two cores five or so, of
+    larger scenes more. Exit code 1 if a point is outside of the error that theory
+    allows it."""
 
     scene: Annotated[Positional[str], arg(metavar="RUN|PLY|NAME")] = "knot"
     """The folder of a run, a .ply file, or built in: knot, fog, needles or huge."""

@@ -7,7 +7,9 @@ is heavy to import is imported there.
 import contextlib
 import re
 from dataclasses import dataclass
+from importlib.util import find_spec
 from inspect import get_annotations
+from pathlib import Path
 from typing import Annotated
 
 from gsjax.commands.options import TOLD
@@ -91,6 +93,12 @@ def parse_budget(text: str) -> float:
     if min(parts) <= 0:
         raise UsageError(f"--budget {text!r}: an error above 0, e.g. 1/255 or 0.004")
     return parts[0] / parts[1]
+
+
+def view_hint(run: Path) -> str:
+    """How to look at a run, and what that needs if it is not installed."""
+    needs = "" if find_spec("viser") else "  (needs pip install 'gsjax[viewer]')"
+    return f"gsjax view {run}{needs}"
 
 
 def start_jax() -> None:

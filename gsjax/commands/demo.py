@@ -6,7 +6,13 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from gsjax.commands.common import Command, UsageError, parse_size, start_jax
+from gsjax.commands.common import (
+    Command,
+    UsageError,
+    parse_size,
+    start_jax,
+    view_hint,
+)
 from gsjax.console import decibels, note, say
 
 
@@ -61,7 +67,7 @@ class DemoCommand(Command):
             f"SSIM {summary.ssim:.4f}"
         )
         note("done; next, try")
-        note(f"  gsjax view {files.run}")
+        note(f"  {view_hint(files.run)}")
         note(f"  gsjax info {files.run}")
         note(f"  gsjax render {files.run} --path test -o {self.out / 'views'}")
         note(f"  gsjax export {files.run} {self.out / 'scene.ply'} --min-opacity 0.01")

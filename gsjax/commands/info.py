@@ -30,7 +30,9 @@ class InfoCommand(Command):
         if self.plot is not None:
             if self.plot.suffix.lower() != ".png":
                 raise UsageError(f"--plot {self.plot}: a name in .png is wanted")
-            files.refuse_existing([self.plot], self.overwrite)
+            files.refuse_existing(
+                [self.plot], self.overwrite, "another name with --plot"
+            )
         start_jax()
         from gsjax.histograms import histograms_png
         from gsjax.info import describe, info_text
@@ -55,7 +57,8 @@ class InfoCommand(Command):
             texts.append(info_text(str(splat), facts))
             if self.plot is not None:
                 files.make_folder(self.plot.parent)
-                histograms_png(self.plot, gaussians, title=splat.name)
+                named = self.scene.resolve() if "run" in told else splat
+                histograms_png(self.plot, gaussians, title=named.name)
                 told["plot"] = str(self.plot)
                 texts.append(str(self.plot))
         say(json.dumps(told, indent=2) if self.json else "\n".join(texts))

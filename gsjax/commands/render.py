@@ -113,7 +113,7 @@ class RenderCommand(HeavyCommand):
                 subject, entries, self.out, kind=kinds[0], fps=rate,
                 overwrite=self.overwrite,
             )  # fmt: skip
-            note(f"{count} frames, {count / rate:.1f} s")
+            note(f"{count} frames, a movie of {count / rate:.1f} s")
             say(str(self.out))
         else:
             write_views(

@@ -29,13 +29,14 @@ class StressCommand(Command):
         from gsjax.stress import run as stress
 
         if self.json is not None:
-            files.refuse_existing([self.json], self.overwrite)
+            files.refuse_existing(
+                [self.json], self.overwrite, "another name with --json"
+            )
         if self.markdown is not None:
             stress.around_marks(self.markdown)  # before minutes go by
         cases = [c for c in stress.chosen(self.full) if self.only in c.name]
         if not cases:
-            names = ", ".join(c.name for c in stress.chosen(self.full))
-            raise UsageError(f"--only {self.only!r}: no case; there are {names}")
+            raise UsageError(f"--only {self.only!r}: {self._no_case()}")
         results = []
         for result in stress.run_cases(tuple(cases), self.full):
             results.append(result)
@@ -50,3 +51,14 @@ class StressCommand(Command):
             stress.put_between_marks(self.markdown, stress.markdown(told))
             note(f"{self.markdown} written")
         return 0 if all(result.good for result in results) else 1
+
+    def _no_case(self) -> str:
+        """Why --only chooses none."""
+        from gsjax.stress import run as stress
+
+        names = [c.name for c in stress.chosen(True) if self.only in c.name]
+        if names:
+            return f"only with --full: {', '.join(names)}"
+        names = [c.name for c in stress.chosen(self.full)]
+        more = "" if self.full else "; more with --full"
+        return f"no case; there are {', '.join(names)}{more}"

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.commands.common import HeavyCommand, UsageError, start_jax
+from gsjax.commands.common import HeavyCommand, UsageError, start_jax, view_hint
 from gsjax.console import decibels, note, say
 
 # What does not change the run itself.
@@ -146,7 +146,7 @@ class TrainCommand(HeavyCommand):
         say(line)
         say(str(result.files.preview))
         note("next: look at it, fly through it, see how it went")
-        note(f"  gsjax view {self.out}")
+        note(f"  {view_hint(self.out)}")
         note(f"  gsjax render {self.out} --path interpolate -o {self.out}/flight.webm")
         note(f"  gsjax info {self.out}")
         return 0

@@ -23,7 +23,7 @@ class ViewCommand(HeavyCommand):
     html: Annotated[Path | None, arg(metavar="OUT.html")] = None
     """Write one page that opens offline instead of serving."""
     min_opacity: float = 0.0
-    """Leave out Gaussians of a lower opacity; below 0.01 nothing is drawn anyway."""
+    """Leave out fainter Gaussians; those below 0.01 the browser never draws anyway."""
     max_gaussians: int | None = None
     """At most that many in the browser, the largest and most opaque first."""
     no_photos: bool = False
@@ -54,7 +54,9 @@ class ViewCommand(HeavyCommand):
         if self.html is not None:
             if self.html.suffix.lower() not in (".html", ".htm"):
                 raise UsageError(f"--html {self.html}: a name in .html is wanted")
-            files.refuse_existing([self.html], self.overwrite)
+            files.refuse_existing(
+                [self.html], self.overwrite, "another name with --html"
+            )
         start_jax()
         from gsjax.viewer.opening import open_exhibit
 
@@ -81,9 +83,10 @@ class ViewCommand(HeavyCommand):
         less = f" of {page.found:,}" if page.drawn < page.found else ""
         faint = max(self.min_opacity, LEAST_OPACITY)
         if less and self.max_gaussians is None:
-            gone = f"{page.found - page.drawn:,}, of opacities below {faint:g}"
-            note(f"left out: {gone} or not finite")
-        cameras = f", {len(exhibit.frusta)} cameras" if exhibit.frusta else ""
+            gone = f"{page.found - page.drawn:,} of {page.found:,} Gaussians left out"
+            note(f"{gone}: too faint (opacity below {faint:g}), or not finite")
+        count = len(exhibit.frusta)
+        cameras = f", {count} camera{'s' * (count != 1)}" if count else ""
         say(
             f"{path}  {page.drawn:,}{less} Gaussians{cameras}, "
             f"{page.size / 2**20:.2f} MiB"

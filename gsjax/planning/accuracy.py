@@ -64,8 +64,8 @@ def within_budget(
         gaussians, views, config, background, (budget / margin, least)
     )
     why = (
-        f"{cut:.3g}: {255 * measured:.3g}/255 off at most on {len(views)} cameras, "
-        f"times {margin:.2g} for those not seen"
+        f"{cut:.3g}: {255 * measured:.3g}/255 off at most on {len(views)} "
+        f"camera{'s' * (len(views) != 1)}, times {margin:.2g} for those not seen"
     )
     told.append(Reason("alpha_cut", why, margin * measured, "estimate"))
     return config.replace(alpha_cut=cut), told, measured

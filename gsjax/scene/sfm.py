@@ -194,9 +194,10 @@ def _collect(
             told = "have a mask or are transparent in part"
             tell(f"{masked} of {len(found)} photos {told}")
     else:
+        frames = sharpest_frames(source, settings.frames, size)  # refuses what is none
         tell(f"choosing the sharpest {settings.frames} frames")
         found = []
-        for number, pixels in sharpest_frames(source, settings.frames, size):
+        for number, pixels in frames:
             name = f"frame_{number:06d}.jpg"
             found.append(work.add(number, name, pixels, None, "video"))
         if len(found) < 2:

@@ -275,7 +275,7 @@ def match_again(database: Path, files: set[str], listing: Path, seed: int, tell:
             cancellation_token=token,
         )
 
-    _watched(work, lambda: f"matching {len(pairs)} pairs again", tell)
+    _watched(work, lambda: f"matching pairs again: {len(pairs)}", tell)
     return len(pairs)
 
 

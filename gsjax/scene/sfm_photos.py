@@ -84,9 +84,9 @@ def find_photos(folder: Path) -> list[Path]:
     found = [p for p in files if p.suffix.lower() in READ]
     if len(found) < 2:
         raise InputError(
-            f"{folder}: {len(found)} photos ({', '.join(READ)}) in it; at least two "
-            "are wanted, rather twenty (a video is given by its own name)"
-            + _told_of_subfolders(folder)
+            f"{folder}: {len(found)} photo{'s' * (len(found) != 1)} "
+            f"({', '.join(READ)}) in it; at least two are wanted, rather twenty (a "
+            "video is given by its own name)" + _told_of_subfolders(folder)
         )
     names = [dataset_name(path) for path in found]
     double = [p for p, name in zip(found, names) if names.count(name) > 1]

@@ -49,7 +49,10 @@ def sharpest_frames(path: Path, wanted: int, max_size: int = 0) -> Iterator[Fram
     total = _count(path)
     if total < 2:
         raise InputError(f"{path}: a video of {total} frames; more are wanted")
-    wanted = min(wanted, total)
+    return _sharpest(path, min(wanted, total), total, max_size)
+
+
+def _sharpest(path: Path, wanted: int, total: int, max_size: int) -> Iterator[Frame]:
     best, best_score, window, index = None, -1.0, 0, -1
     for index, pixels in enumerate(_frames(path)):
         here = min(index * wanted // total, wanted - 1)

@@ -86,7 +86,7 @@ class Reporter:
             self.full = True
             note(
                 f"{wanted:,} Gaussians are wanted, {self.most:,} is the most "
-                "(--max-gaussians): those that lack most come first"
+                "(train --max-gaussians): those that lack most come first"
             )
 
     def left(self, step: int) -> float:

@@ -148,7 +148,13 @@ def resume_run(
         note(f"the run's dataset is now {dataset}")
     if any(files.checkpoints.glob("*.npz")):
         start = _last_checkpoint(files, settings.config, subset(data.scene, data.train))
-        note(f"going on from step {start.step}")
+        if start.step < settings.config.steps:
+            note(f"going on from step {start.step:,}")
+        else:
+            note(
+                f"finished before, with step {start.step:,}: nothing is left to train; "
+                "its results are made anew"
+            )
     sitting = Sitting(settings.config, data, files, start)
     photos = _photographs(sitting)
     state = start.state or initial_state(sitting.scene, settings.config)

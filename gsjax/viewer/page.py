@@ -19,7 +19,8 @@ from gsjax.viewer.stage import (
 )
 
 _CAPTION = """<div style="position:fixed;left:12px;bottom:10px;z-index:9;color:#ddd;
-font:13px sans-serif;text-shadow:0 0 3px #000;pointer-events:none">{}</div>"""
+font:13px sans-serif;background:rgba(0,0,0,.7);padding:3px 7px;border-radius:4px;
+pointer-events:none">{}</div>"""
 
 # viser sorts its splats in a module worker, which it starts from a blob. A page opened
 # from a disk has no origin; Chromium then starts none from there, and says nothing.
@@ -107,7 +108,8 @@ def write_page(exhibit: Exhibit, path: Path, *, title: str) -> Page:
         stop_server(server)
     caption = (
         f"{html.escape(title)} · {drawn:,} of {found:,} Gaussians, each of one colour "
-        "from all sides (SH degree 0), drawn by viser; gsjax"
+        "from all sides (SH degree 0), drawn by viser; gsjax<br>"
+        "Drag to turn, with the right button to shift; the wheel goes nearer."
     )
     head, tail = text.rsplit("</body>", 1)
     head = head.replace("<head>", f"<head>{_WORKERS}", 1)

@@ -51,6 +51,10 @@ def test_what_is_left_out_has_a_reason():
     left_out = set(run.chosen(True)) - set(SHORT)
     assert left_out
     assert all(case.full_only for case in left_out)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    said = re.search(r"short form, (\d+) of the (\d+)", " ".join(readme.split()))
+    assert said is not None
+    assert [*map(int, said.groups())] == [len(SHORT), len(run.CASES)]
     assert len(poison.VALUES) >= 22
     assert len(poison.entries()) == 59
 
@@ -154,7 +158,12 @@ def test_exit_codes(monkeypatch, capsys):
     assert len(capsys.readouterr().out.splitlines()) == 3
     assert stress(monkeypatch, "well over", "--only", "a/") == 0
     assert stress(monkeypatch, "well over", "--only", "z") == 2
-    assert "there are a/well, c/over" in capsys.readouterr().err
+    told = "no case; there are a/well, c/over; more with --full\n"
+    assert capsys.readouterr().err.endswith(told)
+    assert stress(monkeypatch, "well full", "--only", "full") == 2
+    assert "--only 'full': only with --full: f/full" in capsys.readouterr().err
+    assert stress(monkeypatch, "well full", "--full", "--only", "z") == 2
+    assert "there are a/well, f/full\n" in capsys.readouterr().err
 
 
 def test_json_and_markdown(monkeypatch, tmp_path, capsys):
