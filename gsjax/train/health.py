@@ -6,6 +6,9 @@ Both are looked at on the host, and neither changes a bit of what is computed.
 import warnings
 from collections import deque
 from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
 
 from gsjax.errors import DivergedError, InputError
 from gsjax.scene.initialise import require_points
@@ -13,6 +16,7 @@ from gsjax.scene.types import Photo, Scene
 from gsjax.train.step import Metrics
 
 _MAX_BAD_STEPS = 50
+_SAMPLED = 20_000
 _LOST = "nothing of the scene was in view"
 # A loss above it is not that of photographs of nothing.
 _SOMETHING = 0.01
@@ -59,36 +63,53 @@ def check_points(scene: Scene) -> None:
         move; or if there are none.
     """
     require_points(scene)
-    points = scene.points
-    before, drawn, farthest = 0, 0, 0.0
-    for view in scene.views:
-        depth = points @ view.viewmat[2, :3] + view.viewmat[2, 3]
-        before += int((depth > 0).sum())
-        drawn += int((depth > view.near).sum())
-        farthest = max(farthest, depth.max(initial=0, where=depth > 0))
-    near = max(view.near for view in scene.views)
+    points, views = scene.points, scene.views
+    found = _depths(scene, points[:: 1 + len(points) // _SAMPLED])
+    if not found.drawn:  # by those of a sample; all decide
+        found = _depths(scene, points)
+    near = max(view.near for view in views)
     unit = "are points and poses in one unit of length?"
-    if 0 < drawn < before / 2:
+    if not found.before:
+        raise InputError(
+            f"{scene.source}: all {len(points):,} points lie behind all {len(views)} "
+            "cameras; are the poses camera → world where world → camera is wanted, or "
+            "their axes others? Mend the dataset, or start from random points "
+            "(--initial random)"
+        )
+    if not found.drawn:
+        raise InputError(
+            f"{scene.source}: no point is farther than {found.farthest:.2g} from a "
+            f"camera, and what is nearer than {near:.2g} is not drawn; {unit} Mend "
+            "the dataset, or start from random points (--initial random)"
+        )
+    if found.drawn < found.before / 2:
+        share = 1 - found.drawn / found.before
         warnings.warn(
-            f"{scene.source}: {1 - drawn / before:.0%} of the points before a camera "
-            f"are nearer to it than {near:.2g}, and not drawn; {unit}",
+            f"{scene.source}: {share:.0%} of the points before a camera are nearer to "
+            f"it than {near:.2g}, and not drawn; {unit}",
             UserWarning,
             stacklevel=2,
         )
-    if drawn:
-        return
-    if before:
-        raise InputError(
-            f"{scene.source}: no point is farther than {farthest:.2g} from a camera, "
-            f"and what is nearer than {near:.2g} is not drawn; {unit} Mend the "
-            "dataset, or start from random points (--initial random)"
-        )
-    raise InputError(
-        f"{scene.source}: all {len(points):,} points lie behind all {len(scene.views)} "
-        "cameras; are the poses camera → world where world → camera is wanted, or "
-        "their axes others? Mend the dataset, or start from random points (--initial "
-        "random)"
-    )
+
+
+class _Depths(NamedTuple):
+    """Of points in all views: how many lie before the camera, how many of them far
+    enough to be drawn, and how far the farthest is."""
+
+    before: int
+    drawn: int
+    farthest: float
+
+
+def _depths(scene: Scene, points: np.ndarray) -> _Depths:
+    before, drawn, farthest = 0, 0, 0.0
+    for view in scene.views:
+        depth = points @ view.viewmat[2, :3] + view.viewmat[2, 3]
+        depth = depth[depth > 0]  # and no NaN
+        before += len(depth)
+        drawn += int((depth > view.near).sum())
+        farthest = max(farthest, depth.max(initial=0))
+    return _Depths(before, drawn, farthest)
 
 
 class Health:
