@@ -98,7 +98,7 @@ def _shortened(text: str) -> str:
         value, option, listed = choice.groups()
         there = re.findall(r"'([^']*)'", listed)
         return f"{option} {value}: no such choice ({_hint(value, there)})"
-    missing = re.search(r"Missing value for argument '(.+?)'", text)
+    missing = re.search(r"Missing value for argument \W*?(-[\w-]+)", text)
     if missing is not None:
         return f"{missing[1]}: a value is wanted"
     why = r"(?:literal for (int)\(\) with base 10|convert string to (float)): (.+)"
