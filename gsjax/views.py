@@ -14,7 +14,7 @@ from gsjax.errors import InputError
 from gsjax.files import make_folder, refuse_existing, write_file
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.memory import available, size_text
-from gsjax.planning.plan import plan
+from gsjax.planning.plan import plan, trimmed
 from gsjax.raster.render import exact_config, render_estimate, render_exact
 from gsjax.raster.types import RasterConfig, Render
 from gsjax.scene.transforms import CameraEntry
@@ -81,13 +81,17 @@ def write_views(
 def prepared(
     subject: Subject, cameras: Sequence[Camera], kinds: Sequence[str]
 ) -> tuple[Gaussians, RasterConfig]:
-    """The scene and how to render it; with a budget, as `plan` says, and why.
+    """The scene and how to render it, and why: with a budget as `plan` says, else
+    without what changes nothing (`trimmed`).
 
     Raises:
       InputError: if the scene cannot be read, or as `plan`.
     """
     gaussians, config = subject.load(), subject.config.replace(outputs=tuple(kinds))
     if subject.budget is None:
+        gaussians, left_out = trimmed(gaussians, config)
+        for line in left_out:
+            note(line)
         return gaussians, config
     made = plan(
         gaussians,

@@ -26,6 +26,7 @@ from training import (
     scene,
 )
 
+import gsjax
 import gsjax.train.fit as fit_module
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
@@ -41,8 +42,10 @@ from gsjax.train.fit import (
     subset,
     with_initial,
 )
+from gsjax.train.frames import make_frames
 from gsjax.train.room import grow_state, roomy_pairs
 from gsjax.train.step import init_state
+from gsjax.train.unseen import without_unseen
 
 STEPS, FINER = 60, 30
 _PAUSE = 2.0  # s
@@ -138,7 +141,7 @@ def test_it_learns(whole, strategy):
     assert losses[-8:].mean() < 0.85 * losses[:8].mean()
     counts = np.asarray(log.told("gaussians"))[:, 0]
     assert counts[0] == POINTS
-    assert counts[-1] == int(result.gaussians.active.sum())
+    assert counts[-1] == int(result.gaussians.active.sum()) + result.dropped
     assert POINTS < counts[-1] <= 200
     assert all(r["finite"] and not r["overflowed"] for r in log.records)
     assert log.saved == list(range(7, STEPS, 7))
@@ -278,6 +281,66 @@ def test_leaving_the_numbers_is_told():
     ):
         run(config, log, state=state.replace(tuning=tuning))
     assert [r["finite"] for r in log.records] == [False] * 29
+
+
+@on_cpu
+def test_what_no_photograph_shows_is_dropped_in_the_end():
+    """Behind all cameras, far to the side, or fainter than the cut: not a bit of a view
+    that is trained on changes. What one view alone shows stays."""
+    config = CONFIGS["mcmc"]
+    state = init_state(rough_start(1, 64), config, EXTENT, VIEWS)
+    params = state.gaussians.params
+    unseen = [3, 17, 40]
+    params = params.replace(
+        means=params.means.at[3].set([0.0, 0, 60]).at[17].set([50.0, 50, 0]),
+        logit_opacities=params.logit_opacities.at[40].set(-6.0),
+        log_scales=params.log_scales.at[jnp.asarray(unseen)].set(-4.0),
+    )
+    state = state.replace(gaussians=state.gaussians.replace(params=params))
+    frames = make_frames(scene().views, photos(), 1)
+    after, count = without_unseen(state, frames, config, EXTENT)
+    gone = np.asarray(state.gaussians.active & ~after.gaussians.active)
+    raster = config.raster.replace(outputs=("rgb", "alpha"))
+    whole = gsjax.render_exact(state.gaussians, frames.camera, raster)
+    some = gsjax.render_exact(after.gaussians, frames.camera, raster)
+    shown = (np.asarray(whole.radii) > 0).any(0)
+    np.testing.assert_array_equal(gone, np.asarray(state.gaussians.active) & ~shown)
+    assert set(unseen) <= set(np.flatnonzero(gone))
+    assert count == gone.sum() < POINTS / 2
+    np.testing.assert_array_equal(whole.rgb, some.rgb)
+    np.testing.assert_array_equal(whole.alpha, some.alpha)
+    assert changed(state.replace(gaussians=after.gaussians), after) == []
+    again, none = without_unseen(after, frames, config, EXTENT)
+    assert (changed(again, after), none) == ([], 0)
+    # Cameras are where they have been corrected to.
+    turned = config.replace(refine_poses=True)
+    away = init_state(state.gaussians, turned, EXTENT, VIEWS)
+    shifts = jnp.full((VIEWS, 3), 1e4)
+    away = away.replace(tuning=replace(away.tuning, shifts=shifts))
+    _, count = without_unseen(away, frames, turned, EXTENT)
+    assert count == POINTS
+
+
+@on_cpu
+def test_they_are_dropped_when_a_run_ends_and_not_before(monkeypatch):
+    config = CONFIGS["mcmc"]
+    asked = []
+
+    def drop(state, *_):
+        asked.append(int(state.step))
+        return state, 7
+
+    monkeypatch.setattr(fit_module, "without_unseen", drop)
+    stopped, _ = run(config, Log(stop_at=3))
+    assert (stopped.dropped, asked) == (0, [])
+    ending = stopped.state.replace(step=jnp.int32(STEPS - 1))
+    done, _ = run(config, state=ending, pair_capacity=stopped.pair_capacity)
+    assert (done.dropped, asked) == (7, [STEPS])
+    kept, _ = run(
+        config.replace(drop_unseen=False), state=ending,
+        pair_capacity=stopped.pair_capacity,
+    )  # fmt: skip
+    assert (kept.dropped, asked) == (0, [STEPS])
 
 
 def test_a_finished_run_has_nothing_to_do():

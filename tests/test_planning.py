@@ -275,5 +275,32 @@ def test_render_takes_the_plan_and_says_why(capsys):
     assert (found.capacity, config) == (1, made.config)
     told = capsys.readouterr().err.splitlines()
     assert told == [f"gsjax: {line}" for line in made.lines()]
-    same, config = prepared(subject._replace(budget=None), looking(1, 0), ("rgb",))
-    assert (same, config) == (scene, CONFIG)
+
+
+def test_render_leaves_out_what_shows_in_no_picture_and_says_so(capsys):
+    """Without a budget: bands that are 0, and what is below the cut everywhere."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-1, 1, (6, 2)), rng.uniform(3, 5, 6)])
+    scene = gaussians_at(points, 0.5, [0.7, 0.6, 0.5, 1e-3, 0.4, 1e-4], degree=3)
+    sh = scene.params.sh.at[:, 4:].set(0)
+    scene = gsjax.grow(scene.replace(params=scene.params.replace(sh=sh)), 9)
+    subject = Subject(lambda: scene, CONFIG, BEHIND)
+    found, config = prepared(subject, looking(1, 0), ("rgb",))
+    assert config == CONFIG.replace(outputs=("rgb",))
+    assert (found.capacity, found.sh_degree) == (4, 1)
+    told = capsys.readouterr().err
+    assert "SH degree: 1 in place of 3: the bands above are 0" in told
+    assert "2 Gaussians are nowhere above the α cut" in told
+    (camera,) = looking(1, 0)
+    whole = gsjax.render(scene, camera, config)
+    some = gsjax.render(found, camera, config)
+    assert float(whole.rgb.max()) > 0.1
+    np.testing.assert_allclose(some.rgb, whole.rgb, atol=1e-14)
+    # One band that is not 0, in one Gaussian, and there is nothing to leave out.
+    full = gaussians_at(points[:3], 0.5, [0.7, 0.6, 0.5], degree=3)
+    sh = full.params.sh.at[:, 1:].set(0).at[2, 15, 1].set(1e-9)
+    full = full.replace(params=full.params.replace(sh=sh))
+    subject = Subject(lambda: full, CONFIG, BEHIND)
+    found, _ = prepared(subject, looking(1, 0), ("rgb",))
+    assert (found.capacity, found.sh_degree) == (3, 3)
+    assert capsys.readouterr().err == ""

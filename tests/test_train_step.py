@@ -294,6 +294,28 @@ def test_padding_does_not_matter():
     assert first[1].loss > 0.01
 
 
+def test_masked_tiles_are_skipped_and_nothing_else_changes(report):
+    """All that was gathered in the moments: Adam's step itself makes much of little."""
+    config = TUNED.replace(rates=Rates())
+    batch = tuned_batch(gain=0.7)
+    valid = np.asarray(batch.valid) & (np.arange(batch.valid.shape[2]) < 20)
+    batch = batch._replace(valid=jnp.asarray(valid))
+    start = tuned_state(rough_start(0, 64))
+    (one, told), (other, more) = (
+        jax.jit(make_train_step(config.replace(skip_masked=skip), EXTENT))(start, batch)
+        for skip in (True, False)
+    )
+    assert int(told.pairs) < 0.9 * int(more.pairs)
+    assert float(jnp.abs(one.moments.mu.means).max()) > 0
+    worst = abs(float(told.loss / more.loss) - 1)
+    gathered = ((s.moments.mu, s.tuning_moments.mu) for s in (one, other))
+    for a, b in zip(*map(jax.tree.leaves, gathered), strict=True):
+        scale = float(jnp.abs(b).max()) or 1.0
+        worst = max(worst, float(jnp.abs(a - b).max()) / scale)
+    report("gradients with masked tiles and without", worst, 1e-10)
+    assert worst < 1e-10
+
+
 def test_a_step_of_each_correction():
     """Adam's first step is the rate: wherever a gradient is, and nowhere else."""
     start = tuned_state()

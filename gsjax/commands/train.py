@@ -59,6 +59,8 @@ class TrainCommand(HeavyCommand):
     """Correct focal length and principal point along with the scene."""
     exposure: bool = False
     """Learn an exposure for each photograph."""
+    keep_unseen: bool = False
+    """Keep the Gaussians that, in the end, no photograph trained on shows."""
     seed: int = 0
     """The same seed gives the same bits on a CPU."""
     images: str | None = None
@@ -205,6 +207,7 @@ class TrainCommand(HeavyCommand):
             refine_poses=self.refine_poses,
             refine_intrinsics=self.refine_intrinsics,
             exposure=self.exposure,
+            drop_unseen=not self.keep_unseen,
             raster=config.raster.replace(antialias=self.antialias),
         )
         if self.max_gaussians is not None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from gsjax.cameras import Camera
 from gsjax.errors import InputError
-from gsjax.gaussians import Gaussians, select, with_sh_degree
+from gsjax.gaussians import Gaussians, num_active, select, with_sh_degree
 from gsjax.planning import bounds
 from gsjax.planning.accuracy import ROUNDING, within_budget
 from gsjax.planning.sizes import shown, tuned, with_capacities
@@ -91,6 +91,29 @@ def plan(
     config, told = with_capacities(gaussians, views, config)
     reasons += told
     return Plan(gaussians, config, tuple(reasons), budget, measured)
+
+
+def trimmed(gaussians: Gaussians, config: RasterConfig) -> tuple[Gaussians, list[str]]:
+    """The scene without what changes no picture of any camera beyond rounding: bands of
+    spherical harmonics that are 0, Gaussians that are nowhere above the α cut.
+
+    Args:
+      gaussians: N slots, concrete.
+      config: whose α cut it is.
+
+    Returns:
+      The scene, in as many slots as it has Gaussians; and what was left out, in words.
+    """
+    told = []
+    degree, slots = gaussians.sh_degree, gaussians.capacity
+    gaussians, reason = _without_bands(_drawn(gaussians), None)
+    if gaussians.sh_degree < degree:
+        told.append(f"{reason.what}: {reason.why}")
+    before = int(num_active(gaussians))
+    gaussians, reason = shown(gaussians, config, slots)
+    if int(num_active(gaussians)) < before:
+        told.append(f"{reason.what}: {reason.why}")
+    return gaussians, told
 
 
 def _sampled(cameras: Camera | Sequence[Camera]) -> list[Camera]:

@@ -70,13 +70,16 @@ class Lists(NamedTuple):
 
     Attributes:
       ranks: [P] ranks sorted by (tile, rank); what follows the last is never read.
-      length: [T] entries of each tile; zero if they cannot be counted.
-      pairs: [] their sum, saturating.
+      start: [T] where the list of each tile begins.
+      length: [T] entries of each tile; zero if they cannot be counted, or the tile is
+        not wanted.
+      pairs: [] in all lists, saturating.
       fit: [] bool, whether there was room; if not, ``ranks`` holds nothing of use, and
         the counts are right all the same.
     """
 
     ranks: Array
+    start: Array
     length: Array
     pairs: Array
     fit: Array
@@ -178,6 +181,30 @@ def _tiles_in_row(
     return row * grid.cols + first_tile, count
 
 
+def wanted_tiles(mask: Array, grid: Grid, device: Array) -> Array:
+    """Which local tiles [T] hold a pixel of ``mask`` [H, W]."""
+    tall = grid.rows * grid.stride * grid.tile
+    wide = grid.cols * grid.tile
+    mask = jnp.pad(mask, ((0, tall - grid.height), (0, wide - grid.width)))
+    tiles = mask.reshape(-1, grid.tile, grid.cols, grid.tile).any(axis=(1, 3))
+    return tiles.reshape(grid.rows, grid.stride, grid.cols)[:, device].ravel()
+
+
+def _trimming(wanted: Array):
+    """(first tile, count) → the same span without unwanted tiles at its ends."""
+    tiles = wanted.shape[0]
+    place = lax.iota(jnp.int32, tiles)
+    following = lax.cummin(jnp.where(wanted, place, tiles), reverse=True)
+    preceding = lax.cummax(jnp.where(wanted, place, -1))
+
+    def trim(first: Array, count: Array) -> tuple[Array, Array]:
+        last = _at(preceding, first + count - 1)
+        first = _at(following, first)
+        return first, jnp.where(count > 0, jnp.maximum(last - first + 1, 0), 0)
+
+    return trim
+
+
 def make_lists(
     projected: Projected,
     spans: Spans,
@@ -185,6 +212,7 @@ def make_lists(
     device: Array,
     capacity: int,
     rungs: int = 1,
+    wanted: Array | None = None,
 ) -> Lists:
     """Expand ranks to items, items to pairs, and sort; room for ``capacity`` pairs.
 
@@ -198,6 +226,8 @@ def make_lists(
       device: [] its number.
       capacity: of pairs.
       rungs: 2 · rungs − 1 sizes at which to sort, at most.
+      wanted: [T] bool, or None for all: other tiles have no list. (What meets wanted
+        ones of their row on both sides is sorted all the same.)
     """
     ranks = projected.u.shape[0]
     # Nor do the sums over a block wrap.
@@ -208,6 +238,7 @@ def make_lists(
     _, countable = total_count(spans.rows)
     past = jnp.where(spans.rows > 0, lax.iota(jnp.int32, ranks) + 1, 0)
     past = jnp.where(countable, jnp.max(past), 0)
+    trim = None if wanted is None else _trimming(wanted)
 
     def add_ranks(start, state):
         rank = start + lax.iota(jnp.int32, in_ranks)
@@ -224,6 +255,8 @@ def make_lists(
         row = _at(first_row, place) + start + lax.iota(jnp.int32, in_items)
         first, count = _tiles_in_row(projected, rank, row, grid, device)
         count = jnp.where(place < in_ranks, count, 0)
+        if trim is not None:
+            first, count = trim(first, count)
         # Else computed by each of those who use them.
         first, count = lax.optimization_barrier((first, count))
         # 1 where its tiles begin, off again where they end.
@@ -262,9 +295,13 @@ def make_lists(
         low = sort_pairs([key[:size] for key in keys], ranks + 1)
         return jnp.pad(low, (0, capacity - size))
 
+    start = running_total(length) - length
+    if wanted is not None:
+        length = jnp.where(wanted, length, 0)
     return Lists(
         # Sizes lie close together: to sort is quick to compile, and slow to do.
         ranks=on_ladder(pairs, capacity, 2 * rungs - 1, sort, step=2),
+        start=start,
         length=length,
         pairs=pairs,
         fit=pairs <= capacity,

@@ -126,7 +126,7 @@ def _by_blocks(
         corner = corners(tile, grid, device, rows.dtype)
 
         def ranks_of(level):
-            return ranks_at(lists, schedule, tile, level, config.chunk_size, none)
+            return ranks_at(lists, tile, level, config.chunk_size, none)
 
         def more(state):
             level, _, carried, _ = state

@@ -27,7 +27,11 @@ def default_pair_capacity(ranks: int, grid: bins.Grid) -> int:
 
 
 def rasterise(
-    projected: Projected, width: int, height: int, config: RasterConfig
+    projected: Projected,
+    width: int,
+    height: int,
+    config: RasterConfig,
+    mask: Array | None = None,
 ) -> tuple[dict[str, Array], Demand, Array]:
     """Bin and composite what was projected, over all devices.
 
@@ -35,6 +39,7 @@ def rasterise(
       projected: [R].
       width, height: image size.
       config: static settings.
+      mask: [H, W] bool, the pixels that are wanted; or None for all.
 
     Returns:
       Images before the background, {"sums": [H, W, C], "median": [H, W]}; the demand
@@ -47,7 +52,7 @@ def rasterise(
     share = -(-capacity // devices)
     seen = _unhidden(lax.stop_gradient(projected), width, height, config)
     local = partial(_rasterise_local, grid=grid, config=config, capacity=share)
-    images, pairs, wanted = spread(local, devices, projected, seen)
+    images, pairs, wanted = spread(local, devices, projected, seen, mask)
     images = {name: _untile(image, grid) for name, image in images.items()}
     overflowed = jnp.any(wanted > share)
     wanted = jnp.max(wanted)
@@ -91,6 +96,7 @@ def _rasterise_local(
     device: Array,
     projected: Projected,
     geometry: Projected,
+    mask: Array | None,
     *,
     grid: bins.Grid,
     config: RasterConfig,
@@ -99,13 +105,16 @@ def _rasterise_local(
     """One device's tiles; ``device`` is [1]. Results gain a leading device axis.
 
     ``geometry`` is what to bin: ``projected`` without derivatives and without what
-    is hidden.
+    is hidden; ``mask`` says for which pixels.
     """
     device = device[0]
     chunk = config.chunk_size
     group = schedules.tiles_per_step(config, grid, jax.default_backend())
     spans = bins.row_spans(geometry, grid, device)
-    lists = bins.make_lists(geometry, spans, grid, device, capacity, config.rungs)
+    tiles = None if mask is None else bins.wanted_tiles(mask, grid, device)
+    lists = bins.make_lists(
+        geometry, spans, grid, device, capacity, config.rungs, tiles
+    )
     room = schedules.step_capacity(capacity, grid, group, chunk)
     schedule = schedules.make_schedule(lists, grid, group, chunk, room)
     images = composite(projected, lists, schedule, device, grid, room, config)

@@ -33,6 +33,7 @@ def render(
     config: RasterConfig = DEFAULT_CONFIG,
     background: Array | None = None,
     *,
+    mask: Array | None = None,
     features: Array | None = None,
     probe: Array | None = None,
     abs_probe: Array | None = None,
@@ -48,6 +49,9 @@ def render(
       camera: one camera, or a batch B (one call, one image each, made in turn).
       config: static settings.
       background: [C] or [B, C]; default black, as is a component that is not finite.
+      mask: [H, W] bool, or [B, H, W] for a batch: the pixels that are wanted. Tiles
+        without any are skipped; what other pixels come to is not defined, nor do
+        gradients by them mean anything. Counts are of what is wanted.
       features: [N, C] composited in place of the SH colour.
       probe: [N, 2], or [B, N, 2] for a batch, zeros: added to the projected means
         (px); its gradient is the screen-space statistic of densification.
@@ -63,9 +67,9 @@ def render(
     """
     # Tracers cannot index what is NumPy's.
     gaussians = jax.tree.map(jnp.asarray, gaussians)
-    features, probe, abs_probe = (
+    features, probe, abs_probe, mask = (
         None if value is None else jnp.asarray(value)
-        for value in (features, probe, abs_probe)
+        for value in (features, probe, abs_probe, mask)
     )
     cameras = camera if camera.batched else jax.tree.map(lambda a: a[None], camera)
     count = cameras.viewmat.shape[0]
@@ -77,13 +81,14 @@ def render(
     if (abs_probe is not None) != config.absgrad:
         raise InputError("config.absgrad and abs_probe go together: pass both or none")
     _check_features(features, gaussians)
+    mask = _checked_mask(mask, camera)
 
     def render_one(inputs):
         return _render_one(gaussians, config, features, *inputs)
 
     # One after another: no more at a time than one camera takes (a gradient keeps what
     # it needs of each), and the program of one.
-    inputs = (cameras, probe, abs_probe)
+    inputs = (cameras, probe, abs_probe, mask)
     if count == 1:
         out = render_one(jax.tree.map(lambda a: a[0], inputs))
         sums, radii, demands, overflowed = jax.tree.map(lambda a: a[None], out)
@@ -118,13 +123,14 @@ def _render_one(
     camera: Camera,
     probe: Array | None,
     abs_probe: Array | None,
+    mask: Array | None,
 ) -> tuple[dict[str, Array], Array, Demand, Array]:
     """One camera: images before the background, radii [N], demand, overflowed."""
     order, visible = depth_order(gaussians, camera, config)
     out = project(gaussians, camera, config, order, visible, features, probe, abs_probe)
     radii = jnp.zeros(gaussians.capacity, out.u.dtype)
     seen = bins.radii(lax.stop_gradient(out), camera.width, camera.height)
-    sums, demand, overflowed = rasterise(out, camera.width, camera.height, config)
+    sums, demand, overflowed = rasterise(out, camera.width, camera.height, config, mask)
     room = min(config.visible_capacity or gaussians.capacity, gaussians.capacity)
     return (
         sums,
@@ -142,6 +148,18 @@ def _with_batch(name: str, probe, gaussians: Gaussians, camera: Camera):
     if probe.shape != wanted:
         raise InputError(f"{name} has shape {probe.shape}; {wanted} is wanted")
     return probe if camera.batched else probe[None]
+
+
+def _checked_mask(mask: Array | None, camera: Camera) -> Array | None:
+    """``mask`` as [B, H, W], or None."""
+    if mask is None:
+        return None
+    wanted = (*camera.viewmat.shape[:-2], camera.height, camera.width)
+    if mask.shape != wanted or mask.dtype != bool:
+        raise InputError(
+            f"mask has shape {mask.shape} of {mask.dtype}; {wanted} of bool is wanted"
+        )
+    return mask if camera.batched else mask[None]
 
 
 def _check_features(features, gaussians: Gaussians) -> None:
@@ -213,7 +231,7 @@ def render_exact(
     Args:
       gaussians, camera, config, background: as for `render`.
       max_capacity: refuse to grow the pair capacity beyond this.
-      **kwargs: features, probe, abs_probe.
+      **kwargs: mask, features, probe, abs_probe.
 
     Raises:
       CapacityError: if more than ``max_capacity`` is wanted, or more memory than there

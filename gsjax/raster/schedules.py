@@ -24,13 +24,11 @@ class Schedule(NamedTuple):
     Attributes:
       tiles: [blocks, G]; places past the last tile hold T, whose list is empty.
       levels: [blocks] steps of each block, falling; all 0 if there is no room.
-      start: [T] where the lists begin.
       steps: [] how many are wanted, saturating.
     """
 
     tiles: Array
     levels: Array
-    start: Array
     steps: Array
 
 
@@ -82,7 +80,6 @@ def make_schedule(
     return Schedule(
         tiles=tiles,
         levels=jnp.where(lists.fit & (steps <= room), levels, 0),
-        start=running_total(lists.length) - lists.length,
         steps=steps,
     )
 
@@ -106,15 +103,13 @@ def pairs_for_steps(steps: Array, grid: Grid, group: int, chunk: int) -> Array:
     return jnp.where(huge, 2**31 - 1, jnp.where(huge, 0, wanted).astype(jnp.int32))
 
 
-def ranks_at(
-    lists: Lists, schedule: Schedule, tile: Array, level: Array, chunk: int, none: int
-) -> Array:
+def ranks_at(lists: Lists, tile: Array, level: Array, chunk: int, none: int) -> Array:
     """[..., G, K] ranks of a chunk of the tiles [..., G], its ``level`` [...]; ``none``
     where there is none.
     """
     offset = level[..., None, None] * chunk + lax.iota(jnp.int32, chunk)
     inside = offset < take(lists.length, tile)[..., None]
-    position = take(schedule.start, tile)[..., None] + offset
+    position = take(lists.start, tile)[..., None] + offset
     return jnp.where(inside, take(lists.ranks, position), none)
 
 
@@ -133,7 +128,7 @@ def make_work(
     block, level = steps.block[:room], steps.level[:room]
     tile = schedule.tiles.at[block].get(mode="fill", fill_value=lists.length.shape[0])
     return Work(
-        ranks=ranks_at(lists, schedule, tile, level, chunk, ranks),
+        ranks=ranks_at(lists, tile, level, chunk, ranks),
         block=block,
         first=level == 0,
         live=block < schedule.levels.shape[0],

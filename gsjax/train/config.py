@@ -58,6 +58,10 @@ class TrainConfig:
       refine_poses, refine_intrinsics: learn small corrections of the cameras.
       exposure: learn an affine correction of the colours of each photograph.
       pose_rate, intrinsics_rate, exposure_rate: of Adam, for those.
+      skip_masked: leave out the tiles of a view whose pixels are all masked;
+        changes nothing beyond rounding.
+      drop_unseen: at the end, remove the Gaussians that no photograph trained on
+        shows; changes no bit of those views.
       every_eval: in steps, measure the held-out views; 0 only at the end.
       every_checkpoint: in steps; 0 only at the end.
       raster: how to render; sizes in it are set by the run.
@@ -88,6 +92,8 @@ class TrainConfig:
     pose_rate: float = 1e-5
     intrinsics_rate: float = 1e-5
     exposure_rate: float = 1e-3
+    skip_masked: bool = True
+    drop_unseen: bool = True
     every_eval: int = 0
     every_checkpoint: int = 1000
     # One size of the work: it compiles faster, and the run grows its capacities itself.

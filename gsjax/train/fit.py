@@ -25,6 +25,7 @@ from gsjax.train.frames import Frames, draw, make_frames
 from gsjax.train.health import Health, check_photos, check_points
 from gsjax.train.room import pairs_for, roomy_pairs, with_slots
 from gsjax.train.step import Metrics, TrainState, init_state, make_train_step
+from gsjax.train.unseen import without_unseen
 
 
 class Progress(NamedTuple):
@@ -88,11 +89,13 @@ class FitResult:
       state: after the last step.
       pair_capacity: what the last step used.
       progress: of the last step, or None if there was none to do.
+      dropped: Gaussians removed after it, as `TrainConfig.drop_unseen` says.
     """
 
     state: TrainState
     pair_capacity: int
     progress: Progress | None = None
+    dropped: int = 0
 
     @property
     def gaussians(self) -> Gaussians:
@@ -257,7 +260,11 @@ class _Run:
                 self.start += time.perf_counter() - begun
             if hooks.stop():
                 break
-        return FitResult(state, pair_capacity or 0, progress)
+        dropped = 0
+        if step >= config.steps and frames is not None and config.drop_unseen:
+            extent = extent_of(self.scene)
+            state, dropped = without_unseen(state, frames, config, extent)
+        return FitResult(state, pair_capacity or 0, progress, dropped)
 
     def progress(self, metrics: Metrics, divisor: int, state: TrainState) -> Progress:
         return Progress(

@@ -226,6 +226,8 @@ def _trained(
             pair_capacity=start.pair_capacity,
             hooks=hooks,
         )
+        if result.dropped:
+            note(f"{result.dropped:,} Gaussians that no photograph shows are dropped")
         # Within, so that Ctrl-C does not cut it in two either.
         sitting.save(result.state, result.pair_capacity, result.progress)
         save_result(sitting, result.state)

@@ -143,7 +143,8 @@ def make_train_step(
         gaussians = state.gaussians.replace(params=params)
         camera = tuned_camera(batch.camera, tuning, batch.view, extent)
         name = "abs_probe" if densifier.absgrad else "probe"
-        view = render(gaussians, camera, raster, background, **{name: probe})
+        mask = batch.valid if config.skip_masked else None
+        view = render(gaussians, camera, raster, background, mask=mask, **{name: probe})
         assert view.rgb is not None
         image = exposed(view.rgb, tuning, batch.view)
         target, weight = targets(batch, background, image.dtype)
