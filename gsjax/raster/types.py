@@ -46,7 +46,7 @@ class RasterConfig:
       pair_capacity: room for (tile, Gaussian) pairs of a camera; None chooses from
         the sizes. If it is too small, `Render.overflowed` is set and `Render.demand`
         says what was wanted; `render_exact` regrows. Unused room costs memory, and
-        a little time; in a gradient once for each camera of a batch.
+        time, most of all in a gradient: fit it with `exact_config`.
       visible_capacity: room for Gaussians in view (of each camera); None means all
         slots. Reported and regrown like ``pair_capacity``.
       occlusion: leave out, before binning, what lies behind pixels that have all

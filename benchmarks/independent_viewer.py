@@ -1,0 +1,189 @@
+"""Claim: another program shows the PLY that we write as we show it.
+
+``python benchmarks/independent_viewer.py RUN`` opens the ``splat.ply`` of a run, as it
+is, in GaussianSplats3D (Kellogg, MIT; WebGL, a reader and a renderer of its own), with
+the camera of a photograph, and renders the same view with ours at the same size. Both
+are kept side by side, with how far apart they are. (That viewer has colours in 8 bits,
+cuts splats at √8 standard deviations, and leaves out what is fainter than 1/255.) Wants
+``npm``, which fetches it, and Chromium.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import functools
+import http.server
+import json
+import shutil
+import subprocess
+import tempfile
+import threading
+from pathlib import Path
+from typing import ClassVar
+
+import gsjax
+
+gsjax.use_all_cores(queued=False)
+
+import cv2  # noqa: E402
+import measure  # noqa: E402
+import numpy as np  # noqa: E402
+
+from gsjax.flights import path_entries  # noqa: E402
+from gsjax.train.folder import load_data, load_settings, run_files  # noqa: E402
+
+PACKAGES = ("@mkkellogg/gaussian-splats-3d@0.4.7", "three@0.167.1")
+PATIENCE = 300.0  # s: the browser draws without a GPU
+
+PAGE = """<!doctype html><meta charset="utf-8"><body style="margin:0">
+<script type="importmap">{"imports": {
+  "three": "./node_modules/three/build/three.module.js", "splats":
+  "./node_modules/@mkkellogg/gaussian-splats-3d/build/gaussian-splats-3d.module.js"
+}}</script>
+<script type="module">
+import * as THREE from "three";
+import * as Splats from "splats";
+const tell = (path, body) => fetch(path, {method: "POST", body});
+window.onerror = (text) => tell("/error", String(text));
+window.onunhandledrejection = (event) => tell("/error", String(event.reason));
+const told = await (await fetch("view.json")).json();
+const {width, height, projection, pose, degree} = told;
+const renderer = new THREE.WebGLRenderer(
+  {antialias: false, preserveDrawingBuffer: true});
+renderer.setPixelRatio(1);
+renderer.setSize(width, height);
+renderer.setClearColor(0, 1);
+document.body.appendChild(renderer.domElement);
+const camera = new THREE.PerspectiveCamera();
+camera.matrixAutoUpdate = false;
+camera.matrix.fromArray(pose);
+camera.matrix.decompose(camera.position, camera.quaternion, camera.scale);
+camera.updateMatrixWorld(true);
+camera.projectionMatrix.fromArray(projection);
+camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+const viewer = new Splats.DropInViewer({
+  sharedMemoryForWorkers: false, gpuAcceleratedSort: false, integerBasedSort: false,
+  sphericalHarmonicsDegree: degree, antialiased: false, dynamicScene: false,
+  sceneRevealMode: Splats.SceneRevealMode.Instant, logLevel: 0});
+const scene = new THREE.Scene();
+scene.add(viewer);
+await viewer.addSplatScene("splat.ply", {showLoadingUI: false,
+  splatAlphaRemovalThreshold: 1, progressiveLoad: false});
+const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+for (let frame = 0; frame < 30; frame++) {
+  renderer.render(scene, camera);
+  await pause(200);
+}
+await tell("/picture", renderer.domElement.toDataURL("image/png"));
+</script>"""
+
+
+class Handler(http.server.SimpleHTTPRequestHandler):
+    """Serves a folder, and takes what the page posts."""
+
+    posted: ClassVar[dict[str, bytes]] = {}
+    done = threading.Event()
+
+    def do_POST(self):
+        """Keep the body by its path."""
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        self.posted[self.path] = body
+        self.send_response(204)
+        self.end_headers()
+        self.done.set()
+
+    def log_message(self, format, *args):
+        """Say nothing."""
+
+
+def theirs(folder: Path, splat: Path, camera: gsjax.Camera, origin, degree: int):
+    """[H, W, 3] uint8: the picture of the other program."""
+    packages = ["npm", "install", "--no-audit", "--no-fund", *PACKAGES]
+    subprocess.run(packages, cwd=folder, check=True, capture_output=True)
+    shutil.copy(splat, folder / "splat.ply")
+    (folder / "index.html").write_text(PAGE, encoding="utf-8")
+    viewmat, K = (np.asarray(a, np.float64) for a in (camera.viewmat, camera.K))
+    pose = np.linalg.inv(viewmat)
+    pose[:3, 3] += origin
+    pose[:3, 1:3] *= -1  # y up, looking along −z
+    near, far = 0.01, 1000.0
+    (fx, cx), (fy, cy) = (K[0, 0], K[0, 2]), (K[1, 1], K[1, 2])
+    width, height = camera.width, camera.height
+    projection = np.array([
+        [2 * fx / width, 0, 1 - 2 * cx / width, 0],
+        [0, 2 * fy / height, 2 * cy / height - 1, 0],
+        [0, 0, -(far + near) / (far - near), -2 * far * near / (far - near)],
+        [0, 0, -1, 0],
+    ])  # fmt: skip
+    view = {
+        "width": width, "height": height, "degree": min(degree, 2),
+        "projection": projection.T.ravel().tolist(), "pose": pose.T.ravel().tolist(),
+    }  # fmt: skip
+    (folder / "view.json").write_text(json.dumps(view), encoding="utf-8")
+    handler = functools.partial(Handler, directory=str(folder))
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    browser = subprocess.Popen(
+        [
+            "chromium", "--headless=new", "--no-sandbox", "--use-gl=angle",
+            "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+            f"--user-data-dir={folder / 'profile'}", "--disable-gpu-sandbox",
+            f"http://127.0.0.1:{server.server_port}/index.html",
+        ],
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        assert Handler.done.wait(PATIENCE), "the page has sent nothing"
+    finally:
+        browser.kill()
+        browser.wait()
+        server.shutdown()
+    assert "/error" not in Handler.posted, Handler.posted["/error"].decode()
+    png = base64.b64decode(Handler.posted["/picture"].split(b",", 1)[1])
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def main() -> None:
+    """Draw both, compare and save."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path, metavar="RUN")
+    run = parser.parse_args().run
+    settings, files = load_settings(run), run_files(run)
+    data = load_data(settings)
+    size = settings.config.max_size
+    entry = path_entries(data, "train", max_size=size)[0]
+    gaussians = gsjax.load(files.splat)
+    with tempfile.TemporaryDirectory() as folder:
+        found = theirs(
+            Path(folder), files.splat, entry.camera, data.scene.origin,
+            gaussians.sh_degree,
+        )  # fmt: skip
+    scene = gaussians.replace(
+        params=gaussians.params.replace(
+            means=gaussians.params.means - data.scene.origin.astype(np.float32)
+        )
+    )
+    view = gsjax.render_exact(scene, entry.camera, settings.config.raster)
+    ours = np.rint(255 * np.clip(np.asarray(view.rgb), 0, 1)).astype(np.uint8)
+    apart = ours.astype(np.float64) - found
+    both = np.concatenate([ours, found], 1)
+    path = measure.RESULTS / "independent_viewer.webp"
+    cv2.imwrite(str(path), both[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 90])
+    row = {
+        "run": run.name,
+        "view": entry.name,
+        "size": f"{entry.camera.width} x {entry.camera.height}",
+        "Gaussians": int(gsjax.num_active(gaussians)),
+        "PSNR of one against the other, dB": float(
+            -10 * np.log10(np.mean(apart**2) / 255**2)
+        ),
+        "mean difference /255": float(apart.mean()),
+        "99 % of pixels within /255": float(np.percentile(np.abs(apart), 99)),
+    }
+    measure.save("independent_viewer", [row], claim=__doc__, packages=PACKAGES)
+
+
+if __name__ == "__main__":
+    main()

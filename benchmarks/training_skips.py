@@ -1,0 +1,168 @@
+"""Claim: what training leaves out changes nothing that counts, and is worth so much.
+
+``python benchmarks/training_skips.py DATASET...`` trains a dataset twice with ``fast``,
+every 8th view held out: as it is, and without the smaller pictures that it begins with
+(``levels``). On the scene of the first run it measures the other skips, each with its
+switch on and off:
+
+- ``drop_unseen``: Gaussians that no photograph shows, what the file weighs without
+  them, and whether a view that was trained on changes in a bit;
+- ``skip_masked``: a step with a disc of each photograph left over by a mask, and by how
+  much the gradients differ, relative to the largest.
+
+What is not skipped: the optimiser's updates of Gaussians without a gradient. The whole
+optimiser is a twentieth of a step (``benchmarks/training_step.py``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import gsjax
+
+gsjax.use_all_cores(queued=False)
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import measure  # noqa: E402
+import numpy as np  # noqa: E402
+
+from gsjax.scene.photos import load_photos  # noqa: E402
+from gsjax.train.config import Level, TrainConfig, preset  # noqa: E402
+from gsjax.train.fit import FitResult, extent_of, fit, subset  # noqa: E402
+from gsjax.train.frames import draw, make_frames  # noqa: E402
+from gsjax.train.held_out import results_of  # noqa: E402
+from gsjax.train.room import pairs_for  # noqa: E402
+from gsjax.train.step import make_train_step  # noqa: E402
+from gsjax.train.unseen import without_unseen  # noqa: E402
+
+SHARES = (0.75, 0.5, 0.25)  # of the pixels that the mask leaves
+
+
+class Trained:
+    """A dataset with what was learnt of it."""
+
+    def __init__(self, folder: Path, config: TrainConfig):
+        scene = gsjax.load_dataset(folder)
+        held = range(0, len(scene.views), 8)
+        train = [i for i in range(len(scene.views)) if i not in held]
+        self.config = config
+        self.scene, self.test = subset(scene, train), subset(scene, list(held))
+        self.photos = load_photos(self.scene.views, config.max_size)
+        self.held_out = load_photos(self.test.views, config.max_size)
+        self.extent = extent_of(self.scene)
+        self.frames = make_frames(self.scene.views, self.photos)
+
+    def fit(self, config: TrainConfig) -> tuple[FitResult, float]:
+        """The result and seconds, compilation included."""
+        begun = time.perf_counter()
+        result = fit(self.scene, self.photos, config)
+        jax.block_until_ready(result.state.gaussians)
+        return result, time.perf_counter() - begun
+
+    def psnr(self, gaussians) -> float:
+        """dB, mean over the held-out views."""
+        found = results_of(gaussians, self.test, self.held_out, self.config)
+        return float(np.mean([view.psnr for view in found]))
+
+
+def of_levels(name: str, trained: Trained, result: FitResult, seconds: float) -> dict:
+    """Small pictures at first, against full ones from the start."""
+    config = trained.config.replace(levels=(Level(0.0, 1),))
+    jax.clear_caches()
+    other, longer = trained.fit(config)
+    with_it, without = trained.psnr(result.gaussians), trained.psnr(other.gaussians)
+    return {
+        "dataset": name, "skip": "levels", "unit": "s of training",
+        "with": seconds, "without": longer, "ratio": seconds / longer,
+        "changes": f"held out {with_it:.2f} dB with, {without:.2f} dB without",
+    }  # fmt: skip
+
+
+def of_unseen(name: str, trained: Trained, result: FitResult) -> dict:
+    """Without the Gaussians that no photograph shows."""
+    config, frames = trained.config, trained.frames
+    after, dropped = without_unseen(result.state, frames, config, trained.extent)
+    raster = config.raster.replace(outputs=("rgb",))
+    differ = 0
+    for index in range(frames.count):
+        camera = jax.tree.map(lambda a, i=index: a[i], frames.camera)
+        one, other = (
+            gsjax.render_exact(scene, camera, raster).rgb
+            for scene in (result.gaussians, after.gaussians)
+        )
+        differ += int(np.sum(np.asarray(one) != np.asarray(other)))
+    with tempfile.TemporaryDirectory() as folder:
+        sizes = []
+        for scene in (after.gaussians, result.gaussians):
+            path = Path(folder) / f"{len(sizes)}.ply"
+            gsjax.save(path, scene)
+            sizes.append(path.stat().st_size / 1e6)
+    quality = [trained.psnr(s) for s in (after.gaussians, result.gaussians)]
+    total = int(gsjax.num_active(result.gaussians))
+    return {
+        "dataset": name, "skip": "drop_unseen", "unit": "MB of splat.ply",
+        "with": sizes[0], "without": sizes[1], "ratio": sizes[0] / sizes[1],
+        "changes": f"{dropped} of {total} Gaussians; {differ} numbers of the trained "
+        f"views; held out {quality[0]:.3f} dB with, {quality[1]:.3f} dB without",
+    }  # fmt: skip
+
+
+def of_masks(name: str, trained: Trained, result: FitResult, share: float) -> dict:
+    """A step whose photographs are masked but for a disc in the middle."""
+    config, frames, state = trained.config, trained.frames, result.state
+    height, width = frames.pixels.shape[1:3]
+    y, x = np.mgrid[:height, :width]
+    apart = ((x + 0.5) / width - 0.5) ** 2 + ((y + 0.5) / height - 0.5) ** 2
+    disc = apart <= np.quantile(apart, share)
+    batch = draw(frames, state.key, jnp.int32(0), 1)
+    batch = batch._replace(valid=jnp.asarray(disc)[None])
+    pairs = pairs_for(state, frames, config)
+    raster = config.raster.replace(pair_capacity=pairs)
+    steps = {
+        skip: jax.jit(
+            make_train_step(
+                config.replace(skip_masked=skip), trained.extent, raster
+            )
+        )
+        for skip in (True, False)
+    }  # fmt: skip
+    # Adam's step makes much of little: the gradients stand in its moments.
+    fresh = state.replace(step=jnp.int32(1))
+    zero = jax.tree.map(jnp.zeros_like, state.moments)
+    fresh = fresh.replace(moments=zero)
+    slopes = [steps[skip](fresh, batch)[0].moments.mu for skip in (True, False)]
+    worst = max(
+        float(jnp.abs(a - b).max()) / max(float(jnp.abs(b).max()), 1e-30)
+        for a, b in zip(*map(jax.tree.leaves, slopes), strict=True)
+    )
+    ms = measure.interleaved(
+        {skip: lambda s=step: s(fresh, batch) for skip, step in steps.items()}
+    )
+    return {
+        "dataset": name, "skip": f"skip_masked, {share:.0%} left", "unit": "ms a step",
+        "with": ms[True], "without": ms[False], "ratio": ms[True] / ms[False],
+        "changes": f"gradients {worst:.1e} of the largest",
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Measure and save."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("datasets", nargs="+", type=Path, metavar="DATASET")
+    rows = []
+    for folder in parser.parse_args().datasets:
+        config = preset("fast").replace(drop_unseen=False)
+        trained = Trained(folder, config)
+        result, seconds = trained.fit(config)
+        rows.append(of_unseen(folder.name, trained, result))
+        rows += [of_masks(folder.name, trained, result, share) for share in SHARES]
+        rows.append(of_levels(folder.name, trained, result, seconds))
+        measure.save("training_skips", rows, claim=__doc__)
+
+
+if __name__ == "__main__":
+    main()
