@@ -2,8 +2,8 @@
 
 ``python benchmarks/training_skips.py DATASET...`` trains a dataset twice with ``fast``,
 every 8th view held out: as it is, and with pictures of half the size for the first
-quarter (``levels``). On the scene of the first run it measures the other skips, each with its
-switch on and off:
+quarter (``levels``). On the scene of the first run it measures the other skips, each
+with its switch on and off:
 
 - ``drop_unseen``: Gaussians that no photograph shows, what the file weighs without
   them, and whether a view that was trained on changes in a bit;
