@@ -310,6 +310,10 @@ def test_what_no_photograph_shows_is_dropped_in_the_end():
     np.testing.assert_array_equal(whole.rgb, some.rgb)
     np.testing.assert_array_equal(whole.alpha, some.alpha)
     assert changed(state.replace(gaussians=after.gaussians), after) == []
+    # Whatever the caller's settings of sizes and derivatives are.
+    own = config.raster.replace(visible_capacity=4, absgrad=True)
+    same, found = without_unseen(state, frames, config.replace(raster=own), EXTENT)
+    assert (changed(same, after), found) == ([], count)
     again, none = without_unseen(after, frames, config, EXTENT)
     assert (changed(again, after), none) == ([], 0)
     # Cameras are where they have been corrected to.

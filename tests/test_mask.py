@@ -93,9 +93,10 @@ def test_no_pair_outside_of_what_is_wanted(name):
     assert (name == "nothing") == (not every_tile)
 
 
-def test_gradients_of_wanted_pixels_are_those_of_the_whole(report):
+@pytest.mark.parametrize("name", ["disc", "around"])
+def test_gradients_of_wanted_pixels_are_those_of_the_whole(name, report):
     scene, camera = scene_of("random")
-    mask = masks()["disc"]
+    mask = masks()[name]
     weight = np.random.default_rng(0).normal(size=mask.shape) * mask
 
     def gradient(skip):
@@ -118,6 +119,18 @@ def test_gradients_of_wanted_pixels_are_those_of_the_whole(report):
     assert float(jnp.abs(one[0].means).max()) > 0
     report("gradient with and without what is not wanted", worst, 1e-11)
     assert worst < 1e-11
+
+
+def test_too_little_room_is_told_and_regrown():
+    """Of a mask with a hole, whose pairs are counted but not blended."""
+    scene, camera = scene_of("huge")
+    mask = masks()["around"]
+    wanted = render(scene, camera, COMPAT, mask=mask)
+    cramped = COMPAT.replace(pair_capacity=int(wanted.demand.capacity) - 1)
+    assert bool(render(scene, camera, cramped, mask=mask).overflowed)
+    found = gsjax.render_exact(scene, camera, cramped, mask=mask)
+    assert not bool(found.overflowed)
+    np.testing.assert_array_equal(found.rgb[mask], wanted.rgb[mask])
 
 
 def test_a_mask_for_each_camera_of_a_batch():

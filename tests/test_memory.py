@@ -20,7 +20,7 @@ from gsjax.losses import photometric_spread
 from gsjax.memory import Estimate, require, size_text, system_available, unlimited
 from gsjax.raster.render import render_estimate
 from gsjax.raster.types import Demand
-from gsjax.train.config import Level, preset
+from gsjax.train.config import preset
 from gsjax.train.footprint import check_memory, first_slots, run_estimate
 
 GB = 10**9
@@ -206,7 +206,7 @@ def test_the_estimate_of_pictures_is_what_the_loss_reserves(devices, report):
 # Peaks of `gsjax train`, less what the imports had taken; two CPU devices, jax 0.10.2,
 # 21 photographs of 800 × 600 px: preset, changes, and MB.
 MEASURED = [
-    ("fast", {"levels": (Level(0.0, 2), Level(0.25, 1))}, 1270),
+    ("fast", {}, 1270),
     ("default", {"initial": "random", "max_size": 640}, 2288),
     ("quality", {"initial": "random", "strategy": "adaptive"}, 4376),
 ]

@@ -40,6 +40,16 @@ def band_changes(gaussians: Gaussians) -> np.ndarray:
     return np.stack(bands, 1) if bands else np.zeros((len(sh), 0))
 
 
+def highest_band(gaussians: Gaussians) -> int:
+    """Of the active Gaussians: the last that is not 0 throughout; 0 of none."""
+    sh = np.asarray(gaussians.params.sh)
+    active = np.asarray(gaussians.active)
+    for degree in range(gaussians.sh_degree, 0, -1):
+        if np.any(sh[:, degree**2 : (degree + 1) ** 2].any(axis=(1, 2)) & active):
+            return degree
+    return 0
+
+
 def degree_error(gaussians: Gaussians, degree: int) -> float:
     """Largest change of rgb if the bands above ``degree`` are left out.
 

@@ -94,8 +94,9 @@ def plan(
 
 
 def trimmed(gaussians: Gaussians, config: RasterConfig) -> tuple[Gaussians, list[str]]:
-    """The scene without what changes no picture of any camera beyond rounding: bands of
-    spherical harmonics that are 0, Gaussians that are nowhere above the α cut.
+    """The scene without what changes no render of any camera beyond rounding: bands of
+    spherical harmonics that are 0, Gaussians that are nowhere above the α cut. (Of a
+    movie of depths, the range of colours is that of the Gaussians that are left.)
 
     Args:
       gaussians: N slots, concrete.
@@ -105,10 +106,13 @@ def trimmed(gaussians: Gaussians, config: RasterConfig) -> tuple[Gaussians, list
       The scene, in as many slots as it has Gaussians; and what was left out, in words.
     """
     told = []
-    degree, slots = gaussians.sh_degree, gaussians.capacity
-    gaussians, reason = _without_bands(_drawn(gaussians), None)
-    if gaussians.sh_degree < degree:
-        told.append(f"{reason.what}: {reason.why}")
+    slots = gaussians.capacity
+    gaussians = _drawn(gaussians)
+    degree = bounds.highest_band(gaussians)
+    if degree < gaussians.sh_degree:
+        why = f"{degree} in place of {gaussians.sh_degree}: the bands above are 0"
+        told.append(f"SH degree: {why}")
+        gaussians = with_sh_degree(gaussians, degree)
     before = int(num_active(gaussians))
     gaussians, reason = shown(gaussians, config, slots)
     if int(num_active(gaussians)) < before:

@@ -51,7 +51,8 @@ def render(
       background: [C] or [B, C]; default black, as is a component that is not finite.
       mask: [H, W] bool, or [B, H, W] for a batch: the pixels that are wanted. Tiles
         without any are skipped; what other pixels come to is not defined, nor do
-        gradients by them mean anything. Counts are of what is wanted.
+        gradients by them mean anything. Not counted as pairs is what lies before the
+        first and after the last wanted tile of a row.
       features: [N, C] composited in place of the SH colour.
       probe: [N, 2], or [B, N, 2] for a batch, zeros: added to the projected means
         (px); its gradient is the screen-space statistic of densification.

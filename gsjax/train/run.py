@@ -227,7 +227,11 @@ def _trained(
             hooks=hooks,
         )
         if result.dropped:
-            note(f"{result.dropped:,} Gaussians that no photograph shows are dropped")
+            left = int(np.sum(result.gaussians.active))
+            note(
+                f"{result.dropped:,} Gaussians that no photograph shows are dropped; "
+                f"{left:,} are left"
+            )
         # Within, so that Ctrl-C does not cut it in two either.
         sitting.save(result.state, result.pair_capacity, result.progress)
         save_result(sitting, result.state)

@@ -43,7 +43,9 @@ def without_unseen(
     Returns:
       The state, its slots free where there was one, and how many those were.
     """
-    raster = config.raster.replace(outputs=("alpha",), rungs=1)
+    raster = config.raster.replace(
+        outputs=("alpha",), rungs=1, absgrad=False, visible_capacity=None
+    )
     seen = jnp.zeros(state.gaussians.capacity, bool)
     for view in range(frames.count):
         index = jnp.full(1, view, jnp.int32)
