@@ -81,7 +81,7 @@ def write_views(
 def prepared(
     subject: Subject, cameras: Sequence[Camera], kinds: Sequence[str]
 ) -> tuple[Gaussians, RasterConfig]:
-    """The scene and how to render it, and why: with a budget as `plan` says, else
+    """The scene and how to render it: with a budget as `plan` says, and why; else
     without what changes nothing (`trimmed`).
 
     Raises:
@@ -89,10 +89,7 @@ def prepared(
     """
     gaussians, config = subject.load(), subject.config.replace(outputs=tuple(kinds))
     if subject.budget is None:
-        gaussians, left_out = trimmed(gaussians, config)
-        for line in left_out:
-            note(line)
-        return gaussians, config
+        return trimmed(gaussians, config), config
     made = plan(
         gaussians,
         cameras,

@@ -15,7 +15,7 @@ import numpy as np
 
 from gsjax.cameras import Camera
 from gsjax.errors import InputError
-from gsjax.gaussians import Gaussians, num_active, select, with_sh_degree
+from gsjax.gaussians import Gaussians, select, with_sh_degree
 from gsjax.planning import bounds
 from gsjax.planning.accuracy import ROUNDING, within_budget
 from gsjax.planning.sizes import shown, tuned, with_capacities
@@ -93,7 +93,7 @@ def plan(
     return Plan(gaussians, config, tuple(reasons), budget, measured)
 
 
-def trimmed(gaussians: Gaussians, config: RasterConfig) -> tuple[Gaussians, list[str]]:
+def trimmed(gaussians: Gaussians, config: RasterConfig) -> Gaussians:
     """The scene without what changes no render of any camera beyond rounding: bands of
     spherical harmonics that are 0, Gaussians that are nowhere above the α cut. (Of a
     movie of depths, the range of colours is that of the Gaussians that are left.)
@@ -103,21 +103,12 @@ def trimmed(gaussians: Gaussians, config: RasterConfig) -> tuple[Gaussians, list
       config: whose α cut it is.
 
     Returns:
-      The scene, in as many slots as it has Gaussians; and what was left out, in words.
+      In as many slots as there are Gaussians left.
     """
-    told = []
     slots = gaussians.capacity
     gaussians = _drawn(gaussians)
-    degree = bounds.highest_band(gaussians)
-    if degree < gaussians.sh_degree:
-        why = f"{degree} in place of {gaussians.sh_degree}: the bands above are 0"
-        told.append(f"SH degree: {why}")
-        gaussians = with_sh_degree(gaussians, degree)
-    before = int(num_active(gaussians))
-    gaussians, reason = shown(gaussians, config, slots)
-    if int(num_active(gaussians)) < before:
-        told.append(f"{reason.what}: {reason.why}")
-    return gaussians, told
+    gaussians = with_sh_degree(gaussians, bounds.highest_band(gaussians))
+    return shown(gaussians, config, slots)[0]
 
 
 def _sampled(cameras: Camera | Sequence[Camera]) -> list[Camera]:
