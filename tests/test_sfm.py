@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import struct
 import zlib
 from pathlib import Path
@@ -31,6 +32,7 @@ from corner_room import (
 )
 
 from gsjax import InputError, cli
+from gsjax.scene import sfm_colmap
 from gsjax.scene.colmap import load_colmap
 from gsjax.scene.photos import load_photo
 from gsjax.scene.sfm import SfmSettings, run_sfm
@@ -117,11 +119,16 @@ def test_report(solved, room):
     assert phases <= report["seconds"].keys()
 
 
-def test_same_again_to_the_bit_and_silently(solved, room, tmp_path, capfd):
+def test_same_again_to_the_bit_and_silently(solved, room, tmp_path, capfd, monkeypatch):
+    """Also where progress is looked for all the time."""
+    monkeypatch.setattr(sfm_colmap, "_WAIT", 0.001)
     seen = []
     report = run_sfm(room, tmp_path / "again", tell=seen.append)
     assert report.problem is None
     assert seen[0] == f"reading {COUNT} photos"
+    pairs = COUNT * (COUNT - 1) // 2
+    found = [re.fullmatch(rf"matching pairs (\d+)/{pairs}", line) for line in seen]
+    assert 0 < max(int(match[1]) for match in found if match) <= pairs
     assert capfd.readouterr() == ("", "")
     for file in sorted((solved / "sparse" / "0").iterdir()):
         again = tmp_path / "again" / "sparse" / "0" / file.name

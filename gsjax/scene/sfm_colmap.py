@@ -5,7 +5,8 @@ so that progress can be told and Ctrl-C is heard.
 """
 
 import re
-import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
@@ -24,6 +25,12 @@ _AGAIN, _AGAIN_EACH = 60, 5  # pairs matched again: in all, and of each image
 # one in 4000 lies within the 12 px that count as agreeing.
 _LAST_INLIERS = 15
 _WAIT = 5.0  # seconds between lines of progress
+_COUNT_ROWS = """
+import sqlite3, sys
+uri, table = sys.argv[1:]
+read = sqlite3.connect(uri + "?mode=ro", uri=True)
+print(read.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+"""
 
 Tell = Callable[[str], None]
 
@@ -320,11 +327,18 @@ def best_pair(database: Path) -> tuple[int, int]:
 
 
 def _rows(database: Path, table: str) -> int:
-    """How far a step is that fills a table."""
+    """How far a step is that fills a table.
+
+    Looked at from another process. COLMAP brings an SQLite of its own, and two of them
+    in one process undo each other's locks as soon as either closes the file (so does
+    whoever opens and closes it): COLMAP then reads what is half written, or dies of
+    SIGBUS.
+    """
+    call = [sys.executable, "-I", "-S", "-c", _COUNT_ROWS, database.as_uri(), table]
     try:
-        with closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True)) as read:
-            return read.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
-    except sqlite3.Error:
+        counted = subprocess.run(call, capture_output=True, timeout=10, check=True)
+        return int(counted.stdout)
+    except (OSError, ValueError, subprocess.SubprocessError):
         return 0
 
 
