@@ -1,5 +1,7 @@
 """Movies are read back: so many frames, about those pictures, at that speed."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -49,6 +51,13 @@ def test_animations(tmp_path, suffix, unit, width, height):
     assert abs(sum(durations) - 250) <= unit / 2
     assert max(durations) - min(durations) <= unit
     assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_a_name_with_a_colon(tmp_path, monkeypatch):
+    """Which FFmpeg takes for an address, where the path is relative."""
+    monkeypatch.chdir(tmp_path)
+    assert write_movie(Path("2026-11-24T10:30/a.webm"), pictures(4)) == 4
+    assert len(video_of(tmp_path / "2026-11-24T10:30" / "a.webm")[0]) == 4
 
 
 def test_a_gif_is_not_faster_than_browsers_show(tmp_path):

@@ -64,6 +64,21 @@ def test_alpha_is_kept(tmp_path):
     np.testing.assert_array_equal(photo.alpha, NOISE[..., 1])
 
 
+def test_a_tiff_that_is_transparent_in_part_is_refused(tmp_path):
+    """OpenCV reads its colours with black mixed in; all or nothing does no harm."""
+    image = pytest.importorskip("PIL.Image", reason="Pillow is absent")
+    alpha = np.where(NOISE[..., 1] > 99, 255, 0)
+    rgba = np.dstack([NOISE, alpha]).astype(np.uint8)
+    image.fromarray(rgba, "RGBA").save(tmp_path / "a.tiff")
+    photo = load_photo(view_of(tmp_path / "a.tiff"))
+    np.testing.assert_array_equal(photo.alpha, alpha)
+    np.testing.assert_array_equal(photo.pixels[alpha > 0], NOISE[alpha > 0])
+    rgba[3, 5, 3] = 128
+    image.fromarray(rgba, "RGBA").save(tmp_path / "a.tiff")
+    with pytest.raises(InputError, match=r"a\.tiff: a TIFF .* transparent in part"):
+        load_photo(view_of(tmp_path / "a.tiff"))
+
+
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])
 @pytest.mark.parametrize("one", [1, 257])
 def test_alpha_that_is_opaque_is_none(tmp_path, suffix, one):

@@ -404,12 +404,27 @@ def test_video_to_dataset(video, tmp_path):
     assert len(load_colmap(out).views) == 6
 
 
+def test_a_video_with_a_colon_in_its_name(video, tmp_path, monkeypatch):
+    """Which FFmpeg takes for an address, where the path is relative."""
+    monkeypatch.chdir(tmp_path)
+    os.link(video, "10:30.avi")
+    assert len(list(sharpest_frames(Path("10:30.avi"), 6))) == 6
+
+
 def test_a_video_that_ends_early_is_told(video, monkeypatch):
     monkeypatch.setattr("gsjax.scene.video._count", lambda _: 60)
     with pytest.warns(UserWarning, match="breaks off after 30 of 60 frames"):
         assert len(list(sharpest_frames(video, 6))) == 3
     monkeypatch.setattr("gsjax.scene.video._count", lambda _: 31)
     assert len(list(sharpest_frames(video, 31))) == 30
+
+
+def test_photos_follow_one_another_as_people_count(tmp_path):
+    """Neighbours by name are matched: frame 9 stands beside frame 10."""
+    names = [f"frame{i}.jpg" for i in range(8, 13)]
+    for name in sorted(names):
+        (tmp_path / name).write_bytes(b"")
+    assert [path.name for path in find_photos(tmp_path)] == names
 
 
 def test_names_are_utf_8(tmp_path):

@@ -21,10 +21,12 @@ from corner_room import (
     make_room,
 )
 
-from gsjax import cli, images
+from gsjax import InputError, cli, images
+from gsjax.scene import sfm_colmap
 from gsjax.scene.colmap import load_colmap
-from gsjax.scene.sfm import run_sfm
+from gsjax.scene.sfm import SfmSettings, run_sfm
 from gsjax.scene.sfm_colmap import _watched
+from gsjax.scene.sfm_output import staging
 
 pytest.importorskip("pycolmap", reason="pycolmap is absent")
 
@@ -262,6 +264,44 @@ def test_ctrl_c_cancels_colmap(request):
         _watched(work, lambda: "", told.append)
     assert told[-1].startswith("stopping")
     assert cancelled.wait(1)
+
+
+def test_progress_that_cannot_be_told_cancels_colmap(monkeypatch):
+    monkeypatch.setattr(sfm_colmap, "_WAIT", 0.01)
+    ended = threading.Event()
+
+    def work(token):
+        while not token.is_cancelled:
+            time.sleep(0.01)
+        ended.set()
+
+    def tell(_):
+        raise BrokenPipeError
+
+    with pytest.raises(BrokenPipeError):
+        _watched(work, lambda: "a line", tell)
+    assert ended.is_set()
+
+
+def test_masks_that_lie_in_the_dataset_are_not_replaced(solved, room):
+    drawn = solved / "masks"
+    drawn.mkdir()
+    (drawn / "drawn.png").write_bytes(b"by hand")
+    settings = SfmSettings(masks=drawn)
+    with pytest.raises(InputError, match="lies where the dataset would be written"):
+        run_sfm(room, solved, settings, overwrite=True)
+    assert (drawn / "drawn.png").read_bytes() == b"by hand"
+    shutil.rmtree(drawn)
+
+
+def test_a_dataset_is_made_on_the_disk_that_it_is_for(tmp_path):
+    """A file can be moved to its place there; ``-o`` may be another disk's folder."""
+    there, new = tmp_path / "there", tmp_path / "new" / "dataset"
+    there.mkdir()
+    for output, base in ((there, there), (new, new.parent)):
+        with staging(output) as stage:
+            assert stage.parent == base
+        assert not list(base.iterdir())
 
 
 def test_importing_the_commands_is_light():

@@ -19,7 +19,7 @@ import numpy as np
 from gsjax.errors import InputError
 from gsjax.files import read_bytes
 from gsjax.images import opencv
-from gsjax.scene.image_header import check_image
+from gsjax.scene.image_header import check_image, has_tiff_alpha
 
 # What libjpeg, libpng and, through OpenCV, libtiff say of pixels that are not as they
 # were; the rest of libpng's warnings are of colour profiles and the like.
@@ -41,8 +41,8 @@ def decode(path: Path, flags: int) -> np.ndarray:
       flags: of cv2.imdecode.
 
     Raises:
-      InputError: if it cannot be read, is no image, is truncated, or declares more
-        pixels than any camera makes.
+      InputError: if it cannot be read, is no image, is truncated, declares more
+        pixels than any camera makes, or is a TIFF of half-transparent pixels.
     """
     data = read_bytes(path, "a photograph")
     check_image(path, data)
@@ -56,6 +56,16 @@ def decode(path: Path, flags: int) -> np.ndarray:
             f"{path}: cannot be decoded: the image is truncated, damaged or of a kind "
             "that OpenCV does not read; convert it to PNG or JPEG"
         )
+    # OpenCV 5.0 multiplies colours of 8 bits that were not, leaves what was as it is,
+    # and does not say so.
+    if pixels.ndim == 3 and pixels.shape[2] == 4 and has_tiff_alpha(data):
+        alpha = pixels[..., 3]
+        most = np.iinfo(alpha.dtype).max if alpha.dtype.kind == "u" else 1
+        if ((alpha > 0) & (alpha < most)).any():
+            raise InputError(
+                f"{path}: a TIFF with pixels that are transparent in part, whose "
+                "colours cannot be told from black mixed into them; convert it to PNG"
+            )
     return pixels
 
 

@@ -22,8 +22,8 @@ _MAX_DEFLATE = 1032
 _MAX_TIFF = 1400
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _REMEDY = "copy or export it again"
-# Tags of TIFF: width, height, bits of a sample, compression.
-_TIFF_TAGS = (256, 257, 258, 259)
+# Tags of TIFF: width, height, bits of a sample, compression, what a fourth sample is.
+_TIFF_TAGS = (256, 257, 258, 259, 338)
 # Markers of JPEG without a length, and those that carry the size of the image.
 _JPEG_BARE = {0x01, *range(0xD0, 0xD9)}
 _JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
@@ -156,7 +156,14 @@ def _webp(data: Buffer) -> tuple[int, int]:
     return width & 0x3FFF, height & 0x3FFF
 
 
-def _tiff(data: Buffer) -> tuple[int, int]:
+def has_tiff_alpha(data: Buffer) -> bool:
+    """Whether an image, which `check_image` has seen, is a TIFF that says what its
+    fourth sample is: opacity, that colours were multiplied by (1) or not (2).
+    """
+    return _reader(data[:12]) is _tiff and _tiff_tags(data).get(338) in (1, 2)
+
+
+def _tiff_tags(data: Buffer) -> dict[int, int]:
     order = "<" if data[:2] == b"II" else ">"
     (at,) = struct.unpack_from(f"{order}I", data, 4)
     (count,) = struct.unpack_from(f"{order}H", data, at)
@@ -169,6 +176,11 @@ def _tiff(data: Buffer) -> tuple[int, int]:
             if values * struct.calcsize(form) > 4:  # of several the first, elsewhere
                 (at,) = struct.unpack_from(f"{order}I", data, at)
             (found[tag],) = struct.unpack_from(order + form, data, at)
+    return found
+
+
+def _tiff(data: Buffer) -> tuple[int, int]:
+    found = _tiff_tags(data)
     if not {256, 257} <= set(found):
         raise _Truncated("no image size")
     width, height = found[256], found[257]

@@ -145,7 +145,7 @@ def run_sfm(
     tell = (lambda _: None) if tell is None else tell
     colmap()
     _check(source, settings)
-    refuse_output(output, source, overwrite)
+    refuse_output(output, (source, settings.masks), overwrite)
     seconds: dict[str, float] = {}
     with staging(output) as stage, quiet_and_seeded(settings.seed):
         work = Workshop(stage)

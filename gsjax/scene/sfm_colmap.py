@@ -343,7 +343,8 @@ def _rows(database: Path, table: str) -> int:
 
 
 def _watched(work: Callable[[Any], Any], look: Callable[[], str], tell: Tell) -> Any:
-    """What ``work(token)`` returns, run in a thread and cancelled by Ctrl-C."""
+    """What ``work(token)`` returns, run in a thread and cancelled by Ctrl-C, or where
+    progress cannot be told."""
     token = colmap().CancellationToken()
     with ThreadPoolExecutor(1) as pool:
         running = pool.submit(work, token)
@@ -353,7 +354,8 @@ def _watched(work: Callable[[Any], Any], look: Callable[[], str], tell: Tell) ->
                     return running.result(timeout=_WAIT)
                 except TimeoutError:
                     tell(look())
-        except KeyboardInterrupt:
+        except BaseException as error:
             token.cancel()
-            tell("stopping when the images that are begun are done")
+            if isinstance(error, KeyboardInterrupt):
+                tell("stopping when the images that are begun are done")
             raise

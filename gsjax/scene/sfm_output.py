@@ -6,7 +6,7 @@ pixel) from the working files, so that nothing is resampled or compressed twice.
 
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -116,21 +116,24 @@ def _move_points(image: Any, camera: Any, lens: _Lens) -> None:
         point.xy = xy
 
 
-def refuse_output(output: Path, source: Path, overwrite: bool) -> None:
+def refuse_output(
+    output: Path, sources: Iterable[Path | None], overwrite: bool
+) -> None:
     """Check the folder of the dataset before the work that fills it.
 
     Raises:
       InputError: if it is a file, or has entries that would be replaced unasked, or
-        that no dataset of ours put there; or if it would replace the source.
+        that no dataset of ours put there; or if it would replace one of the sources.
     """
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: is a file; a folder is to be written there")
-    within = source.resolve()
-    if any(within.is_relative_to((output / e).resolve()) for e in ENTRIES):
-        raise InputError(
-            f"{source}: lies where the dataset would be written; pass another folder "
-            "with -o"
-        )
+    for source in filter(None, sources):
+        within = source.resolve()
+        if any(within.is_relative_to((output / e).resolve()) for e in ENTRIES):
+            raise InputError(
+                f"{source}: lies where the dataset would be written; pass another "
+                "folder with -o"
+            )
     found = [output / entry for entry in ENTRIES if (output / entry).exists()]
     if found and not overwrite:
         raise InputError(
@@ -145,9 +148,12 @@ def refuse_output(output: Path, source: Path, overwrite: bool) -> None:
 
 @contextmanager
 def staging(output: Path) -> Iterator[Path]:
-    """A folder beside ``output``, gone at the end whatever happens."""
-    make_folder(output.parent)
-    folder = output.parent / f".gsjax-{secrets.token_hex(6)}.tmp"
+    """A folder from which all can be moved to ``output``, gone at the end whatever
+    happens: within it, as it may be a disk of its own; beside it, if it is not there.
+    """
+    base = output if output.is_dir() else output.parent
+    make_folder(base)
+    folder = base / f".gsjax-{secrets.token_hex(6)}.tmp"
     make_folder(folder)
     try:
         yield folder

@@ -15,7 +15,7 @@ from gsjax.errors import InputError
 from gsjax.files import opened, write_file
 from gsjax.images import encode_png, opencv
 from gsjax.scene.decode import decode, libraries_heard, telling_of_damage
-from gsjax.scene.image_files import check_name, find_mask
+from gsjax.scene.image_files import check_name, find_mask, natural_order
 from gsjax.scene.sfm_colmap import Shot, exif_camera
 
 READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
@@ -69,12 +69,13 @@ class Workshop(NamedTuple):
 
 
 def find_photos(folder: Path) -> list[Path]:
-    """The photographs in a folder (not in folders within), sorted by name.
+    """The photographs in a folder (not in folders within), by name: 2 before 10.
 
     Raises:
       InputError: if there are fewer than two, or any that cannot be read.
     """
-    files = sorted(p for p in folder.iterdir() if p.is_file() and p.name[0] != ".")
+    files = [p for p in folder.iterdir() if p.is_file() and p.name[0] != "."]
+    files.sort(key=lambda path: natural_order(path.name))
     unread = [p for p in files if p.suffix.lower() in _UNREAD]
     if unread:
         raise InputError(

@@ -1,5 +1,6 @@
 """Frames of a video: of each stretch of time the sharpest."""
 
+import os
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -107,8 +108,8 @@ def _opened(path: Path):
     if path.suffix.lower() in READ:
         raise InputError(f"{path}: is a single image; a folder or a video is wanted")
     cv2 = opencv()
-    with libraries_heard():
-        capture = cv2.VideoCapture(str(path))
+    with libraries_heard():  # FFmpeg takes a relative "10:30.mp4" for an address
+        capture = cv2.VideoCapture(os.path.abspath(path))
     if not capture.isOpened():
         raise InputError(
             f"{path}: is neither a folder of photos nor a video that OpenCV reads"
