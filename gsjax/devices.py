@@ -23,6 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from gsjax.machine import usable_cores
+
 # Programs are a few hundred kB each; a folder of more than this loses its oldest.
 _MAX_KEPT_BYTES = 500_000_000
 
@@ -33,6 +35,8 @@ _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
 def use_all_cores(count: int | None = None, *, queued: bool = True) -> int:
     """Let JAX show ``count`` CPU devices (default: the cores this process may use).
 
+    Those are the cores that it may run on, but no more than the CPU time that its
+    control groups give it, as in a container: more devices than that only wait.
     Call it before the first computation: ``import gsjax; gsjax.use_all_cores()``. On
     a GPU or TPU it changes nothing that matters. `RasterConfig.devices` then
     defaults to all of them; images do not depend on it. It also calls `keep_memory`.
@@ -54,8 +58,7 @@ def use_all_cores(count: int | None = None, *, queued: bool = True) -> int:
       RuntimeError: if JAX has started already with another number of devices.
     """
     if count is None:
-        available = getattr(os, "sched_getaffinity", None)
-        count = len(available(0)) if available else (os.cpu_count() or 1)
+        count = usable_cores()
     keep_memory()
     threads = 2 * count if queued and count > 1 else None
     with _threads(threads):
