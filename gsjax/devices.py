@@ -24,6 +24,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from gsjax.machine import usable_cores
+from gsjax.programs import drop_oldest, drop_torn
 
 # Programs are a few hundred kB each; a folder of more than this loses its oldest.
 _MAX_KEPT_BYTES = 500_000_000
@@ -140,7 +141,8 @@ def keep_programs() -> Path | None:
     """Let JAX keep compiled programs on disk, so that the next process starts at once.
 
     In a folder of the user's cache (`XDG_CACHE_HOME`, else ``~/.cache``), one for each
-    kind of processor: programs are compiled for it. Nothing is changed where JAX has
+    kind of processor: programs are compiled for it. What a kill or a full disk left
+    there unfinished is removed. Nothing is changed where JAX has
     a folder already (`JAX_COMPILATION_CACHE_DIR`), or is told to keep nothing
     (`JAX_ENABLE_COMPILATION_CACHE=false`), or none can be made.
 
@@ -154,7 +156,8 @@ def keep_programs() -> Path | None:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(home) / "gsjax" / f"programs-{_processor()}"
         folder.mkdir(parents=True, exist_ok=True)
-        _drop_oldest(folder, _MAX_KEPT_BYTES)
+        drop_torn(folder)
+        drop_oldest(folder, _MAX_KEPT_BYTES)
     except (OSError, RuntimeError):  # RuntimeError: there is no home
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder))
@@ -169,14 +172,3 @@ def _processor() -> str:
         lines = info.read_text(errors="replace").splitlines()
         told += sorted({x for x in lines if x.startswith(("model name", "flags"))})
     return hashlib.sha256("\n".join(told).encode()).hexdigest()[:12]
-
-
-def _drop_oldest(folder: Path, most: int) -> None:
-    """Remove the files longest not written until ``most`` bytes are left."""
-    files = [(path, path.stat()) for path in folder.iterdir() if path.is_file()]
-    total = sum(stat.st_size for _, stat in files)
-    for path, stat in sorted(files, key=lambda file: file[1].st_mtime):
-        if total <= most:
-            return
-        path.unlink(missing_ok=True)
-        total -= stat.st_size

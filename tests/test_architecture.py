@@ -19,7 +19,7 @@ PACKAGE = Path(gsjax.__file__).parent
 FLOORS = {
     0: (
         *("errors", "files", "numerics", "rotations", "sh"),
-        *("devices", "machine", "memory"),
+        *("devices", "programs", "machine", "memory"),
     ),
     1: ("gaussians", "cameras", "distortion"),
     2: ("raster", "densify", "losses", "metrics", "optim"),
