@@ -55,14 +55,16 @@ def decibels(value: float | None) -> str:
 def stopping_on_ctrl_c() -> Iterator[Callable[[], bool]]:
     """Within, Ctrl-C only sets a flag, so that what goes on is never cut in two.
 
-    A second one raises `KeyboardInterrupt` as usual. Off the main thread, where
-    signals cannot be caught, nothing changes.
+    A second one raises `KeyboardInterrupt` as usual. Nothing changes off the main
+    thread, where signals cannot be caught; where Ctrl-C is ignored, as by what a script
+    starts in the background; and where something other than Python handles it.
     """
     asked = False
-    if threading.current_thread() is not threading.main_thread():
+    previous = signal.getsignal(signal.SIGINT)
+    mine = threading.current_thread() is threading.main_thread()
+    if not mine or previous in (signal.SIG_IGN, None):
         yield lambda: False
         return
-    previous = signal.getsignal(signal.SIGINT)
 
     def handle(*_):
         nonlocal asked

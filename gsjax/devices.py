@@ -23,6 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from gsjax.machine import usable_cores
+from gsjax.programs import drop_oldest, drop_torn
+
 # Programs are a few hundred kB each; a folder of more than this loses its oldest.
 _MAX_KEPT_BYTES = 500_000_000
 
@@ -33,6 +36,8 @@ _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
 def use_all_cores(count: int | None = None, *, queued: bool = True) -> int:
     """Let JAX show ``count`` CPU devices (default: the cores this process may use).
 
+    Those are the cores that it may run on, but no more than the CPU time that its
+    control groups give it, as in a container: more devices than that only wait.
     Call it before the first computation: ``import gsjax; gsjax.use_all_cores()``. On
     a GPU or TPU it changes nothing that matters. `RasterConfig.devices` then
     defaults to all of them; images do not depend on it. It also calls `keep_memory`.
@@ -54,8 +59,7 @@ def use_all_cores(count: int | None = None, *, queued: bool = True) -> int:
       RuntimeError: if JAX has started already with another number of devices.
     """
     if count is None:
-        available = getattr(os, "sched_getaffinity", None)
-        count = len(available(0)) if available else (os.cpu_count() or 1)
+        count = usable_cores()
     keep_memory()
     threads = 2 * count if queued and count > 1 else None
     with _threads(threads):
@@ -137,7 +141,8 @@ def keep_programs() -> Path | None:
     """Let JAX keep compiled programs on disk, so that the next process starts at once.
 
     In a folder of the user's cache (`XDG_CACHE_HOME`, else ``~/.cache``), one for each
-    kind of processor: programs are compiled for it. Nothing is changed where JAX has
+    kind of processor: programs are compiled for it. What a kill or a full disk left
+    there unfinished is removed. Nothing is changed where JAX has
     a folder already (`JAX_COMPILATION_CACHE_DIR`), or is told to keep nothing
     (`JAX_ENABLE_COMPILATION_CACHE=false`), or none can be made.
 
@@ -151,7 +156,8 @@ def keep_programs() -> Path | None:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(home) / "gsjax" / f"programs-{_processor()}"
         folder.mkdir(parents=True, exist_ok=True)
-        _drop_oldest(folder, _MAX_KEPT_BYTES)
+        drop_torn(folder)
+        drop_oldest(folder, _MAX_KEPT_BYTES)
     except (OSError, RuntimeError):  # RuntimeError: there is no home
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder))
@@ -166,14 +172,3 @@ def _processor() -> str:
         lines = info.read_text(errors="replace").splitlines()
         told += sorted({x for x in lines if x.startswith(("model name", "flags"))})
     return hashlib.sha256("\n".join(told).encode()).hexdigest()[:12]
-
-
-def _drop_oldest(folder: Path, most: int) -> None:
-    """Remove the files longest not written until ``most`` bytes are left."""
-    files = [(path, path.stat()) for path in folder.iterdir() if path.is_file()]
-    total = sum(stat.st_size for _, stat in files)
-    for path, stat in sorted(files, key=lambda file: file[1].st_mtime):
-        if total <= most:
-            return
-        path.unlink(missing_ok=True)
-        total -= stat.st_size

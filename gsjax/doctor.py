@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.machine import usable_cores
 from gsjax.raster.reference import reference_render
 from gsjax.raster.render import DEFAULT_CONFIG, render_exact
 from gsjax.scene.synthetic import torus_knot_scene
@@ -70,9 +71,8 @@ def _package(package: str, module: str, use: str) -> tuple[str, bool]:
 
 
 def _cores() -> str:
-    usable = getattr(os, "sched_getaffinity", None)
-    total = os.cpu_count() or 1
-    return f"{len(usable(0)) if usable else total} usable of {total}"
+    usable = usable_cores()
+    return f"{usable} usable of {os.cpu_count() or usable}"
 
 
 def _memory() -> str:

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gsjax.errors import CapacityError
+from gsjax.machine import ROOT, control_groups, text_of
 
 # Less than that is not worth asking the system for.
 _SMALL = 2**28
-_ROOT = Path("/")
 _unlimited = False
 
 
@@ -96,7 +96,7 @@ def available() -> int | None:
     return None if free is None else free + _kept()
 
 
-def system_available(root: Path = _ROOT) -> int | None:
+def system_available(root: Path = ROOT) -> int | None:
     """Bytes that Linux, and the control groups of this process, can still give.
 
     Args:
@@ -107,7 +107,7 @@ def system_available(root: Path = _ROOT) -> int | None:
 
 
 def _of_meminfo(path: Path) -> Iterator[int]:
-    for line in _text(path).splitlines():
+    for line in text_of(path).splitlines():
         words = line.split()
         if words[:1] == ["MemAvailable:"] and words[1].isdigit():
             yield int(words[1]) * 1024
@@ -115,43 +115,28 @@ def _of_meminfo(path: Path) -> Iterator[int]:
 
 def _of_groups(root: Path) -> Iterator[int]:
     """What is left in each control group of the process, of either version."""
-    for line in _text(root / "proc/self/cgroup").splitlines():
-        _, kinds, path = line.split(":", 2)
-        if kinds == "":
-            files = ("memory.max", "memory.current", "inactive_file")
-            top = root / "sys/fs/cgroup"
-        elif "memory" in kinds.split(","):
-            files = (
+    for version, folder in control_groups("memory", root):
+        if version == 2:
+            names = ("memory.max", "memory.current", "inactive_file")
+        else:
+            names = (
                 "memory.limit_in_bytes",
                 "memory.usage_in_bytes",
                 "total_inactive_file",
             )
-            top = root / "sys/fs/cgroup/memory"
-        else:
-            continue
-        # A limit above binds as well. In a container the path may be that outside.
-        parts = [part for part in path.split("/") if part and part != ".."]
-        for depth in range(len(parts) + 1):
-            yield from _of_group(top.joinpath(*parts[:depth]), *files)
+        yield from _of_group(folder, *names)
 
 
 def _of_group(folder: Path, limit: str, used: str, cache: str) -> Iterator[int]:
-    numbers = [_text(folder / name).strip() for name in (limit, used)]
+    numbers = [text_of(folder / name).strip() for name in (limit, used)]
     if not all(number.isdigit() for number in numbers):  # "max", or not there
         return
     most, taken = map(int, numbers)
-    for line in _text(folder / "memory.stat").splitlines():
+    for line in text_of(folder / "memory.stat").splitlines():
         name, _, value = line.partition(" ")
         if name == cache and value.isdigit():
             taken -= int(value)  # files read long ago, dropped when room is needed
     yield most - max(taken, 0)
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text()
-    except (OSError, UnicodeDecodeError):
-        return ""
 
 
 class _Mallinfo2(ctypes.Structure):

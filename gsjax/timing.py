@@ -1,6 +1,5 @@
 """How long something takes, and on what machine."""
 
-import os
 import platform
 import time
 from collections.abc import Callable, Mapping
@@ -10,6 +9,8 @@ from typing import Any
 
 import jax
 import numpy as np
+
+from gsjax.machine import usable_cores
 
 
 def time_ms(function: Callable[[], Any], repeats: int = 9) -> list[float]:
@@ -55,7 +56,7 @@ def machine() -> dict[str, str]:
         pass
     return {
         "date": date.today().isoformat(),
-        "cpu": f"{cpu}, {os.cpu_count()} cores",
+        "cpu": f"{cpu}, {usable_cores()} cores",
         "devices": f"{jax.local_device_count()} × {jax.devices()[0].device_kind}",
         "jax": jax.__version__,
         "python": platform.python_version(),

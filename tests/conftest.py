@@ -251,6 +251,13 @@ def oracle_data(name: str):
     return dict(np.load(path, allow_pickle=False))
 
 
+def write_files(root: Path, texts: dict[str, str]) -> None:
+    """Texts by their paths below ``root``."""
+    for path, text in texts.items():
+        (root / path).parent.mkdir(parents=True, exist_ok=True)
+        (root / path).write_text(text)
+
+
 def cast(tree, dtype):
     """The same pytree with its floats as ``dtype``; gsjax follows its inputs."""
 

@@ -17,7 +17,10 @@ from gsjax import RasterConfig
 
 PACKAGE = Path(gsjax.__file__).parent
 FLOORS = {
-    0: ("errors", "files", "numerics", "rotations", "sh", "devices", "memory"),
+    0: (
+        *("errors", "files", "numerics", "rotations", "sh"),
+        *("devices", "programs", "machine", "memory"),
+    ),
     1: ("gaussians", "cameras", "distortion"),
     2: ("raster", "densify", "losses", "metrics", "optim"),
     3: ("io", "scene", "images", "movies", "sheets", "curves"),

@@ -47,17 +47,6 @@ def test_nowhere_to_keep_them(tmp_path, monkeypatch):
     assert jax.config.jax_compilation_cache_dir is None
 
 
-def test_the_oldest_go_first(tmp_path):
-    for age, name in enumerate(("new", "middle", "old")):
-        path = tmp_path / name
-        path.write_bytes(bytes(100))
-        os.utime(path, (1e9 - age, 1e9 - age))
-    devices._drop_oldest(tmp_path, 250)
-    assert {path.name for path in Path(tmp_path).iterdir()} == {"new", "middle"}
-    devices._drop_oldest(tmp_path, 0)
-    assert not list(tmp_path.iterdir())
-
-
 def test_memory_is_kept():
     """In a process of its own: calls that take no new page, of which else is none."""
     code = """

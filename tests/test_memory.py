@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from captures import scene_of_views
-from conftest import LIGHT, camera_of, frustum_points, gaussians_at
+from conftest import LIGHT, camera_of, frustum_points, gaussians_at, write_files
 
 import gsjax
 import gsjax.raster.render as render_module
@@ -26,23 +26,17 @@ from gsjax.train.footprint import check_memory, first_slots, run_estimate
 GB = 10**9
 
 
-def write(root, **files):
-    for path, text in files.items():
-        (root / path).parent.mkdir(parents=True, exist_ok=True)
-        (root / path).write_text(text)
-
-
 def test_the_least_of_all_limits_counts(tmp_path):
     root = tmp_path
     assert system_available(root) is None
-    write(root, **{"proc/meminfo": "MemTotal: 99 kB\nMemAvailable:  4000 kB\n"})
+    write_files(root, {"proc/meminfo": "MemTotal: 99 kB\nMemAvailable:  4000 kB\n"})
     assert system_available(root) == 4_096_000
     # Version 2: the limit of a group above binds as well; read files do not count.
-    write(root, **{"proc/self/cgroup": "0::/a/b\n"})
+    write_files(root, {"proc/self/cgroup": "0::/a/b\n"})
     groups = root / "sys/fs/cgroup"
-    write(
+    write_files(
         groups,
-        **{
+        {
             "a/memory.max": "3000000\n",
             "a/memory.current": "1500000\n",
             "a/memory.stat": "anon 5\ninactive_file 500000\n",
@@ -52,17 +46,17 @@ def test_the_least_of_all_limits_counts(tmp_path):
     )
     assert system_available(root) == 2_000_000
     # Version 1, beside it, and in a container, whose path is that outside.
-    write(root, **{"proc/self/cgroup": "4:cpu:/\n3:hugetlb,memory:/x\n0::/\n"})
-    write(
+    write_files(root, {"proc/self/cgroup": "4:cpu:/\n3:hugetlb,memory:/x\n0::/\n"})
+    write_files(
         groups / "memory",
-        **{
+        {
             "memory.limit_in_bytes": "1000000",
             "memory.usage_in_bytes": "950000",
             "memory.stat": "total_inactive_file 20000\n",
         },
     )
     assert system_available(root) == 70_000
-    write(groups / "memory", **{"memory.usage_in_bytes": "2000000"})
+    write_files(groups / "memory", {"memory.usage_in_bytes": "2000000"})
     assert system_available(root) == 0
 
 

@@ -7,11 +7,12 @@ import socket
 import threading
 import time
 
+import chex
 import jax
 import numpy as np
 import pytest
 import training
-from conftest import LIGHT, frustum_points, gaussians_at
+from conftest import LIGHT, frustum_points, gaussians_at, needs_two_devices
 from viewing import COUNT, scene, wait_for
 
 import gsjax
@@ -23,6 +24,7 @@ from gsjax.train.config import TrainConfig
 from gsjax.train.fit import Progress, initial_state
 from gsjax.train.step import Metrics
 from gsjax.viewer.exact import ExactRenderer, camera_of, picture
+from gsjax.viewer.live import copy_on_one_device
 from gsjax.viewer.splats import (
     LEAST_OPACITY,
     Cut,
@@ -403,6 +405,31 @@ def test_who_connects_and_goes_costs_no_line(monkeypatch, caplog):
     wait_for(lambda: told)
     stop_server(server)
     assert caplog.records == []
+
+
+@needs_two_devices
+def test_the_copy_that_is_shown_is_of_one_device_and_outlives_the_step():
+    """The step leaves its state on all devices, and takes its memory over."""
+    mesh = jax.sharding.Mesh(np.array(jax.local_devices()), ("devices",))
+    everywhere = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
+    step = jax.jit(
+        lambda state: jax.tree.map(
+            lambda a: a ^ True if a.dtype == bool else -a, state
+        ),
+        out_shardings=everywhere,
+        donate_argnums=0,
+    )
+    state = step(jax.device_put(scene(), everywhere))
+    kept, copy = jax.tree.map(np.array, state), copy_on_one_device(state)
+    after = step(state)
+    assert len(after.params.means.devices()) > 1
+    assert state.params.means.is_deleted()
+    chex.assert_trees_all_equal(copy, kept)
+    first = {jax.local_devices()[0]}
+    assert all(array.devices() == first for array in jax.tree.leaves(copy))
+    camera = camera_of((1, 0, 0, 0), (0, 0, 0), 0.7, 32, 24)
+    view = gsjax.render_exact(copy, camera, gsjax.RasterConfig(**LIGHT))
+    assert view.rgb.devices() == first
 
 
 def test_a_training_is_shown_by_copies_of_its_own():

@@ -4,7 +4,6 @@ OpenCV decodes and is loaded when first needed. EXIF orientation is ignored, as
 COLMAP ignores it: the camera is that of the pixels as they are stored.
 """
 
-import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +15,7 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.images import opencv
+from gsjax.machine import usable_cores
 from gsjax.scene.decode import decode, telling_of_damage
 from gsjax.scene.types import Lens, Photo, View
 from gsjax.scene.undistort import undistortion_maps
@@ -95,7 +95,7 @@ def load_photos(
     Raises:
       InputError: on the first photograph that `load_photo` refuses.
     """
-    workers = min(32, os.cpu_count() or 1)
+    workers = min(32, usable_cores())
     photos: list[Photo] = []
     with ThreadPoolExecutor(workers) as pool:
         for start in range(0, len(views), _BATCH * workers):

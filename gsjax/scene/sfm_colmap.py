@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from gsjax import images
 from gsjax.errors import MissingExtraError
+from gsjax.machine import usable_cores
 
 MAX_FEATURES = 8192
 _FATAL = 3  # of glog's levels
@@ -115,6 +116,7 @@ def extract(
     _set_focal_lengths(database, shots)
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
+    options.num_threads = usable_cores()  # COLMAP knows nothing of containers
     options.sift.max_num_features = MAX_FEATURES
     if masks is not None:
         reader.mask_path = masks
@@ -178,6 +180,7 @@ def _matching(seed: int, guided: bool = False) -> dict[str, Any]:
     pycolmap = colmap()
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
+    options.num_threads = usable_cores()
     options.guided_matching = guided
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed

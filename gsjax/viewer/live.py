@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from gsjax.console import note
+from gsjax.gaussians import Gaussians
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.config import TrainConfig
 from gsjax.train.fit import Progress
@@ -50,8 +51,7 @@ class LiveViewer:
             window = self.window
             if window is not None and not last and not self.wants(window, now):
                 return
-            # The step takes the memory over: what is shown is a copy.
-            gaussians = jax.tree.map(jnp.copy, state.gaussians)
+            gaussians = copy_on_one_device(state.gaussians)
             jax.block_until_ready(gaussians)
             if window is None:
                 exhibit = exhibit_of_training(gaussians, scene, photos, config)
@@ -84,3 +84,13 @@ class LiveViewer:
         """Stop serving."""
         if self.window is not None:
             self.window.close()
+
+
+def copy_on_one_device(gaussians: Gaussians) -> Gaussians:
+    """A copy on the first device, whose memory the next step does not take over.
+
+    The step leaves its state on all devices, and all would render it. `jax.device_put`
+    (jax 0.10.2) copies nothing to a device that has it already.
+    """
+    there = jax.device_put(gaussians, jax.local_devices()[0])
+    return jax.tree.map(jnp.copy, there)

@@ -98,7 +98,8 @@ def exhibit_of_training(
     """What a training begins with.
 
     Its exact pictures are rendered by one device: the step runs on all of them at the
-    same time, and two programs that wait for one another's devices would for ever.
+    same time, and two programs that wait for one another's devices would for ever. So
+    ``gaussians``, and what is shown in their place, must be on one.
     """
     raster: RasterConfig = config.raster.replace(devices=1)
     renderer = ExactRenderer(raster, background_of(config))

@@ -1,0 +1,60 @@
+"""Ctrl-C while something goes on that is not to be cut in two."""
+
+import signal
+import threading
+
+import pytest
+
+from gsjax.console import stopping_on_ctrl_c
+
+
+@pytest.fixture(autouse=True)
+def _as_it_was():
+    before = signal.getsignal(signal.SIGINT)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_once_asks_and_twice_stops(capsys):
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with stopping_on_ctrl_c() as stopped:
+        assert not stopped()
+        signal.raise_signal(signal.SIGINT)
+        assert stopped()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert "stopping after this step" in capsys.readouterr().err
+
+
+def test_what_ignores_it_goes_on(capsys):
+    """As a shell script starts what it puts in the background."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with stopping_on_ctrl_c() as stopped:
+        for _ in range(2):
+            signal.raise_signal(signal.SIGINT)
+        assert not stopped()
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    assert not capsys.readouterr().err
+
+
+def test_a_handler_that_python_does_not_know_stays(monkeypatch):
+    before = signal.getsignal(signal.SIGINT)
+    with monkeypatch.context() as patched:
+        patched.setattr(signal, "getsignal", lambda _: None)
+        with stopping_on_ctrl_c() as stopped:
+            assert not stopped()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_off_the_main_thread_nothing_changes():
+    before, found = signal.getsignal(signal.SIGINT), []
+
+    def work():
+        with stopping_on_ctrl_c() as stopped:
+            found.append((stopped(), signal.getsignal(signal.SIGINT)))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert found == [(False, before)]
