@@ -60,7 +60,7 @@ def decode(path: Path, flags: int) -> np.ndarray:
     # and does not say so.
     if pixels.ndim == 3 and pixels.shape[2] == 4 and has_tiff_alpha(data):
         alpha = pixels[..., 3]
-        most = np.iinfo(alpha.dtype).max if alpha.dtype.kind == "u" else 1
+        most = 65535 if alpha.dtype == np.uint16 else 255
         if ((alpha > 0) & (alpha < most)).any():
             raise InputError(
                 f"{path}: a TIFF with pixels that are transparent in part, whose "
