@@ -213,8 +213,9 @@ def _trained(
 ) -> RunResult:
     config, files, scene = sitting.config, sitting.files, sitting.scene
     start = sitting.start
-    for path in (files.metrics, files.held_out):
-        keep_steps(path, start.step)
+    keep_steps(files.metrics, start.step)
+    # The end is measured anew, also of a run that had come to it.
+    keep_steps(files.held_out, min(start.step, config.steps - 1))
     with hooks_of(sitting) as hooks:
         if watch is not None:
             hooks.state = watch(scene, photos, config)

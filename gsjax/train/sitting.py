@@ -126,8 +126,9 @@ def hooks_of(sitting: Sitting) -> Iterator[Hooks]:
             )
     finally:
         reporter.close()
-        with suppress(InputError):  # told of by whatever is to be saved next
-            sitting.metrics.write()
+        for journal in (sitting.metrics, sitting.measured):
+            with suppress(InputError):  # told of by whatever is to be saved next
+                journal.write()
 
 
 def save_result(sitting: Sitting, state: TrainState) -> None:
