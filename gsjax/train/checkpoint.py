@@ -81,7 +81,10 @@ def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Pa
     text["capacity"], text["arrays"] = state.gaussians.capacity, sorted(arrays)
     encoded = np.frombuffer(json.dumps(text).encode(), np.uint8)
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{_META: encoded}, **arrays)
+    if any(array.dtype.hasobject for array in arrays.values()):
+        # NumPy below 2.2 cannot be told to refuse them itself.
+        raise TypeError("a state is of numbers alone; objects are in this one")
+    np.savez(buffer, **{_META: encoded, **arrays})  # pyright: ignore
     path = folder / f"step_{step:09d}.npz"
     # Given up at once where writing fails: a view that lives on with the error keeps
     # the buffer from being freed.
