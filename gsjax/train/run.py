@@ -12,7 +12,8 @@ import numpy as np
 from gsjax.console import note
 from gsjax.errors import DivergedError, InputError
 from gsjax.evaluation import Summary
-from gsjax.files import make_folder
+from gsjax.files import make_folder, writing
+from gsjax.raster.render import device_count
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.checkpoint import latest_step, load_latest, restore
@@ -97,7 +98,7 @@ def start_run(
     """
     files = run_files(folder)
     names = dict.fromkeys((*files, *run_files(folder, "train")))
-    ours = [path for path in names if path.exists()]
+    ours = [path for path in names if path.exists() or path.is_symlink()]
     if ours and not overwrite:
         raise InputError(
             f"{ours[0]}: exists; pass --resume to go on, --overwrite to start again, "
@@ -110,11 +111,21 @@ def start_run(
     sitting = Sitting(settings.config, data, files, Start())
     photos = _photographs(sitting)
     state = initial_state(sitting.scene, settings.config)
-    for path in ours:
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    # What says that it is a run goes last: where something stays, it still is one.
+    for path in sorted(ours, key=lambda path: path == files.config):
+        _remove(path)
     make_folder(folder)
     save_settings(folder, settings)
     return _train(sitting, photos, state, watch)
+
+
+def _remove(path: Path) -> None:
+    """A file, a folder with all that is in it, or a link, but not what it leads to."""
+    with writing(path, "removed"):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 def _begun(config: TrainConfig, data: Data) -> TrainConfig:
