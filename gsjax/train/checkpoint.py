@@ -65,7 +65,8 @@ def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Pa
     Args:
       folder: created if missing.
       state: of the run.
-      meta: JSON values to keep with it: ``pair_capacity``, and ``seconds`` of training.
+      meta: JSON values to keep with it: ``pair_capacity``, ``seconds`` of training, and
+        the number of ``devices``, which may be missing.
 
     Raises:
       InputError: if it cannot be written; the checkpoints that were there still are.
@@ -153,8 +154,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
         "pair_capacity": lambda value: type(value) is int and 0 <= value < 2**30,
         "seconds": lambda value: type(value) in (int, float) and 0 <= value < math.inf,
         "arrays": lambda value: value == sorted(arrays),
+        "devices": lambda value: type(value) is int and value >= 1,
     }
     meta = meta if isinstance(meta, dict) else {}
+    if "devices" not in meta:  # an old one
+        del wanted["devices"]
     for key, good in wanted.items():
         if not good(meta.get(key)):
             found = repr(meta.get(key, "missing"))[:80]

@@ -166,8 +166,8 @@ def fit(
 ) -> FitResult:
     """Train.
 
-    The same arguments give the same bits on a CPU, also when a run is taken up again
-    from the state and pair capacity that a checkpoint kept.
+    The same arguments give the same bits on a CPU with as many devices, also when a run
+    is taken up again from the state and pair capacity that a checkpoint kept.
 
     Args:
       scene: its views are trained on, all of them.

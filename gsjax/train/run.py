@@ -139,7 +139,8 @@ def _begun(config: TrainConfig, data: Data) -> TrainConfig:
 def resume_run(
     folder: Path, *, dataset: Path | None = None, watch: Watch | None = None
 ) -> RunResult:
-    """Go on where a run stopped, bit for bit as if it had not; see `start_run`.
+    """Go on where a run stopped, with as many devices bit for bit as if it had not; see
+    `start_run`.
 
     Args:
       folder: of the run.
@@ -161,6 +162,7 @@ def resume_run(
         start = _last_checkpoint(files, settings.config, subset(data.scene, data.train))
         if start.step < settings.config.steps:
             note(f"going on from step {start.step:,}")
+            _tell_other_devices(start.devices, settings.config)
         else:
             note(
                 f"finished before, with step {start.step:,}: nothing is left to train; "
@@ -181,7 +183,18 @@ def _last_checkpoint(files: RunFiles, config: TrainConfig, scene: Scene) -> Star
         int(found.meta["pair_capacity"]),
         found.step,
         float(found.meta["seconds"]),
+        found.meta.get("devices"),
     )
+
+
+def _tell_other_devices(before: int | None, config: TrainConfig) -> None:
+    """Sums are made device by device, and round by how many there are."""
+    now = device_count(config.raster)
+    if before not in (None, now):
+        note(
+            f"with {now} {'device' if now == 1 else 'devices'} (cores), and {before} "
+            "before: the same training to rounding, not the same bits"
+        )
 
 
 def _photographs(sitting: Sitting) -> list[Photo]:
