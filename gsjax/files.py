@@ -14,6 +14,7 @@ from typing import Any, BinaryIO
 from gsjax.errors import InputError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
+_TEMPORARY = ".gsjax-{}.tmp"
 # Of JSON: a camera is an object and five lists in 90 bytes or more; 3 bytes, "[],",
 # take 70 in memory, so that what is full of them is refused before it is parsed.
 _MANY, _LEAST_BYTES = 10_000, 10
@@ -120,7 +121,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
     Raises:
       InputError: as `writing`.
     """
-    temporary = path.parent / f".gsjax-{secrets.token_hex(6)}.tmp"
+    temporary = path.parent / _TEMPORARY.format(secrets.token_hex(6))
     try:
         with writing(path):
             with temporary.open("xb") as file:
@@ -132,6 +133,20 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
     finally:
         with suppress(OSError):  # it is told already
             temporary.unlink()
+
+
+def remove_leftovers(folder: Path, than: Path) -> None:
+    """Remove what `replacing` was filling in ``folder`` when its process was killed.
+
+    Only what is older ``than`` a file that was just written: what is newer may be that
+    of another process. What cannot be removed stays.
+    """
+    with suppress(OSError):
+        written = than.stat().st_mtime_ns
+        for path in folder.glob(_TEMPORARY.format("*")):
+            with suppress(OSError):
+                if path.lstat().st_mtime_ns < written:
+                    path.unlink()
 
 
 def write_file(path: Path, data: bytes | memoryview, *, durable: bool = False) -> None:

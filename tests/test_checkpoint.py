@@ -72,6 +72,25 @@ def test_the_same_bits_come_back(tmp_path, strategy, tuned, x64):
     assert state.gaussians.params.means.dtype == (np.float64 if x64 else np.float32)
 
 
+def test_of_how_many_devices_need_not_be_said(tmp_path):
+    found = load_checkpoint(save_checkpoint(tmp_path, state_at(), META))
+    assert "devices" not in found.meta
+    told = {**META, "devices": 3}
+    found = load_checkpoint(save_checkpoint(tmp_path, state_at(), told))
+    assert found.meta["devices"] == 3
+    told["devices"] = 0
+    with pytest.raises(InputError, match="devices 0"):
+        load_checkpoint(save_checkpoint(tmp_path, state_at(), told))
+
+
+def test_objects_are_not_saved(tmp_path):
+    state = state_at()
+    wrong = replace(state, stats=np.asarray([{}], object))
+    with pytest.raises(TypeError, match="numbers alone"):
+        save_checkpoint(tmp_path, wrong, META)
+    assert names(tmp_path) == []
+
+
 def names(folder):
     return sorted(path.name for path in folder.iterdir())
 

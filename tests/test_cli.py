@@ -496,7 +496,7 @@ def test_help_has_no_default_that_nobody_types(capsys):
         assert not re.search(r"None|False|\(default: ?\)", told), command
         if command == "train":
             assert "--steps INT How many" in told
-            assert "same bits on a CPU. (default: 0)" in told
+            assert "same bits on a CPU, with as many cores. (default: 0)" in told
 
 
 def test_help_and_version(capsys):

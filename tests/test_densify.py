@@ -371,6 +371,27 @@ def test_statistics_are_of_the_views_that_show_it():
     assert all((leaf == 0).all() for leaf in fresh)
 
 
+def test_statistics_are_in_units_of_each_image():
+    """Of images that differ as of each alone; of equal ones as of one size."""
+    gaussians, _ = scene_with()
+    strategy, rng = adaptive(SETTINGS, EXTENT), np.random.default_rng(1)
+    start = strategy.init(gaussians)
+    gradient, radii = rng.normal(size=(2, SLOTS, 2)), rng.normal(size=(2, SLOTS))
+    sizes = np.asarray([[40, 30], [30, 40]])
+    both = Observation(gradient, radii, *sizes.T)
+    alone = start
+    for index, (width, height) in enumerate(sizes.tolist()):
+        own = slice(index, index + 1)
+        seen = Observation(gradient[own], radii[own], width, height)
+        alone = strategy.observe(alone, seen)
+    for found, wanted in zip(strategy.observe(start, both), alone):
+        np.testing.assert_allclose(found, wanted, rtol=1e-12)
+    equal = both._replace(width=np.full(2, 40), height=np.full(2, 30))
+    one = strategy.observe(start, both._replace(width=40, height=30))
+    for found, wanted in zip(strategy.observe(start, equal), one):
+        np.testing.assert_array_equal(found, wanted)
+
+
 def test_copies_are_exact():
     gaussians, _ = scene_with()
     born = jax.tree.map(lambda a: a + 1, gaussians.params)

@@ -1,6 +1,7 @@
 """The folder of a run: replaced only where it is one, and true to its dataset."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -101,6 +102,105 @@ def test_a_start_that_fails_leaves_nothing(tmp_path, monkeypatch):
         start_run(RunSettings(bad, CONFIG.replace(initial="points")), run)
     assert not run.exists()
     assert not loaded
+
+
+def test_links_are_replaced_and_what_they_lead_to_stays(made, tmp_path):
+    """Also of what is gone by now."""
+    run, there = made / "run", tmp_path / "there"
+    for name in ("checkpoints", "renders"):
+        (run / name).rename(there.with_name(name))
+        (run / name).symlink_to(there.with_name(name))
+    shutil.rmtree(tmp_path / "renders")
+    before = contents(tmp_path / "checkpoints")
+    other = RunSettings(made / "data", CONFIG.replace(seed=1))
+    assert start_run(other, run, overwrite=True).finished
+    for name in ("checkpoints", "renders"):
+        assert not (run / name).is_symlink()
+        assert any((run / name).iterdir())
+    assert contents(tmp_path / "checkpoints") == before
+
+
+def test_a_run_that_cannot_be_removed_still_is_one(made, monkeypatch):
+    def refused(_):
+        raise PermissionError(13, "Permission denied")
+
+    settings = load_settings(made / "run")
+    again = RunSettings(made / "data", CONFIG)
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", refused)
+        with pytest.raises(InputError, match="checkpoints: cannot be removed: Permis"):
+            start_run(again, made / "run", overwrite=True)
+    assert load_settings(made / "run") == settings
+    assert start_run(again, made / "run", overwrite=True).finished
+
+
+# --- killed, and gone on with ---
+
+
+@pytest.fixture(scope="module")
+def killed(whole, tmp_path_factory) -> Path:
+    """What a kill leaves in the third step: after it are a checkpoint and measurements,
+    which were due in the second. Never written to."""
+    folder = tmp_path_factory.mktemp("killed")
+    data, run = folder / "data", folder / "run"
+    shutil.copytree(whole / "data", data)
+
+    def watch(*_):
+        def look(_, progress):
+            if progress.metrics.step == 3:
+                shutil.copytree(run, folder / "killed")
+                raise RuntimeError("after a copy")
+
+        return look
+
+    config = CONFIG.replace(steps=4, every_eval=1, every_checkpoint=2)
+    with pytest.raises(RuntimeError, match="after a copy"):
+        start_run(RunSettings(data, config), run, watch=watch)
+    return folder
+
+
+def steps_of(path: Path) -> list[int]:
+    return [json.loads(line)["step"] for line in path.read_text().splitlines()]
+
+
+@pytest.mark.parametrize("name", ["killed", "run"])
+def test_each_step_due_is_measured_once(killed, tmp_path, name):
+    """After a kill and after an error, and where a run is finished twice."""
+    run = shutil.copytree(killed / name, tmp_path / "run")
+    assert steps_of(run / "held_out.jsonl") == [1, 2]
+    for _ in range(2):
+        assert resume_run(run).finished
+        for log in ("held_out.jsonl", "metrics.jsonl"):
+            assert steps_of(run / log) == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("now", [1, 2])
+def test_another_number_of_devices_is_told(killed, tmp_path, now, monkeypatch, capsys):
+    run = shutil.copytree(killed / "killed", tmp_path / "run")
+    monkeypatch.setattr(run_module, "device_count", lambda _: now)
+    assert resume_run(run).finished
+    told = [line for line in capsys.readouterr().err.splitlines() if "before" in line]
+    wanted = "gsjax: with 2 devices (cores), and 1 before: the same training to "
+    assert [line.startswith(wanted) for line in told] == [True] * (now - 1)
+
+
+@pytest.mark.parametrize("again", ["resumed", "replaced"])
+def test_what_a_kill_left_half_written_goes(made, again):
+    """But not what another process may be writing now."""
+    run = made / "run"
+    folders = (run, run / "checkpoints") if again == "resumed" else (run,)
+    for folder in folders:
+        for name, seconds in ((".gsjax-0f.tmp", 1), (".gsjax-1f.tmp", 2**32), ("a", 1)):
+            (folder / name).write_bytes(b"half")
+            os.utime(folder / name, (seconds, seconds))
+    if again == "resumed":
+        assert resume_run(run).finished
+    else:
+        start_run(RunSettings(made / "data", CONFIG), run, overwrite=True)
+    for folder in folders:
+        assert not (folder / ".gsjax-0f.tmp").exists()
+        assert (folder / ".gsjax-1f.tmp").exists()
+        assert (folder / "a").exists()
 
 
 # --- what it starts from ---

@@ -294,6 +294,42 @@ def test_padding_does_not_matter():
     assert first[1].loss > 0.01
 
 
+def test_a_padded_view_gives_the_statistic_of_the_view_alone():
+    """In units of its own size; what the padding alone would show is not seen."""
+    size = width, height = 24, 18  # what shows there is within the limits of both
+    config = TUNED.replace(
+        strategy="adaptive", adaptive=AdaptiveSettings(), raster=RASTER
+    )
+    views = scene().views[:2]
+    taken = [p._replace(pixels=255 - p.pixels) for p in photos()[:2]]
+    taken[1] = taken[1]._replace(pixels=taken[1].pixels[:height, :width])
+    params = exact_gaussians().params
+    params = params.replace(log_scales=params.log_scales - 1.5)
+    state = init_state(exact_gaussians().replace(params=params), config, EXTENT, VIEWS)
+    step = jax.jit(make_train_step(config, EXTENT))
+
+    def stats(batch):
+        after, metrics = step(state, batch)
+        assert metrics.finite
+        return after.stats
+
+    frames = make_frames(views, taken)
+    assert frames.size.tolist() == [[WIDTH, HEIGHT], [*size]]
+    second = jax.tree.map(lambda a: a[1:], frames)
+    index = jnp.ones(1, jnp.int32)
+    batch = Batch(second.pixels, second.valid, second.camera, index, second.size)
+    alone = make_frames(views[1:], taken[1:])
+    assert alone.size is None
+    wanted = stats(Batch(alone.pixels, alone.valid, alone.camera, index))
+    found, frame = stats(batch), stats(batch._replace(size=None))
+    assert (frame.views != wanted.views).any(), "some are in the padding alone"
+    np.testing.assert_array_equal(found.views, wanted.views)
+    np.testing.assert_allclose(found.radius, wanted.radius, rtol=1e-9)
+    np.testing.assert_allclose(found.gradient, wanted.gradient, rtol=1e-6, atol=1e-15)
+    assert (wanted.gradient > 1e-4).sum() > 15
+    assert (frame.gradient > 1.05 * wanted.gradient).sum() > 15
+
+
 def test_masked_tiles_are_skipped_and_nothing_else_changes(report):
     """All that was gathered in the moments: Adam's step itself makes much of little."""
     config = TUNED.replace(rates=Rates())

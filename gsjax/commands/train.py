@@ -62,7 +62,7 @@ class TrainCommand(HeavyCommand):
     keep_unseen: bool = False
     """Keep the Gaussians that, in the end, no photograph trained on shows."""
     seed: int = 0
-    """The same seed gives the same bits on a CPU."""
+    """The same seed gives the same bits on a CPU, with as many cores."""
     images: str | None = None
     """Folder of the photographs, if not as usual."""
     factor: int | None = None
@@ -83,7 +83,8 @@ class TrainCommand(HeavyCommand):
     viewer_port: int = 8080
     """Where; the next free port if it is taken."""
     resume: bool = False
-    """Go on where the run in RUN stopped, with the settings that it has."""
+    """Go on where the run in RUN stopped, with the settings that it has; to the same
+    bits, with as many cores."""
     overwrite: bool = False
     """Replace a run that exists."""
 

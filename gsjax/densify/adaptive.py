@@ -120,10 +120,13 @@ def adaptive(settings: AdaptiveSettings, extent: float) -> Densifier:
         return AdaptiveStats(zeros(), zeros(), zeros())
 
     def observe(stats: AdaptiveStats, seen: Observation) -> AdaptiveStats:
-        half = jnp.asarray([seen.width / 2, seen.height / 2], seen.gradient.dtype)
+        sides = [jnp.atleast_1d(side) for side in (seen.width, seen.height)]
+        size = jnp.stack(sides, -1)[:, None]  # [B, 1, 2]; of one if all are the same
+        half = (size / 2).astype(seen.gradient.dtype)
         norm = jnp.linalg.norm(seen.gradient * half, axis=-1)
         visible = seen.radii > 0
-        share = jnp.max(seen.radii, 0) / max(seen.width, seen.height)
+        longer = jnp.max(size, -1).astype(seen.radii.dtype)
+        share = jnp.max(seen.radii / longer, 0)
         seen_now = AdaptiveStats(
             gradient=stats.gradient + jnp.sum(jnp.where(visible, norm, 0), 0),
             views=stats.views + jnp.sum(visible, 0),

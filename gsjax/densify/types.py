@@ -26,13 +26,13 @@ class Observation(NamedTuple):
       gradient: [B, N, 2] of the loss by the projected mean, px; or, for strategies
         with ``absgrad``, the sum over pixels of its absolute values.
       radii: [B, N] px, 0 where the Gaussian is out of the view.
-      width, height: of the image, px.
+      width, height: of the image, px; [B] where the images differ.
     """
 
     gradient: Array
     radii: Array
-    width: int
-    height: int
+    width: int | Array
+    height: int | Array
 
 
 class SlotEdit(NamedTuple):

@@ -98,7 +98,7 @@ def row_spans(projected: Projected, grid: Grid, device: Array) -> Spans:
     return Spans(first=first, rows=rows)
 
 
-def radii(projected: Projected, width: int, height: int) -> Array:
+def radii(projected: Projected, width: int | Array, height: int | Array) -> Array:
     """Half the longer side [R] of the box around Q ≤ reach, in px; 0 where it holds no
     pixel of the image.
     """
@@ -108,7 +108,9 @@ def radii(projected: Projected, width: int, height: int) -> Array:
     return jnp.where(seen, radius, 0)
 
 
-def _boxes(projected: Projected, width: int, height: int) -> tuple[Array, ...]:
+def _boxes(
+    projected: Projected, width: int | Array, height: int | Array
+) -> tuple[Array, ...]:
     """First and last pixel across, then down, and whether there is any, [R] each."""
     extent_x = _extent(projected.reach / jnp.square(projected.inv_sx))
     extent_y = _extent(projected.reach * projected.var_y)
@@ -123,7 +125,9 @@ def _extent(squared: Array) -> Array:
     return safe_sqrt(squared) * (1 + 1e-4) + 1e-2
 
 
-def _pixel_range(centre: Array, extent: Array, size: int) -> tuple[Array, Array]:
+def _pixel_range(
+    centre: Array, extent: Array, size: int | Array
+) -> tuple[Array, Array]:
     """First and last pixel whose centre lies in centre ± extent, within the image.
 
     Clipped as floats: a cast of wild values would saturate and then wrap.

@@ -34,6 +34,7 @@ def render(
     background: Array | None = None,
     *,
     mask: Array | None = None,
+    size: Array | None = None,
     features: Array | None = None,
     probe: Array | None = None,
     abs_probe: Array | None = None,
@@ -53,6 +54,8 @@ def render(
         without any are skipped; what other pixels come to is not defined, nor do
         gradients by them mean anything. Not counted as pairs is what lies before the
         first and after the last wanted tile of a row.
+      size: [2], or [B, 2] for a batch: width and height, px, of a picture that fills
+        the upper left corner alone; ``radii`` are 0 for what is out of it.
       features: [N, C] composited in place of the SH colour.
       probe: [N, 2], or [B, N, 2] for a batch, zeros: added to the projected means
         (px); its gradient is the screen-space statistic of densification.
@@ -68,28 +71,28 @@ def render(
     """
     # Tracers cannot index what is NumPy's.
     gaussians = jax.tree.map(jnp.asarray, gaussians)
-    features, probe, abs_probe, mask = (
+    features, probe, abs_probe, mask, size = (
         None if value is None else jnp.asarray(value)
-        for value in (features, probe, abs_probe, mask)
+        for value in (features, probe, abs_probe, mask, size)
     )
     cameras = camera if camera.batched else jax.tree.map(lambda a: a[None], camera)
     count = cameras.viewmat.shape[0]
-    for name, size in (("cameras", count), ("slots", gaussians.capacity)):
-        if size < 1:
+    for name, there in (("cameras", count), ("slots", gaussians.capacity)):
+        if there < 1:
             raise InputError(f"there are no {name}: at least one is wanted")
     probe = _with_batch("probe", probe, gaussians, camera)
     abs_probe = _with_batch("abs_probe", abs_probe, gaussians, camera)
     if (abs_probe is not None) != config.absgrad:
         raise InputError("config.absgrad and abs_probe go together: pass both or none")
     _check_features(features, gaussians)
-    mask = _checked_mask(mask, camera)
+    mask, size = _checked_mask(mask, camera), _checked_size(size, camera)
 
     def render_one(inputs):
         return _render_one(gaussians, config, features, *inputs)
 
     # One after another: no more at a time than one camera takes (a gradient keeps what
     # it needs of each), and the program of one.
-    inputs = (cameras, probe, abs_probe, mask)
+    inputs = (cameras, probe, abs_probe, mask, size)
     if count == 1:
         out = render_one(jax.tree.map(lambda a: a[0], inputs))
         sums, radii, demands, overflowed = jax.tree.map(lambda a: a[None], out)
@@ -125,12 +128,16 @@ def _render_one(
     probe: Array | None,
     abs_probe: Array | None,
     mask: Array | None,
+    size: Array | None,
 ) -> tuple[dict[str, Array], Array, Demand, Array]:
     """One camera: images before the background, radii [N], demand, overflowed."""
     order, visible = depth_order(gaussians, camera, config)
     out = project(gaussians, camera, config, order, visible, features, probe, abs_probe)
     radii = jnp.zeros(gaussians.capacity, out.u.dtype)
-    seen = bins.radii(lax.stop_gradient(out), camera.width, camera.height)
+    width, height = camera.width, camera.height
+    if size is not None:
+        width, height = size.astype(out.u.dtype)
+    seen = bins.radii(lax.stop_gradient(out), width, height)
     sums, demand, overflowed = rasterise(out, camera.width, camera.height, config, mask)
     room = min(config.visible_capacity or gaussians.capacity, gaussians.capacity)
     return (
@@ -161,6 +168,16 @@ def _checked_mask(mask: Array | None, camera: Camera) -> Array | None:
             f"mask has shape {mask.shape} of {mask.dtype}; {wanted} of bool is wanted"
         )
     return mask if camera.batched else mask[None]
+
+
+def _checked_size(size: Array | None, camera: Camera) -> Array | None:
+    """``size`` as [B, 2], or None."""
+    if size is None:
+        return None
+    wanted = (*camera.viewmat.shape[:-2], 2)
+    if size.shape != wanted:
+        raise InputError(f"size has shape {size.shape}; {wanted} is wanted")
+    return size if camera.batched else size[None]
 
 
 def _check_features(features, gaussians: Gaussians) -> None:

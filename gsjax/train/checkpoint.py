@@ -65,7 +65,8 @@ def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Pa
     Args:
       folder: created if missing.
       state: of the run.
-      meta: JSON values to keep with it: ``pair_capacity``, and ``seconds`` of training.
+      meta: JSON values to keep with it: ``pair_capacity``, ``seconds`` of training, and
+        the number of ``devices``, which may be missing.
 
     Raises:
       InputError: if it cannot be written; the checkpoints that were there still are.
@@ -81,7 +82,10 @@ def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Pa
     text["capacity"], text["arrays"] = state.gaussians.capacity, sorted(arrays)
     encoded = np.frombuffer(json.dumps(text).encode(), np.uint8)
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{_META: encoded}, **arrays)
+    if any(array.dtype.hasobject for array in arrays.values()):
+        # NumPy below 2.2 cannot be told to refuse them itself.
+        raise TypeError("a state is of numbers alone; objects are in this one")
+    np.savez(buffer, **{_META: encoded, **arrays})  # pyright: ignore
     path = folder / f"step_{step:09d}.npz"
     # Given up at once where writing fails: a view that lives on with the error keeps
     # the buffer from being freed.
@@ -150,8 +154,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
         "pair_capacity": lambda value: type(value) is int and 0 <= value < 2**30,
         "seconds": lambda value: type(value) in (int, float) and 0 <= value < math.inf,
         "arrays": lambda value: value == sorted(arrays),
+        "devices": lambda value: type(value) is int and value >= 1,
     }
     meta = meta if isinstance(meta, dict) else {}
+    if "devices" not in meta:  # an old one
+        del wanted["devices"]
     for key, good in wanted.items():
         if not good(meta.get(key)):
             found = repr(meta.get(key, "missing"))[:80]

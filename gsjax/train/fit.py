@@ -66,8 +66,8 @@ class Hooks:
       phase: before something that takes a while, with what it is.
       checkpoint: every ``config.every_checkpoint`` steps, unless something is wrong
         just then: state, pair capacity, and the record of that step.
-      measure: every ``config.every_eval`` steps: state and record; the time that it
-        takes does not count.
+      measure: every ``config.every_eval`` steps, before the checkpoint where both are
+        due: state and record; the time that it takes does not count.
       stop: asked after each step; True ends the run there.
       state: after each step, with the state, whose memory the next step takes over:
         copy what is to last.
@@ -166,8 +166,8 @@ def fit(
 ) -> FitResult:
     """Train.
 
-    The same arguments give the same bits on a CPU, also when a run is taken up again
-    from the state and pair capacity that a checkpoint kept.
+    The same arguments give the same bits on a CPU with as many devices, also when a run
+    is taken up again from the state and pair capacity that a checkpoint kept.
 
     Args:
       scene: its views are trained on, all of them.
@@ -248,16 +248,17 @@ class _Run:
             hooks.step(progress)
             hooks.state(state, progress)
             state = with_slots(state, int(metrics.wanted), config)
-            # The last is saved by the caller, with what belongs to the end.
-            every = config.every_checkpoint
-            due = every and step % every == 0 and step < config.steps
-            if due and not health.bad:  # what is lost is not to push out what is not
-                hooks.checkpoint(state, pair_capacity, progress)
+            # The last is measured and saved by the caller, with what else ends a run.
             every = config.every_eval
             if every and step % every == 0 and step < config.steps:
                 begun = time.perf_counter()
                 hooks.measure(state, progress)
                 self.start += time.perf_counter() - begun
+            # After it: a run that goes on from there does not measure that step again.
+            every = config.every_checkpoint
+            due = every and step % every == 0 and step < config.steps
+            if due and not health.bad:  # what is lost is not to push out what is not
+                hooks.checkpoint(state, pair_capacity, progress)
             if hooks.stop():
                 break
         dropped = 0

@@ -24,7 +24,7 @@ _ORDER = 2**32 - 1
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=("pixels", "valid", "camera"),
+    data_fields=("pixels", "valid", "camera", "size"),
     meta_fields=(),
 )
 @dataclass(frozen=True)
@@ -35,11 +35,14 @@ class Frames:
       pixels: [V, H, W, 3 or 4] uint8; the fourth is the photograph's opacity.
       valid: [V, H, W] bool, False where there is nothing to learn from; or None.
       camera: batch of V.
+      size: [V, 2] int32, width and height of each photograph, which stands in the upper
+        left corner; None if all are as large as the frame.
     """
 
     pixels: Array
     valid: Array | None
     camera: Camera
+    size: Array | None = None
 
     @property
     def count(self) -> int:
@@ -55,12 +58,14 @@ class Batch(NamedTuple):
       valid: [B, H, W] bool or None.
       camera: batch of B.
       view: [B] int32, which of the V views these are.
+      size: [B, 2] int32 or None, see `Frames`.
     """
 
     pixels: Array
     valid: Array | None
     camera: Camera
     view: Array
+    size: Array | None = None
 
 
 def make_frames(
@@ -76,6 +81,7 @@ def make_frames(
     with_alpha = any(p.alpha is not None for p in small)
     pixels = np.zeros((len(small), height, width, 3 + with_alpha), np.uint8)
     valid = np.zeros(pixels.shape[:3], bool)
+    size = np.asarray([p.pixels.shape[1::-1] for p in small], np.int32)
     for index, photo in enumerate(small):
         h, w = photo.pixels.shape[:2]
         pixels[index, :h, :w, :3] = photo.pixels
@@ -90,7 +96,10 @@ def make_frames(
         near=jnp.asarray([view.near for view in views]),
     )
     return Frames(
-        jnp.asarray(pixels), None if valid.all() else jnp.asarray(valid), camera
+        jnp.asarray(pixels),
+        None if valid.all() else jnp.asarray(valid),
+        camera,
+        None if (size == (width, height)).all() else jnp.asarray(size),
     )
 
 
@@ -133,7 +142,5 @@ def draw(frames: Frames, key: Array, step: Array, batch: int) -> Batch:
         return order[number % count]
 
     index = jax.vmap(one)(number).astype(jnp.int32)
-    pixels, valid, camera = jax.tree.map(
-        lambda a: a[index], (frames.pixels, frames.valid, frames.camera)
-    )
-    return Batch(pixels, valid, camera, index)
+    drawn = jax.tree.map(lambda a: a[index], frames)
+    return Batch(drawn.pixels, drawn.valid, drawn.camera, index, drawn.size)

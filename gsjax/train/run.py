@@ -12,7 +12,8 @@ import numpy as np
 from gsjax.console import note
 from gsjax.errors import DivergedError, InputError
 from gsjax.evaluation import Summary
-from gsjax.files import make_folder
+from gsjax.files import make_folder, writing
+from gsjax.raster.render import device_count
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.checkpoint import latest_step, load_latest, restore
@@ -97,7 +98,7 @@ def start_run(
     """
     files = run_files(folder)
     names = dict.fromkeys((*files, *run_files(folder, "train")))
-    ours = [path for path in names if path.exists()]
+    ours = [path for path in names if path.exists() or path.is_symlink()]
     if ours and not overwrite:
         raise InputError(
             f"{ours[0]}: exists; pass --resume to go on, --overwrite to start again, "
@@ -110,11 +111,21 @@ def start_run(
     sitting = Sitting(settings.config, data, files, Start())
     photos = _photographs(sitting)
     state = initial_state(sitting.scene, settings.config)
-    for path in ours:
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    # What says that it is a run goes last: where something stays, it still is one.
+    for path in sorted(ours, key=lambda path: path == files.config):
+        _remove(path)
     make_folder(folder)
     save_settings(folder, settings)
     return _train(sitting, photos, state, watch)
+
+
+def _remove(path: Path) -> None:
+    """A file, a folder with all that is in it, or a link, but not what it leads to."""
+    with writing(path, "removed"):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 def _begun(config: TrainConfig, data: Data) -> TrainConfig:
@@ -128,7 +139,8 @@ def _begun(config: TrainConfig, data: Data) -> TrainConfig:
 def resume_run(
     folder: Path, *, dataset: Path | None = None, watch: Watch | None = None
 ) -> RunResult:
-    """Go on where a run stopped, bit for bit as if it had not; see `start_run`.
+    """Go on where a run stopped, with as many devices bit for bit as if it had not; see
+    `start_run`.
 
     Args:
       folder: of the run.
@@ -150,6 +162,7 @@ def resume_run(
         start = _last_checkpoint(files, settings.config, subset(data.scene, data.train))
         if start.step < settings.config.steps:
             note(f"going on from step {start.step:,}")
+            _tell_other_devices(start.devices, settings.config)
         else:
             note(
                 f"finished before, with step {start.step:,}: nothing is left to train; "
@@ -170,7 +183,18 @@ def _last_checkpoint(files: RunFiles, config: TrainConfig, scene: Scene) -> Star
         int(found.meta["pair_capacity"]),
         found.step,
         float(found.meta["seconds"]),
+        found.meta.get("devices"),
     )
+
+
+def _tell_other_devices(before: int | None, config: TrainConfig) -> None:
+    """Sums are made device by device, and round by how many there are."""
+    now = device_count(config.raster)
+    if before not in (None, now):
+        note(
+            f"with {now} {'device' if now == 1 else 'devices'} (cores), and {before} "
+            "before: the same training to rounding, not the same bits"
+        )
 
 
 def _photographs(sitting: Sitting) -> list[Photo]:
@@ -213,8 +237,9 @@ def _trained(
 ) -> RunResult:
     config, files, scene = sitting.config, sitting.files, sitting.scene
     start = sitting.start
-    for path in (files.metrics, files.held_out):
-        keep_steps(path, start.step)
+    keep_steps(files.metrics, start.step)
+    # The end is measured anew, also of a run that had come to it.
+    keep_steps(files.held_out, min(start.step, config.steps - 1))
     with hooks_of(sitting) as hooks:
         if watch is not None:
             hooks.state = watch(scene, photos, config)

@@ -9,6 +9,8 @@ import numpy as np
 from gsjax.console import decibels, note, stopping_on_ctrl_c
 from gsjax.errors import InputError
 from gsjax.evaluation import Summary, summarise
+from gsjax.files import remove_leftovers
+from gsjax.raster.render import device_count
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.checkpoint import latest_step, save_checkpoint
@@ -24,12 +26,14 @@ from gsjax.train.step import TrainState
 
 
 class Start(NamedTuple):
-    """Where a sitting takes the run up: the beginning, or its last checkpoint."""
+    """Where a sitting takes the run up: the beginning, or its last checkpoint, and with
+    how many devices that was written, if it says so."""
 
     state: TrainState | None = None
     pair_capacity: int | None = None
     step: int = 0
     seconds: float = 0.0
+    devices: int | None = None
 
 
 class Sitting:
@@ -52,12 +56,18 @@ class Sitting:
         self, state: TrainState, pair_capacity: int, progress: Progress | None
     ) -> None:
         """A checkpoint, and before it what was logged: a run that is taken up there
-        logs no step before it again.
+        logs no step before it again. After it, what a kill had left goes.
         """
         self.metrics.write()
         self.measured.write()
-        meta = {"pair_capacity": pair_capacity, "seconds": self.seconds(progress)}
-        save_checkpoint(self.files.checkpoints, state, meta)
+        meta = {
+            "pair_capacity": pair_capacity,
+            "seconds": self.seconds(progress),
+            "devices": device_count(self.config.raster),
+        }
+        path = save_checkpoint(self.files.checkpoints, state, meta)
+        for folder in (path.parent, self.files.config.parent):
+            remove_leftovers(folder, path)
 
     def cameras(self, state: TrainState) -> Scene:
         """All views, with their cameras as they are by now."""
@@ -126,8 +136,9 @@ def hooks_of(sitting: Sitting) -> Iterator[Hooks]:
             )
     finally:
         reporter.close()
-        with suppress(InputError):  # told of by whatever is to be saved next
-            sitting.metrics.write()
+        for journal in (sitting.metrics, sitting.measured):
+            with suppress(InputError):  # told of by whatever is to be saved next
+                journal.write()
 
 
 def save_result(sitting: Sitting, state: TrainState) -> None:

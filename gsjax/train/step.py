@@ -144,7 +144,8 @@ def make_train_step(
         camera = tuned_camera(batch.camera, tuning, batch.view, extent)
         name = "abs_probe" if densifier.absgrad else "probe"
         mask = batch.valid if config.skip_masked else None
-        view = render(gaussians, camera, raster, background, mask=mask, **{name: probe})
+        given = {"mask": mask, "size": batch.size, name: probe}
+        view = render(gaussians, camera, raster, background, **given)
         assert view.rgb is not None
         image = exposed(view.rgb, tuning, batch.view)
         target, weight = targets(batch, background, image.dtype)
@@ -176,13 +177,11 @@ def make_train_step(
             params, state.tuning, probe, state, batch, background
         )
         finite = jnp.isfinite(loss) & all_within(grads, _STEEPEST)
-        observation = Observation(
-            # The loss is a mean over the views of the step.
-            grads[2] * count,
-            radii,
-            batch.camera.width,
-            batch.camera.height,
-        )
+        width, height = batch.camera.width, batch.camera.height
+        if batch.size is not None:
+            width, height = batch.size.T
+        # The loss is a mean over the views of the step.
+        observation = Observation(grads[2] * count, radii, width, height)
 
         def keep():
             return state, jnp.int32(0), jnp.asarray(True)

@@ -21,9 +21,11 @@ Array = jax.Array
 
 
 @partial(jax.jit, static_argnames="raster")
-def _in_view(gaussians: Gaussians, camera: Camera, raster: RasterConfig) -> Array:
+def _in_view(
+    gaussians: Gaussians, camera: Camera, size: Array | None, raster: RasterConfig
+) -> Array:
     """[N] of a batch of cameras; colours and pairs are not in the program."""
-    return jnp.any(render(gaussians, camera, raster).radii > 0, 0)
+    return jnp.any(render(gaussians, camera, raster, size=size).radii > 0, 0)
 
 
 def without_unseen(
@@ -49,9 +51,10 @@ def without_unseen(
     seen = jnp.zeros(state.gaussians.capacity, bool)
     for view in range(frames.count):
         index = jnp.full(1, view, jnp.int32)
-        camera = jax.tree.map(lambda a, i=index: a[i], frames.camera)
+        shown = (frames.camera, frames.size)
+        camera, size = jax.tree.map(lambda a, i=index: a[i], shown)
         camera = tuned_camera(camera, state.tuning, index, extent)
-        seen |= _in_view(state.gaussians, camera, raster)
+        seen |= _in_view(state.gaussians, camera, size, raster)
     active = state.gaussians.active
     dropped = int(jnp.sum(active & ~seen))
     gaussians = state.gaussians.replace(active=active & seen)  # pyright: ignore
