@@ -18,6 +18,12 @@ from gsjax.numerics import safe_divide
 from gsjax.raster import bins
 from gsjax.raster.counts import total_count
 from gsjax.raster.footprint import render_estimate as render_estimate
+from gsjax.raster.inputs import (
+    check_features,
+    checked_mask,
+    checked_size,
+    with_batch,
+)
 from gsjax.raster.order import depth_order
 from gsjax.raster.project import COLOR_LIMIT, project
 from gsjax.raster.rasterise import device_count as device_count
@@ -80,12 +86,12 @@ def render(
     for name, there in (("cameras", count), ("slots", gaussians.capacity)):
         if there < 1:
             raise InputError(f"there are no {name}: at least one is wanted")
-    probe = _with_batch("probe", probe, gaussians, camera)
-    abs_probe = _with_batch("abs_probe", abs_probe, gaussians, camera)
+    probe = with_batch("probe", probe, gaussians, camera)
+    abs_probe = with_batch("abs_probe", abs_probe, gaussians, camera)
     if (abs_probe is not None) != config.absgrad:
         raise InputError("config.absgrad and abs_probe go together: pass both or none")
-    _check_features(features, gaussians)
-    mask, size = _checked_mask(mask, camera), _checked_size(size, camera)
+    check_features(features, gaussians)
+    mask, size = checked_mask(mask, camera), checked_size(size, camera)
 
     def render_one(inputs):
         return _render_one(gaussians, config, features, *inputs)
@@ -146,48 +152,6 @@ def _render_one(
         demand._replace(visible=visible),
         overflowed | (visible > room),
     )
-
-
-def _with_batch(name: str, probe, gaussians: Gaussians, camera: Camera):
-    """``probe`` as [B, N, 2], or None."""
-    if probe is None:
-        return None
-    wanted = (*camera.viewmat.shape[:-2], gaussians.capacity, 2)
-    if probe.shape != wanted:
-        raise InputError(f"{name} has shape {probe.shape}; {wanted} is wanted")
-    return probe if camera.batched else probe[None]
-
-
-def _checked_mask(mask: Array | None, camera: Camera) -> Array | None:
-    """``mask`` as [B, H, W], or None."""
-    if mask is None:
-        return None
-    wanted = (*camera.viewmat.shape[:-2], camera.height, camera.width)
-    if mask.shape != wanted or mask.dtype != bool:
-        raise InputError(
-            f"mask has shape {mask.shape} of {mask.dtype}; {wanted} of bool is wanted"
-        )
-    return mask if camera.batched else mask[None]
-
-
-def _checked_size(size: Array | None, camera: Camera) -> Array | None:
-    """``size`` as [B, 2], or None."""
-    if size is None:
-        return None
-    wanted = (*camera.viewmat.shape[:-2], 2)
-    if size.shape != wanted:
-        raise InputError(f"size has shape {size.shape}; {wanted} is wanted")
-    return size if camera.batched else size[None]
-
-
-def _check_features(features, gaussians: Gaussians) -> None:
-    if features is None:
-        return
-    shape = features.shape
-    if len(shape) != 2 or shape[0] != gaussians.capacity or shape[1] < 1:
-        raise InputError(
-            f"features has shape {shape}; ({gaussians.capacity}, C) is wanted, C ≥ 1"
-        )
 
 
 def _finish(
