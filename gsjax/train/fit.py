@@ -279,7 +279,8 @@ class _Run:
 
     def program(self, state: TrainState, frames: Frames, raster: RasterConfig):
         """The compiled step for these sizes."""
-        shapes = (frames.pixels.shape, state.gaussians.capacity, raster)
+        kind = (frames.pixels.shape, jax.tree.structure(frames))  # what it lacks, too
+        shapes = (kind, state.gaussians.capacity, raster)
         if shapes not in self.programs:
             height, width = frames.pixels.shape[1:3]
             slots, pairs = state.gaussians.capacity, raster.pair_capacity

@@ -134,6 +134,8 @@ def _unit(longest: np.ndarray) -> float:
 
 def _rotations(quats: np.ndarray) -> np.ndarray:
     """[M, 3, 3] float32."""
+    if not len(quats):  # of which scipy 1.14 makes an error
+        return np.zeros((0, 3, 3), np.float32)
     some = np.any(quats != 0, axis=1, keepdims=True)
     xyzw = np.roll(np.where(some, quats, (1.0, 0, 0, 0)), -1, axis=1)
     return Rotation.from_quat(xyzw).as_matrix().astype(np.float32)
