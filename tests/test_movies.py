@@ -20,7 +20,9 @@ def pictures(count=6, width=64, height=48):
 
 
 def animation_of(path):
-    done, found = cv2.imdecodeanimation(np.frombuffer(path.read_bytes(), np.uint8))
+    done, found = cv2.imdecodeanimation(
+        np.frombuffer(path.read_bytes(), np.uint8)[None]
+    )
     assert done
     return [frame[..., 2::-1] for frame in found.frames], list(found.durations)
 
