@@ -323,7 +323,7 @@ def _default() -> TrainConfig:
         max_size=800,
         levels=(Level(0.0, 4), Level(0.1, 2), Level(0.3, 1)),
         sh_degree=2,
-        # √(30 000 / 7000), as of `_fast`: what is held out is 0.1 to 0.4 dB better.
+        # √(30 000 / 7000), as of `_fast`: what is held out is 0.1 to 0.7 dB better.
         rates=Rates(cooling=0.1).times(2.0),
         adaptive=AdaptiveSettings(
             start=300, stop=4500, every=100, reset_every=0, max_gaussians=300_000
