@@ -121,7 +121,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
     Raises:
       InputError: as `writing`.
     """
-    temporary = path.parent / _TEMPORARY.format(secrets.token_hex(6))
+    temporary = temporary_in(path.parent)
     try:
         with writing(path):
             with temporary.open("xb") as file:
@@ -133,6 +133,11 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
     finally:
         with suppress(OSError):  # it is told already
             temporary.unlink()
+
+
+def temporary_in(folder: Path) -> Path:
+    """A hidden name that nothing has yet, for what is to be moved when it is done."""
+    return folder / _TEMPORARY.format(secrets.token_hex(6))
 
 
 def remove_leftovers(folder: Path, than: Path) -> None:

@@ -183,9 +183,7 @@ def _write_vp9(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
         if writer is not None:
             writer.release()
         # The encoder does not report a full disk; a file cut short has no duration.
-        written = cv2.VideoCapture(os.path.abspath(temporary)).get(
-            cv2.CAP_PROP_FRAME_COUNT
-        )
+        written = cv2.VideoCapture(str(temporary)).get(cv2.CAP_PROP_FRAME_COUNT)
         if abs(written - count) > 1:
             raise InputError(
                 f"{path}: {written:g} of {count} frames could be written; check the "
@@ -202,10 +200,9 @@ def _write_vp9(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
 
 def _vp9_writer(path: Path, frame: np.ndarray, fps: float):
     cv2 = images.opencv()
-    name = os.path.abspath(path)  # FFmpeg takes "10:30.webm" for an address
     size, code = (frame.shape[1], frame.shape[0]), cv2.VideoWriter.fourcc(*"VP90")
     with _muted_stderr():  # it complains of a code that WebM does without
-        writer = cv2.VideoWriter(name, cv2.CAP_FFMPEG, code, fps, size)
+        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, fps, size)
     if not writer.isOpened():
         raise InputError(
             f"{path.parent}: this OpenCV cannot write VP9 there; check permissions, or "
@@ -215,8 +212,11 @@ def _vp9_writer(path: Path, frame: np.ndarray, fps: float):
 
 
 def _temporary(path: Path) -> Path:
-    """A name beside ``path`` with its suffix, which tells OpenCV the container."""
-    return path.parent / f".gsjax-{secrets.token_hex(6)}{path.suffix.lower()}"
+    """A name beside ``path`` with its suffix, which tells OpenCV the container; from
+    the root, as FFmpeg takes a relative "10:30.webm" for an address.
+    """
+    name = f".gsjax-{secrets.token_hex(6)}{path.suffix.lower()}"
+    return path.absolute().with_name(name)
 
 
 @contextmanager

@@ -32,7 +32,7 @@ from corner_room import (
 )
 
 from gsjax import InputError, cli
-from gsjax.scene import sfm_colmap
+from gsjax.scene import sfm_engine
 from gsjax.scene.colmap import load_colmap
 from gsjax.scene.photos import load_photo
 from gsjax.scene.sfm import SfmSettings, run_sfm
@@ -121,7 +121,7 @@ def test_report(solved, room):
 
 def test_same_again_to_the_bit_and_silently(solved, room, tmp_path, capfd, monkeypatch):
     """Also where progress is looked for all the time."""
-    monkeypatch.setattr(sfm_colmap, "_WAIT", 0.001)
+    monkeypatch.setattr(sfm_engine, "_WAIT", 0.001)
     seen = []
     report = run_sfm(room, tmp_path / "again", tell=seen.append)
     assert report.problem is None

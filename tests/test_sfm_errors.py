@@ -22,10 +22,10 @@ from corner_room import (
 )
 
 from gsjax import InputError, cli, images
-from gsjax.scene import sfm_colmap
+from gsjax.scene import sfm_engine
 from gsjax.scene.colmap import load_colmap
 from gsjax.scene.sfm import SfmSettings, run_sfm
-from gsjax.scene.sfm_colmap import _watched
+from gsjax.scene.sfm_engine import watched
 from gsjax.scene.sfm_output import staging
 
 pytest.importorskip("pycolmap", reason="pycolmap is absent")
@@ -261,13 +261,13 @@ def test_ctrl_c_cancels_colmap(request):
     timer.start()
     told = []
     with pytest.raises(KeyboardInterrupt):
-        _watched(work, lambda: "", told.append)
+        watched(work, lambda: "", told.append)
     assert told[-1].startswith("stopping")
     assert cancelled.wait(1)
 
 
 def test_progress_that_cannot_be_told_cancels_colmap(monkeypatch):
-    monkeypatch.setattr(sfm_colmap, "_WAIT", 0.01)
+    monkeypatch.setattr(sfm_engine, "_WAIT", 0.01)
     ended = threading.Event()
 
     def work(token):
@@ -279,7 +279,7 @@ def test_progress_that_cannot_be_told_cancels_colmap(monkeypatch):
         raise BrokenPipeError
 
     with pytest.raises(BrokenPipeError):
-        _watched(work, lambda: "a line", tell)
+        watched(work, lambda: "a line", tell)
     assert ended.is_set()
 
 

@@ -15,16 +15,14 @@ from gsjax.errors import InputError, SfmError
 from gsjax.files import write_json
 from gsjax.scene.sfm_colmap import (
     Shot,
-    Tell,
     best_pair,
-    colmap,
     extract,
     match,
     match_again,
-    quiet_and_seeded,
     reconstruct,
     why_not,
 )
+from gsjax.scene.sfm_engine import Tell, colmap, quiet_and_seeded
 from gsjax.scene.sfm_output import install, refuse_output, staging, write_dataset
 from gsjax.scene.sfm_photos import (
     Photograph,

@@ -1,39 +1,24 @@
 """COLMAP's steps, through pycolmap: features, matching, mapping, and what they found.
 
-Everything that pycolmap does to a database is in this file. Its calls run in a thread,
-so that progress can be told and Ctrl-C is heard.
+Everything that pycolmap does to a database is in this file.
 """
 
 import re
-import subprocess
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gsjax import images
-from gsjax.errors import MissingExtraError
 from gsjax.machine import usable_cores
+from gsjax.scene.sfm_engine import Tell, colmap, rows_of, watched
 
 MAX_FEATURES = 8192
-_FATAL = 3  # of glog's levels
 _FEW_FEATURES = 100
 _SCANT = "too few to place it, or not consistent"
 _AGAIN, _AGAIN_EACH = 60, 5  # pairs matched again: in all, and of each image
 # To begin with COLMAP wants 30. Half of that still cannot be chance: of random matches
 # one in 4000 lies within the 12 px that count as agreeing.
 _LAST_INLIERS = 15
-_WAIT = 5.0  # seconds between lines of progress
-_COUNT_ROWS = """
-import sqlite3, sys
-uri, table = sys.argv[1:]
-read = sqlite3.connect(uri + "?mode=ro", uri=True)
-print(read.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
-"""
-
-Tell = Callable[[str], None]
 
 
 class Shot(NamedTuple):
@@ -52,36 +37,6 @@ class Shot(NamedTuple):
     height: int
     focal: float | None
     camera: str
-
-
-def colmap() -> Any:
-    """The module pycolmap.
-
-    Raises:
-      MissingExtraError: if it is absent or does not load.
-    """
-    # OpenCV first: loaded after pycolmap 4.2, OpenCV 5.0 aborts as it writes a PNG.
-    images.opencv()
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise MissingExtraError(
-            f"pycolmap, which finds the cameras, does not load ({error}); install "
-            "it: pip install pycolmap"
-        ) from error
-    return pycolmap
-
-
-@contextmanager
-def quiet_and_seeded(seed: int) -> Iterator[None]:
-    """Within, COLMAP logs nothing, and its random numbers start from ``seed``."""
-    log = colmap().logging
-    before, log.minloglevel = log.minloglevel, _FATAL
-    try:
-        colmap().set_random_seed(seed)
-        yield
-    finally:
-        log.minloglevel = before
 
 
 def exif_camera(path: Path) -> tuple[str, float | None]:
@@ -134,9 +89,9 @@ def extract(
         )
 
     def look():
-        return f"features {_rows(database, 'keypoints')}/{len(shots)}"
+        return f"features {rows_of(database, 'keypoints')}/{len(shots)}"
 
-    _watched(work, look, tell)
+    watched(work, look, tell)
 
 
 def _set_focal_lengths(database: Path, shots: Sequence[Shot]) -> None:
@@ -170,9 +125,9 @@ def match(database: Path, count: int, matcher: str, seed: int, tell: Tell) -> No
 
     def look():
         wanted = f"/{count * (count - 1) // 2}" if every else ""
-        return f"matching pairs {_rows(database, 'two_view_geometries')}{wanted}"
+        return f"matching pairs {rows_of(database, 'two_view_geometries')}{wanted}"
 
-    _watched(work, look, tell)
+    watched(work, look, tell)
 
 
 def _matching(seed: int, guided: bool = False) -> dict[str, Any]:
@@ -239,7 +194,7 @@ def reconstruct(
         )
 
     models.mkdir()
-    found = _watched(work, lambda: f"mapping: {placed} images placed", tell)
+    found = watched(work, lambda: f"mapping: {placed} images placed", tell)
     return sorted(
         found.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D())
     )
@@ -285,7 +240,7 @@ def match_again(database: Path, files: set[str], listing: Path, seed: int, tell:
             cancellation_token=token,
         )
 
-    _watched(work, lambda: f"matching pairs again: {len(pairs)}", tell)
+    watched(work, lambda: f"matching pairs again: {len(pairs)}", tell)
     return len(pairs)
 
 
@@ -327,38 +282,3 @@ def best_pair(database: Path) -> tuple[int, int]:
     with closing(colmap().Database.open(database)) as opened:
         counts = [count for count, _ in _verified(opened)]
     return max(counts, default=0), len(counts)
-
-
-def _rows(database: Path, table: str) -> int:
-    """How far a step is that fills a table.
-
-    Looked at from another process. COLMAP brings an SQLite of its own, and two of them
-    in one process undo each other's locks as soon as either closes the file (so does
-    whoever opens and closes it): COLMAP then reads what is half written, or dies of
-    SIGBUS.
-    """
-    call = [sys.executable, "-I", "-S", "-c", _COUNT_ROWS, database.as_uri(), table]
-    try:
-        counted = subprocess.run(call, capture_output=True, timeout=10, check=True)
-        return int(counted.stdout)
-    except (OSError, ValueError, subprocess.SubprocessError):
-        return 0
-
-
-def _watched(work: Callable[[Any], Any], look: Callable[[], str], tell: Tell) -> Any:
-    """What ``work(token)`` returns, run in a thread and cancelled by Ctrl-C, or where
-    progress cannot be told."""
-    token = colmap().CancellationToken()
-    with ThreadPoolExecutor(1) as pool:
-        running = pool.submit(work, token)
-        try:
-            while True:
-                try:
-                    return running.result(timeout=_WAIT)
-                except TimeoutError:
-                    tell(look())
-        except BaseException as error:
-            token.cancel()
-            if isinstance(error, KeyboardInterrupt):
-                tell("stopping when the images that are begun are done")
-            raise

@@ -4,7 +4,6 @@ Photographs and masks go through the same map, one cubic interpolation (masks: n
 pixel) from the working files, so that nothing is resampled or compressed twice.
 """
 
-import secrets
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -14,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.files import make_folder, write_file, writing
+from gsjax.files import make_folder, temporary_in, write_file, writing
 from gsjax.images import encode_png, opencv
-from gsjax.scene.sfm_colmap import colmap
+from gsjax.scene.sfm_engine import colmap
 from gsjax.scene.sfm_photos import Photograph, Workshop, read_upright
 
 ENTRIES = ("images", "masks", "sparse", "sfm.json")  # the last says: made by us
@@ -153,7 +152,7 @@ def staging(output: Path) -> Iterator[Path]:
     """
     base = output if output.is_dir() else output.parent
     make_folder(base)
-    folder = base / f".gsjax-{secrets.token_hex(6)}.tmp"
+    folder = temporary_in(base)
     make_folder(folder)
     try:
         yield folder
