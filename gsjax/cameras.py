@@ -21,6 +21,9 @@ from gsjax.errors import InputError
 
 # What is nearer to the camera is not drawn, where nothing else is said; world units.
 NEAR = 0.01
+# Nor is what is nearer than that, whatever is said: 1 / z³, of which derivatives are
+# made, is to stay within float32.
+NEAREST = 1e-12
 # Extent (`scene.initialise.scene_extent`) of the scenes that the field's numbers in
 # units of the world are for: COLMAP scales what it reconstructs so that the box around
 # the middle eight tenths of the cameras, along each axis, has a diagonal of 10 units.
@@ -136,7 +139,8 @@ def make_camera(
         `gsjax.scene.transforms` for files in OpenGL axes).
       K: [3, 3] (shared) or [B, 3, 3] intrinsics in pixels, fx 0 cx, 0 fy cy, 0 0 1.
       width, height: image size in pixels, at least 1.
-      near, far: range of z that is drawn, scalars or [B]; near > 0.
+      near, far: range of z that is drawn, scalars or [B]; near > 0. Nearer than 1e-12
+        nothing is drawn.
       model: "pinhole", "orthographic", or a `CameraModel`.
 
     Raises:

@@ -74,9 +74,12 @@ def safe_normalize(components: tuple[Array, ...], fallback: tuple[float, ...]):
 
 
 def logit(probability: Array) -> Array:
-    """Inverse of the sigmoid; probabilities are clamped to [2^-24, 1 - 2^-24]."""
-    tiny = 2.0**-24
-    p = jnp.clip(probability, tiny, 1 - tiny)
+    """Inverse of the sigmoid; probabilities are clamped to [2^-24, 1 - 2^-23].
+
+    Both ends come back from `jax.nn.sigmoid` with a slope: that of the logit of
+    1 - 2^-24 is rounded to 1.
+    """
+    p = jnp.clip(probability, 2.0**-24, 1 - 2.0**-23)
     return jnp.log(p) - jnp.log1p(-p)
 
 

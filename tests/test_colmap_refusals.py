@@ -141,6 +141,12 @@ def test_text_by_hand(tmp_path):
         ({"cameras": "1 PINHOLE 640 0 500 500 1 1"}, "image size 640 × 0"),
         ({"cameras": "1 PINHOLE 99999999 9 9 9 9 9"}, "image size 99999999 × 9"),
         ({"cameras": "1 PINHOLE 640 480 0 500 1 1"}, "focal lengths 0, 500"),
+        ({"cameras": "1 PINHOLE 640 480 1e-300 5 1 1"}, "1: focal lengths 1e-300, 5"),
+        ({"cameras": "1 PINHOLE 640 480 5 1e29 1 1"}, "1: focal lengths 5, 1e[+]29"),
+        (
+            {"cameras": "1 PINHOLE 640 480 5 5 1 -1e29"},
+            "1: principal point 1, -1e[+]29",
+        ),
         ({"cameras": "1 PINHOLE 640 480 nan 500 1 1"}, "finite numbers are wanted"),
         ({"cameras": "1 PINHOLE 640 480 a 500 1 1"}, "could not convert"),
         ({"cameras": "1 PINHULE 640 480 a 500 1 1"}, "'PINHULE' is unknown"),

@@ -5,6 +5,7 @@ The scene "smooth" has no threshold within reach: cut 1e-14, no stop. The scene
 to be larger than what the finite differences step over.
 """
 
+import re
 from functools import partial
 
 import jax
@@ -279,6 +280,27 @@ def test_what_no_derivative_is_taken_by_is_left_out():
         return str(jax.make_jaxpr(slope)(some)).count("dot_general")
 
     assert 0 < products(["sh"]) < products(["logit_opacities"]) < products(LEAVES)
+
+
+def test_every_product_is_in_full_precision():
+    """Of the image, its gradient and a Hessian–vector product: accelerators would take
+    fewer bits where nothing is said."""
+    point = base_point()
+    some = {name: point[name] for name in LEAVES}
+
+    def value(some):
+        return loss({**point, **some}, COMPAT)
+
+    def curvature(some):
+        return jax.jvp(jax.grad(value), (some,), (some,))[1]
+
+    for of in (value, jax.grad(value), curvature):
+        program = str(jax.make_jaxpr(of)(some))
+        products = re.findall(
+            r"dot_general\[.*? precision=(\S+ \S+)", program, re.DOTALL
+        )
+        assert len(products) == program.count("dot_general[") > 0
+        assert set(products) == {"(Precision.HIGHEST, Precision.HIGHEST)"}
 
 
 def test_gradients_of_a_batch_are_the_sum(report):

@@ -97,7 +97,8 @@ def test_number_of_photographs(tmp_path):
         (3, 1e35, "row 2: values that are no finite numbers"),
         (4, 0, "row 2: height 0, width 32"),
         (9, 3.5, "width 3.5"),
-        (14, -1, "focal length -1"),
+        (14, -1, "row 2: focal lengths -1, -1"),
+        (14, 1e20, "row 2: focal lengths 1e[+]20"),
         (0, 9.0, "row 2: the 3 × 3 part .* is no rotation"),
     ],
 )

@@ -340,6 +340,8 @@ def test_scaled_rotations_are_warned_of(tmp_path):
         ({"is_fisheye": True, "p1": 0.1}, "a fisheye has no p1, p2"),
         ({"k1": "a"}, "k1 is 'a'; a number"),
         ({"fl_x": 0}, "focal lengths 0, 42"),
+        ({"fl_x": 1e-30}, "focal lengths 1e-30, 42"),
+        ({"cx": -1e20}, "principal point -1e[+]20, "),
         ({"w": 0}, "image size w 0"),
         ({"ply_file_path": 3}, "ply_file_path is 3; text"),
         ({"ply_file_path": "../a.ply"}, "within the dataset's folder"),

@@ -115,6 +115,36 @@ def test_orientation_is_ignored(tmp_path):
     assert image_size(path) == (32, 24)
 
 
+def tiff_turned(path: Path, orientation: int) -> None:
+    """Give a TIFF, of 8 bits and little-endian, an orientation."""
+    data = path.read_bytes()
+    (at,) = struct.unpack_from("<I", data, 4)
+    (count,) = struct.unpack_from("<H", data, at)
+    entries = [data[at + 2 + 12 * i :][:12] for i in range(count)]
+    entries = [e for e in entries if e[:2] != struct.pack("<H", 0x112)]
+    entries.append(struct.pack("<HHII", 0x112, 3, 1, orientation))
+    entries.sort(key=lambda e: struct.unpack("<H", e[:2]))
+    folder = struct.pack("<H", len(entries)) + b"".join(entries) + bytes(4)
+    data += bytes(len(data) % 2)
+    path.write_bytes(data[:4] + struct.pack("<I", len(data)) + data[8:] + folder)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_orientation_of_a_tiff_is_ignored(tmp_path, orientation, dtype):
+    """Of the photograph and its mask: OpenCV turns a TIFF whatever it is told."""
+    path = save_photo(tmp_path / "a.tiff", NOISE.astype(dtype))
+    grey = np.where(NOISE[..., 0] > 99, 255, 0).astype(np.uint8)
+    mask = save_photo(tmp_path / "m.tiff", grey)
+    plain = load_photo(view_of(path, mask=mask))
+    tiff_turned(path, orientation)
+    tiff_turned(mask, orientation)
+    turned = load_photo(view_of(path, mask=mask))
+    np.testing.assert_array_equal(turned.pixels, plain.pixels)
+    np.testing.assert_array_equal(turned.valid, plain.valid)
+    assert image_size(path) == (32, 24)
+
+
 # --- sizes ---
 
 

@@ -28,7 +28,7 @@ from gsjax.memory import Estimate, require
 _NORMALS = ("nx", "ny", "nz")
 _MAX_SHIFT = 0.1  # of a Gaussian's size by rounding, before it is told
 # Exporters write ±inf for opacities of exactly 0 and 1; the range of `logit`.
-_MAX_LOGIT = math.log((1 - 2.0**-24) / 2.0**-24)
+_MAX_LOGIT = math.log((1 - 2.0**-23) / 2.0**-23)
 
 
 def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaussians:
@@ -36,7 +36,7 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
 
     Properties are found by name, in any order and of any scalar type; those that
     are not needed (normals too) are skipped. Opacities of ±inf are clamped to the
-    logit of [2^-24, 1 - 2^-24] with a warning. Zero quaternions, values that look
+    logit of [2^-23, 1 - 2^-23] with a warning. Zero quaternions, values that look
     activated and trailing bytes are warned of.
 
     Args:

@@ -14,7 +14,7 @@ from jax import lax
 
 from gsjax import rotations
 from gsjax import sh as sh_lib
-from gsjax.cameras import LENS_RANGE, Camera, camera_centre
+from gsjax.cameras import LENS_RANGE, NEAREST, Camera, camera_centre
 from gsjax.gaussians import Gaussians
 from gsjax.numerics import exp_log_scale, near_one, safe_normalize
 from gsjax.raster.batches import any_of_batch
@@ -60,7 +60,7 @@ def usable(camera: Camera) -> Array:
 
 def in_depth_range(camera: Camera, z: Array) -> Array:
     """Where camera z is drawn; a NaN is not."""
-    return (z > camera.near) & (z < camera.far)
+    return (z > camera.near) & (z > NEAREST) & (z < camera.far)
 
 
 def reach_of(opacity: Array, config: RasterConfig) -> Array:
@@ -111,8 +111,18 @@ def project(
         live = lax.iota(jnp.int32, size) < count
         front = jax.tree.map(lambda a: a[:size], components)
         out = _project_components(front, camera, config, live, features is None)
-        beyond = _unseen(out, room - size)
-        return jax.tree.map(lambda a, b: jnp.concatenate([a, b], -1), out, beyond)
+        if size == room:
+            return out
+
+        # As an update at a place that XLA (jax 0.10.2) does not know to be 0: else it
+        # makes a pad of it, fuses that with all that leads to ``a``, and evaluates
+        # this element by element over the whole room.
+        zero = jnp.minimum(count, 0)
+
+        def among(unseen: Array, a: Array) -> Array:
+            return lax.dynamic_update_slice(unseen, a, (zero,) * a.ndim)
+
+        return jax.tree.map(among, _unseen(out, room), out)
 
     def none(*operands) -> Projected:
         return _unseen(jax.eval_shape(partial(some, room), *operands), room)

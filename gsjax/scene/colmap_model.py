@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.scene.types import Lens
+from gsjax.scene.types import Lens, intrinsic_matrix
 
 MAX_NAME_BYTES = 1024
 MAX_SIDE = 1 << 20
@@ -132,11 +132,8 @@ def make_colmap_camera(
             f"{where}: parameters {params}; finite numbers are wanted: estimate the "
             "camera again"
         )
-    fx, fy = params[0], params[kind.focals - 1]
-    if not (fx > 0 and fy > 0):
-        raise InputError(f"{where}: focal lengths {fx:g}, {fy:g}; above 0 is wanted")
     cx, cy = params[kind.focals : kind.focals + 2]
-    K = np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
+    K = intrinsic_matrix(where, (params[0], params[kind.focals - 1]), (cx, cy))
     rest = params[kind.focals + 2 :]
     return ColmapCamera(*size, K, _lens(kind, rest))
 
@@ -187,10 +184,14 @@ def twice(where: str, identity: int, what: str) -> InputError:
 
 
 def sorted_points(where: str, points: ColmapPoints) -> ColmapPoints:
-    """Points in the order of their ids, which are checked, as are the coordinates."""
+    """Points in the order of their ids, which are checked, as are the coordinates.
+
+    They are put in order where they are, field by field: no copy is made of all.
+    """
     if (points.ids[1:] < points.ids[:-1]).any():
         order = np.argsort(points.ids, kind="stable")
-        points = ColmapPoints(*(values[order] for values in points))
+        for values in points:
+            values[:] = values[order]
     again = np.flatnonzero(points.ids[1:] == points.ids[:-1])
     if len(again):
         raise InputError(

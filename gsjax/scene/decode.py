@@ -19,7 +19,7 @@ import numpy as np
 from gsjax.errors import InputError
 from gsjax.files import read_bytes
 from gsjax.images import opencv
-from gsjax.scene.image_header import check_image, has_tiff_alpha
+from gsjax.scene.image_header import check_image, has_tiff_alpha, tiff_as_stored
 
 # What libjpeg, libpng and, through OpenCV, libtiff say of pixels that are not as they
 # were; the rest of libpng's warnings are of colour profiles and the like.
@@ -47,6 +47,8 @@ def decode(path: Path, flags: int) -> np.ndarray:
     data = read_bytes(path, "a photograph")
     check_image(path, data)
     cv2 = opencv()
+    if flags & cv2.IMREAD_IGNORE_ORIENTATION:  # IMREAD_UNCHANGED is among them
+        data = tiff_as_stored(data)  # of which OpenCV takes no notice in a TIFF
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:

@@ -22,8 +22,10 @@ _MAX_DEFLATE = 1032
 _MAX_TIFF = 1400
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _REMEDY = "copy or export it again"
-# Tags of TIFF: width, height, bits of a sample, compression, what a fourth sample is.
-_TIFF_TAGS = (256, 257, 258, 259, 338)
+# Tags of TIFF: width, height, bits of a sample, compression, how it is turned, what a
+# fourth sample is.
+_ORIENTATION = 274
+_TIFF_TAGS = (256, 257, 258, 259, _ORIENTATION, 338)
 # Markers of JPEG without a length, and those that carry the size of the image.
 _JPEG_BARE = {0x01, *range(0xD0, 0xD9)}
 _JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
@@ -163,7 +165,24 @@ def has_tiff_alpha(data: Buffer) -> bool:
     return _reader(data[:12]) is _tiff and _tiff_tags(data).get(338) in (1, 2)
 
 
+def tiff_as_stored(data: bytes) -> bytes:
+    """An image, which `check_image` has seen; a TIFF, without an orientation."""
+    places = _tiff_places(data) if _reader(data[:12]) is _tiff else {}
+    if _ORIENTATION not in places:
+        return data
+    form, at = places[_ORIENTATION]
+    upright = bytearray(data)
+    struct.pack_into(form, upright, at, 1)
+    return bytes(upright)
+
+
 def _tiff_tags(data: Buffer) -> dict[int, int]:
+    places = _tiff_places(data).items()
+    return {tag: struct.unpack_from(form, data, at)[0] for tag, (form, at) in places}
+
+
+def _tiff_places(data: Buffer) -> dict[int, tuple[str, int]]:
+    """Form and offset of the first value of each of `_TIFF_TAGS` that is there."""
     order = "<" if data[:2] == b"II" else ">"
     (at,) = struct.unpack_from(f"{order}I", data, 4)
     (count,) = struct.unpack_from(f"{order}H", data, at)
@@ -175,7 +194,7 @@ def _tiff_tags(data: Buffer) -> dict[int, int]:
             at = entry + 8
             if values * struct.calcsize(form) > 4:  # of several the first, elsewhere
                 (at,) = struct.unpack_from(f"{order}I", data, at)
-            (found[tag],) = struct.unpack_from(order + form, data, at)
+            found[tag] = order + form, at
     return found
 
 

@@ -16,7 +16,7 @@ from gsjax.io.npy import read_npy
 from gsjax.scene.colmap_model import MAX_COORDINATE, MAX_SIDE
 from gsjax.scene.image_files import SUFFIXES, check_name, image_folder
 from gsjax.scene.transforms_fields import rigid
-from gsjax.scene.types import Scene, View
+from gsjax.scene.types import Scene, View, intrinsic_matrix
 
 _COLUMNS = 17
 
@@ -63,17 +63,16 @@ def _view(where: str, row: np.ndarray, file: Path) -> View:
     matrix = row[:15].reshape(3, 5)
     height, width, focal = matrix[:, 4].tolist()
     sides = (width, height)
-    if not all(1 <= v <= MAX_SIDE and v % 1 == 0 for v in sides) or not focal > 0:
+    if not all(1 <= v <= MAX_SIDE and v % 1 == 0 for v in sides):
         raise InputError(
-            f"{where}: height {height:g}, width {width:g}, focal length {focal:g}; "
-            "whole sizes ≥ 1 and a focal length above 0 are wanted"
+            f"{where}: height {height:g}, width {width:g}; whole sizes ≥ 1 are wanted"
         )
     # Down, right, back → right, down, forward.
     block = matrix[:, [1, 0, 2]] * (1, 1, -1)
     rotation, _ = rigid(where, block)
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ matrix[:, 3]
-    K = np.asarray([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    K = intrinsic_matrix(where, (focal, focal), (width / 2, height / 2))
     return View(file.name, file, viewmat, K, int(width), int(height))
 
 

@@ -32,7 +32,7 @@ from gsjax.scene.transforms_fields import (
     text_of,
     warn_of_scaled,
 )
-from gsjax.scene.types import Lens, Scene, View
+from gsjax.scene.types import Lens, Scene, View, intrinsic_matrix
 
 _PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
@@ -156,7 +156,7 @@ def _view(
         name=name,
         image=file,
         viewmat=viewmat,
-        K=np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64),
+        K=intrinsic_matrix(frame.where, (fx, fy), (cx, cy)),
         width=width,
         height=height,
         lens=lens,
@@ -182,7 +182,9 @@ def _mask(frame: Frame, folder: Path) -> Path | None:
         return None
     mask = folder / inside(frame.where, name)
     if not mask.is_file():
-        raise InputError(f"{frame.where}: mask_path {name!r}: no such file in {folder}")
+        raise InputError(
+            f"{frame.where}: mask_path {shown(name)}: no such file in {folder}"
+        )
     return mask
 
 
@@ -190,8 +192,8 @@ def _lens(frame: Frame) -> Lens | None:
     model = model_of(frame)
     if model not in (*_PERSPECTIVE, *_FISHEYE):
         raise InputError(
-            f"{frame.where}: camera_model {model!r} is not supported; undistort the "
-            f"photographs to a pinhole first; supported: "
+            f"{frame.where}: camera_model {shown(model)} is not supported; undistort "
+            f"the photographs to a pinhole first; supported: "
             f"{', '.join((*_PERSPECTIVE, *_FISHEYE))}"
         )
     k1, k2, k3, k4, p1, p2 = _coefficients(frame)

@@ -9,7 +9,34 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsjax.cameras import NEAR
+from gsjax.cameras import LENS_RANGE, NEAR
+from gsjax.errors import InputError
+
+# Room for a photograph to be made smaller, and its focal length with it.
+_LEAST, _MOST = LENS_RANGE[0] * 1e6, LENS_RANGE[1] / 1e6
+
+
+def intrinsic_matrix(
+    where: str, focals: tuple[float, float], centre: tuple[float, float]
+) -> np.ndarray:
+    """[3, 3] of focal lengths and a principal point in px, which ``where`` names.
+
+    Raises:
+      InputError: if nothing could be drawn with them; found here, before a training
+        whose last photograph it is.
+    """
+    (fx, fy), (cx, cy) = focals, centre
+    if not all(_LEAST < focal < _MOST for focal in focals):
+        raise InputError(
+            f"{where}: focal lengths {fx:g}, {fy:g} px; above {_LEAST:g} and below "
+            f"{_MOST:g} is wanted: estimate the camera again"
+        )
+    if not all(abs(value) < _MOST for value in centre):
+        raise InputError(
+            f"{where}: principal point {cx:g}, {cy:g} px; within {_MOST:g} is wanted: "
+            "estimate the camera again"
+        )
+    return np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
 class Lens(NamedTuple):

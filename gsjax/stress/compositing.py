@@ -1,5 +1,7 @@
 """Blending, counts and capacities, sizes of images."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,10 +9,11 @@ import numpy as np
 from gsjax.gaussians import make_gaussians
 from gsjax.numerics import in_float64
 from gsjax.raster.alpha import alphas
-from gsjax.raster.blend import running_product
+from gsjax.raster.blend import running_product, transmittance
 from gsjax.raster.counts import total_count
 from gsjax.raster.reference import reference_render
 from gsjax.raster.render import render, render_exact
+from gsjax.raster.types import RasterConfig
 from gsjax.sh import dc_to_rgb
 from gsjax.stress.scenes import (
     BACKGROUND,
@@ -35,13 +38,13 @@ _TILES = (SIZE // COMPAT.tile_size) ** 2
 _render = jax.jit(render, static_argnames="config")
 
 
-@jax.jit
-def _slopes_of_transmittance(alpha, weigh):
+@partial(jax.jit, static_argnames="product")
+def _slopes_of_transmittance(product, alpha, weigh):
     """Of Σ_k weigh_k T_k + T at the end by α [S, 1, K, 1], chunk after chunk."""
 
     def step(carried, inputs):
         chunk, weights = inputs
-        total, before = running_product(chunk)
+        total, before = product(chunk)
         return carried * total, jnp.sum(weights * carried[:, None] * before)
 
     def weighted(alpha):
@@ -51,24 +54,32 @@ def _slopes_of_transmittance(alpha, weigh):
     return jax.grad(weighted)(alpha)
 
 
-def opaque(full: bool) -> Measured:
-    """Error of the slopes of T with α = 1 once and twice in a thousand.
+def opaque(product, most: float):
+    """Error of the slopes of T with α = ``most`` once and twice in a thousand.
 
-    Relative to the largest of the slopes without them.
+    Relative to the largest of the slopes without them. ``product`` is what settings of
+    such a cap take.
     """
-    rng = np.random.default_rng(0)
-    shape, worst = (32, 1, 32, 1), 0.0
-    for _ in range(100 if full else 5):
-        alpha = rng.uniform(0, 0.004, shape).astype(np.float32)
-        weigh = rng.normal(size=shape).astype(np.float32)
-        usually = float(jnp.max(jnp.abs(_slopes_of_transmittance(alpha, weigh))))
-        for count in (1, 2):
-            alpha.flat[rng.choice(alpha.size, count, replace=False)] = 1
-            found = np.asarray(_slopes_of_transmittance(alpha, weigh)).ravel()
-            wanted = _slopes_of_products(double(alpha).ravel(), weigh.ravel())
-            worst = worse(worst, float(np.max(np.abs(found - wanted))) / usually)
-            alpha[alpha == 1] = 0.002
-    return Measured(worst, f"of {np.prod(shape)}")
+
+    def measure(full: bool) -> Measured:
+        rng = np.random.default_rng(0)
+        shape, worst = (32, 1, 32, 1), 0.0
+        for _ in range(100 if full else 5):
+            alpha = rng.uniform(0, 0.004, shape).astype(np.float32)
+            weigh = rng.normal(size=shape).astype(np.float32)
+            slopes = _slopes_of_transmittance(product, alpha, weigh)
+            usually = float(jnp.max(jnp.abs(slopes)))
+            for count in (1, 2):
+                places = rng.choice(alpha.size, count, replace=False)
+                spoilt = alpha.copy()
+                spoilt.flat[places] = most
+                slopes = _slopes_of_transmittance(product, spoilt, weigh)
+                wanted = _slopes_of_products(double(spoilt).ravel(), weigh.ravel())
+                error = np.max(np.abs(np.asarray(slopes).ravel() - wanted))
+                worst = worse(worst, float(error) / usually)
+        return Measured(worst, f"of {np.prod(shape)}")
+
+    return measure
 
 
 def _slopes_of_products(alpha: np.ndarray, weigh: np.ndarray) -> np.ndarray:
@@ -244,7 +255,18 @@ def constants(full: bool) -> Measured:
 
 
 CASES = (
-    Case("alpha/of 1", "error of slopes of T, relative", 1e-6, opaque),
+    Case(
+        "alpha/of 1",
+        "error of slopes of T, relative",
+        1e-6,
+        opaque(running_product, 1.0),
+    ),
+    Case(
+        "alpha/at the cap",
+        "error of slopes of T, relative",
+        1e-6,
+        opaque(transmittance, RasterConfig.accurate().alpha_cap),
+    ),
     Case("alpha/tie at the cap", "slope", 0, cap_tie),
     Case("capacity/overflow", "silent or wrong", 0, capacities),
     Case("capacity/past 2^31", "silent or wrong", 0, past_32_bits),

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.cameras import NEAREST
 from gsjax.gaussians import Gaussians, num_active
 from gsjax.numerics import logit
 from gsjax.raster.bins import make_grid, row_spans
@@ -21,7 +22,6 @@ from gsjax.stress.scenes import (
     frustum,
     host_fields,
     not_finite,
-    pose,
     scene_of,
     single,
     unequal,
@@ -194,16 +194,21 @@ def equal_depths(full: bool) -> Measured:
 
 
 def at_the_camera(full: bool) -> Measured:
-    """Numbers not finite where the direction of the harmonics is undefined."""
+    """Numbers not finite where the direction of the harmonics is hardly defined.
+
+    At the centre itself, which no near plane lets through, and straight ahead so close
+    to it that the fourth power of the distance is zero.
+    """
     del full
-    fields = host_fields(usual())
-    viewmat = double(pose())
-    fields["means"][:4] = -viewmat[:3, :3].T @ viewmat[:3, 3]
-    fields["log_scales"][:4] = 2
-    # With a near plane of 0 under jit, what stands at the centre could be drawn.
-    camera = camera_of(near=1e-30)
-    out, slopes = usual_gradients(changed(usual(), **fields), camera)
-    return Measured(not_finite((images_of(out), slopes)), "4 at the centre")
+    fields = fields_at(frustum(np.random.default_rng(0)), 0.1, 0.5, np.eye(4))
+    depths = single([0, 1e-30, 0.9 * NEAREST, 1.1 * NEAREST, 1e-11, 1e-10])
+    fields["means"][:6] = depths[:, None] * (0, 0, 1)
+    fields["log_scales"][:6] = np.log(np.maximum(depths, NEAREST))[:, None] - 2
+    scene, camera = scene_of(fields), camera_of(np.eye(4), near=1e-30)
+    out, slopes = usual_gradients(scene, camera)
+    wrong = int(np.sum((out.radii[:6] > 0) != (depths > NEAREST)))
+    count = not_finite((images_of(out), slopes))
+    return Measured(np.nan if wrong else count, "6, of which 3 are drawn")
 
 
 def empty(full: bool) -> Measured:
@@ -223,12 +228,17 @@ def empty(full: bool) -> Measured:
 
 
 def probabilities(full: bool) -> Measured:
-    """Largest error of sigmoid(logit(p)), p = 0 and 1 included."""
+    """Largest error of sigmoid(logit(p)), p = 0 and 1 included; none of the logits may
+    be infinite, nor without a slope.
+    """
     del full
     p = single([0, 1e-45, 1e-30, 2**-24, 1e-6, 0.01, 0.5, 0.99, 1 - 2**-24, 1])
     p = np.concatenate([p, np.linspace(0, 1, 10_001, dtype=np.float32)])
-    back = np.asarray(jax.nn.sigmoid(logit(jnp.asarray(p))))
-    return Measured(float(np.max(np.abs(back - double(p)))), f"{len(p)} values")
+    logits = logit(jnp.asarray(p))
+    slopes = jax.vmap(jax.grad(jax.nn.sigmoid))(logits)
+    good = bool(jnp.all(jnp.isfinite(logits) & (slopes > 0)))
+    error = float(np.max(np.abs(np.asarray(jax.nn.sigmoid(logits)) - double(p))))
+    return Measured(error if good else np.nan, f"{len(p)} values")
 
 
 CASES = (

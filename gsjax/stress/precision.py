@@ -11,6 +11,7 @@ from gsjax.cameras import Camera, look_at
 from gsjax.gaussians import Gaussians, num_active
 from gsjax.numerics import in_float64
 from gsjax.raster.project import project
+from gsjax.rotations import quaternion_to_matrix
 from gsjax.scene.rebase import rebase
 from gsjax.scene.types import Scene, View
 from gsjax.stress.needles import projected
@@ -201,6 +202,45 @@ def off_axis(full: bool) -> Measured:
     return Measured(worst, f"{DIRECTIONS} directions")
 
 
+@jax.jit
+def _covariances(gaussians: Gaussians, camera: Camera) -> tuple[jax.Array, ...]:
+    """Of the slots: xx, xy, yy of the projection, and whether it is drawn."""
+    out = project(gaussians, camera, COMPAT, jnp.arange(SLOTS), num_active(gaussians))
+    xx = 1 / jnp.square(out.inv_sx)
+    return xx, xx * out.slope, out.var_y, out.reach > 0
+
+
+def limits(full: bool) -> Measured:
+    """Error of covariances, relative to their trace, beyond the sides of the image.
+
+    Against the formula in float64: J at x / z and y / z that are kept within 30 % of
+    half the image beyond *each* side. The principal point lies outside the image, where
+    limits that are alike on both sides would be far off.
+    """
+    del full
+    camera = camera_of(np.eye(4), centre=(-6.0, 21.0))
+    points = frustum(np.random.default_rng(0), spread=2.5)
+    scene = scene_of(fields_at(points, (0.3, 0.1, 0.05), 0.5, np.eye(4)))
+    xx, xy, yy, drawn = (np.asarray(a) for a in _covariances(scene, camera))
+    means, scales = (double(a) for a in (scene.params.means, scene.params.log_scales))
+    rotations = double(quaternion_to_matrix(scene.params.quats))
+    K, z = double(camera.K), means[:, 2]
+    jacobian, beyond = np.zeros((SLOTS, 2, 3)), np.zeros(SLOTS, bool)
+    for row in range(2):
+        focal, centre, ratio = K[row, row], K[row, 2], means[:, row] / z
+        inside = (np.array([-0.15, 1.15]) * SIZE - centre) / focal
+        jacobian[:, row, row] = focal / z
+        jacobian[:, row, 2] = -focal / z * np.clip(ratio, *inside)
+        beyond |= np.clip(ratio, *inside) != ratio
+    half = jacobian @ rotations * np.exp(scales)[:, None]
+    wanted = half @ half.transpose(0, 2, 1) + COMPAT.dilation * np.eye(2)
+    trace = np.trace(wanted, axis1=1, axis2=2)
+    errors = np.stack([xx, xy, yy], 1) - wanted[:, (0, 0, 1), (0, 1, 1)]
+    error = float(np.max(np.abs(errors[drawn]) / trace[drawn, None]))
+    count = int(np.sum(beyond & drawn))
+    return Measured(error if count > SLOTS // 4 else np.nan, f"{count} beyond a side")
+
+
 CASES = (
     Case("scenes/image", "error of α and colour, 99.9 %", 1e-4, of_scenes(0)),
     Case("scenes/gradient", "relative L2 error, 99.9 %", 1e-3, of_scenes(1)),
@@ -208,5 +248,6 @@ CASES = (
         Case(f"far world/1e{n} m", "centres, rebased", 1e-3, far_world(10.0**n), "px")
         for n in (5, 6, 7)
     ),
+    Case("projection/beyond the sides", "error of a covariance", 1e-5, limits),
     Case("projection/slopes", "against differences", 1e-3, off_axis, full_only=True),
 )
