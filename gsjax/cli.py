@@ -23,6 +23,7 @@ from gsjax.console import one_line, warnings_as_lines
 from gsjax.errors import CapacityError, GsjaxError, InputError
 from gsjax.memory import unlimited
 
+_LONGEST = 2000  # characters of an error, whose remedy stands at its end
 _EXHAUSTED = "RESOURCE_EXHAUSTED"  # as XLA tells it
 
 
@@ -35,11 +36,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _report("interrupted", 130, debug)
     except GsjaxError as error:
-        return _report(one_line(error), error.exit_code, debug)
+        return _report(one_line(error, _LONGEST), error.exit_code, debug)
     except BrokenPipeError:
         return _hung_up()
     except OSError as error:
-        return _report(one_line(error), InputError.exit_code, debug)
+        what = "" if error.filename is None else f"{str(error.filename)[:200]!r}: "
+        text = f"{what}{error.strerror or error}; check the path and its permissions"
+        return _report(one_line(text, _LONGEST), InputError.exit_code, debug)
     except Exception as error:
         if isinstance(error, MemoryError) or _EXHAUSTED in str(error):
             text = "the memory of this machine does not hold what this takes; make it "

@@ -1,5 +1,6 @@
 """What programs say: results on stdout; progress, warnings and errors on stderr."""
 
+import re
 import signal
 import sys
 import threading
@@ -10,20 +11,23 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 T = TypeVar("T")
+# What a terminal obeys instead of showing it: control characters, and those that turn
+# the direction of text. Line breaks and tabs are neither.
+_OBEYED = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 
 
 def say(line: str) -> None:
     """Print a result line, above the progress bar if there is one."""
     from tqdm import tqdm
 
-    tqdm.write(line, file=sys.stdout)
+    tqdm.write(harmless(line), file=sys.stdout)
 
 
 def note(line: str) -> None:
     """Print a line on stderr, above the progress bar if there is one."""
     from tqdm import tqdm
 
-    tqdm.write(f"gsjax: {line}", file=sys.stderr)
+    tqdm.write(f"gsjax: {harmless(line)}", file=sys.stderr)
 
 
 def progress(items: Sequence[T], label: str) -> Iterator[T]:
@@ -41,9 +45,22 @@ def progress(items: Sequence[T], label: str) -> Iterator[T]:
             note(f"{label} {done}/{len(items)}")
 
 
-def one_line(text: object) -> str:
-    """Text without line breaks."""
-    return " ".join(str(text).split())
+def harmless(text: str) -> str:
+    """Text in which what a terminal would obey, as of a file's name, is spelled out."""
+    return _OBEYED.sub(lambda found: repr(found[0])[1:-1], text)
+
+
+def one_line(text: object, most: int | None = None) -> str:
+    """Text without line breaks, `harmless`.
+
+    Args:
+      text: anything.
+      most: characters; of more, some in the middle are left out. None for any number.
+    """
+    line = harmless(" ".join(str(text).split()))
+    if most is None or len(line) <= most:
+        return line
+    return f"{line[: most // 2]} […] {line[-most // 2 :]}"
 
 
 def decibels(value: float | None) -> str:

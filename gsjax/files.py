@@ -4,20 +4,38 @@ import errno
 import json
 import math
 import os
+import reprlib
 import secrets
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from gsjax.errors import InputError
+from gsjax.memory import Estimate, require
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _TEMPORARY = ".gsjax-{}.tmp"
-# Of JSON: a camera is an object and five lists in 90 bytes or more; 3 bytes, "[],",
-# take 70 in memory, so that what is full of them is refused before it is parsed.
-_MANY, _LEAST_BYTES = 10_000, 10
+# Of JSON: a camera is an object and five lists in 90 bytes or more, with some 50 keys
+# and 100 values at most; 3 bytes, "[],", take 70 in memory, a key of its own 100. So
+# what is full of them is refused before it is parsed.
+_MANY, _LEAST_BYTES, _MOST_ITEMS = 10_000, 10, 100
+# Python's parser takes up to that many times the text: of a short word, 6 bytes, 60.
+_PARSED = 14
+
+
+_short = reprlib.Repr()
+_short.maxlist = _short.maxdict = 20
+_short.maxstring = _short.maxlong = _short.maxother = 80
+
+
+def shown(value: Any) -> str:
+    """A value as found, for a message: 80 characters at most, whatever it is."""
+    if isinstance(value, dict):  # of which all keys would be sorted
+        value = dict(islice(value.items(), _short.maxdict))
+    return _short.repr(value)[:80]
 
 
 @contextmanager
@@ -65,17 +83,20 @@ def read_bytes(path: Path, wanted: str = "a file") -> bytes:
 def read_json(path: Path, wanted: str = "a JSON file") -> dict[str, Any]:
     """The object that a JSON file holds.
 
+    It is parsed as a whole, and takes up to 14 times its size in memory meanwhile.
+
     Raises:
       InputError: as `reading`, and if it is no JSON, no object, or so full of empty
-        objects and lists that it would take many times its size in memory.
+        objects and lists, keys or values that it can be no list of cameras.
+      CapacityError: if the memory may not hold what is in it.
     """
     raw = read_bytes(path, wanted)
-    nested = raw.count(b"{") + raw.count(b"[")
-    if nested > _MANY and nested * _LEAST_BYTES > len(raw):
-        raise InputError(
-            f"{path}: {nested} objects and lists in {len(raw)} bytes, fewer than "
-            f"{_LEAST_BYTES} bytes each, which no list of cameras has; pass {wanted}"
-        )
+    _check_json(path, raw, wanted)
+    require(
+        Estimate({"objects and numbers": _PARSED * len(raw)}),
+        f"{path}: {len(raw):,} bytes of JSON",
+        "leave out some of it",
+    )
     try:
         data = json.loads(raw)
     except (ValueError, RecursionError) as error:
@@ -84,9 +105,29 @@ def read_json(path: Path, wanted: str = "a JSON file") -> dict[str, Any]:
         ) from error
     if not isinstance(data, dict):
         raise InputError(
-            f"{path}: the top is {repr(data)[:80]}, an object is wanted; pass {wanted}"
+            f"{path}: the top is {shown(data)}, an object is wanted; pass {wanted}"
         )
     return data
+
+
+def _check_json(path: Path, raw: bytes, wanted: str) -> None:
+    """Refuse what is of another kind than what is kept as JSON, before it is parsed."""
+    size, objects = len(raw), raw.count(b"{")
+    keys, values = raw.count(b":"), raw.count(b",")
+    nested = objects + raw.count(b"[")
+    fault = None
+    if nested > _MANY and nested * _LEAST_BYTES > size:
+        told = f"{nested} objects and lists in {size} bytes"
+        fault = f"{told}, fewer than {_LEAST_BYTES} bytes each"
+    elif keys > _MANY + _MOST_ITEMS * objects:
+        fault = f"{keys} keys in {objects} objects"
+    # A list of names is as long, but of longer values.
+    elif values > _MANY + _MOST_ITEMS * objects and values * _LEAST_BYTES > size:
+        fault = f"{values} values in {objects} objects and {size} bytes"
+    if fault is not None:
+        raise InputError(
+            f"{path}: {fault}, which no list of cameras has; pass {wanted}"
+        )
 
 
 @contextmanager

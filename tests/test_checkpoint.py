@@ -30,7 +30,7 @@ META = {"pair_capacity": 4096, "seconds": 1.5}
 
 
 def state_at(step=0, config=CONFIG, capacity=CAPACITY):
-    """A state with every number drawn at random."""
+    """A state with every number drawn at random, above 0 as squares are."""
     scene = scene_of_views(count=VIEWS, points=9)
     gaussians = init_gaussians(scene, sh_degree=config.sh_degree, capacity=capacity)
     state = init_state(gaussians, config, EXTENT, VIEWS)
@@ -39,7 +39,7 @@ def state_at(step=0, config=CONFIG, capacity=CAPACITY):
     def fill(leaf):
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
             return leaf
-        return jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype)
+        return jnp.asarray(rng.exponential(size=leaf.shape), leaf.dtype)
 
     return replace(jax.tree.map(fill, state), step=jnp.int32(step))
 
@@ -57,11 +57,9 @@ def test_the_same_bits_come_back(tmp_path, strategy, tuned, x64):
     config = config.replace(strategy=strategy)
     with jax.enable_x64(x64):
         state = state_at(70, config)
-        state = state.replace(  # values that text would not carry
-            moments=state.moments._replace(
-                mu=jax.tree.map(lambda a: a.at[0].set(jnp.nan), state.moments.mu)
-            )
-        )
+        # Values that text would not carry, in slots where they do not matter.
+        mu = jax.tree.map(lambda a: a.at[-1].set(jnp.nan), state.moments.mu)
+        state = state.replace(moments=state.moments._replace(mu=mu))
         path = save_checkpoint(tmp_path / "new" / "folder", state, META)
         found = load_latest(path.parent)
         template = empty_state(config, EXTENT, VIEWS, found.meta["capacity"])
@@ -248,6 +246,38 @@ def test_damaged_ones_fall_back_to_the_older(tmp_path):
         load_latest(tmp_path)
 
 
+def test_senseless_ones_fall_back_to_the_older(tmp_path):
+    """As damaged ones do; what stands in an inactive slot is no matter."""
+    good = state_at(7)
+    nan = jax.tree.map(lambda a: a.at[-1].set(jnp.nan), good.gaussians.params)
+    good = good.replace(gaussians=good.gaussians.replace(params=nan))
+    save_checkpoint(tmp_path, good, META)
+    bad = state_at(9)
+    nu = jax.tree.map(lambda a: a.at[0].set(jnp.inf), bad.moments.nu)
+    bad = bad.replace(moments=bad.moments._replace(nu=nu))
+    save_checkpoint(tmp_path, bad, META)
+    with pytest.warns(UserWarning, match=r"9.npz: .*moments.nu.*from step_000000007"):
+        found = load_latest(tmp_path)
+    template = empty_state(CONFIG, EXTENT, VIEWS, CAPACITY)
+    assert bits(restore(found, template)) == bits(good)
+
+
+def test_corrections_of_cameras_are_finite(tmp_path):
+    state = state_at(9)
+    tuning = replace(state.tuning, turns=state.tuning.turns.at[1, 2].set(jnp.nan))
+    path = save_checkpoint(tmp_path, replace(state, tuning=tuning), META)
+    with pytest.raises(InputError, match=r"tuning.turns: 1 of 9 .* \[1, 2\] the first"):
+        load_checkpoint(path)
+
+
+def test_no_run_is_beyond_its_end(tmp_path):
+    for step in (7, 9):
+        save_checkpoint(tmp_path, state_at(step), META)
+    assert load_latest(tmp_path, 9).step == 9
+    with pytest.warns(UserWarning, match="step 9 of a run of 8 .*going on from"):
+        assert load_latest(tmp_path, 8).step == 7
+
+
 def test_no_folder(tmp_path):
     with pytest.raises(InputError, match="no checkpoint to go on from"):
         load_latest(tmp_path / "none")
@@ -267,14 +297,14 @@ def test_no_folder(tmp_path):
 )
 def test_other_settings_are_named(original, changes, capacity, views, named):
     template = empty_state(CONFIG.replace(**changes), EXTENT, views, capacity)
-    with pytest.raises(InputError, match=rf"step 7 .*{named}"):
+    with pytest.raises(InputError, match=rf"000007.npz: .*step 7 .*{named}"):
         restore(original, template)
 
 
 def test_other_types_are_named(original):
     with jax.enable_x64(False):
         template = empty_state(CONFIG, EXTENT, VIEWS, CAPACITY)
-        with pytest.raises(InputError, match=r"float64 .*; float32"):
+        with pytest.raises(InputError, match=r"000007.npz: .*float64 .*; float32"):
             restore(original, template)
 
 

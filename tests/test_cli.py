@@ -56,6 +56,24 @@ def error_of(capsys) -> str:
     return lines[0]
 
 
+def test_what_files_say_is_neither_obeyed_nor_endless(tmp_path, capsys):
+    assert cli.main(["info", f"{tmp_path}/\x1b[2J.ply"]) == 3
+    assert r"\x1b[2J.ply: cannot be read" in error_of(capsys)
+    name = "A" * 10_000 + "\x1b"
+    matrix = np.eye(4).tolist()
+    frame = {"transform_matrix": matrix, "camera_model": name, "file_path": "a.png"}
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"w": 8, "h": 6, "fl_x": 8, "frames": [frame]}))
+    (tmp_path / "a.png").touch()
+    for args in (["train", str(path)], ["render", "a.ply", "--cameras", str(path)]):
+        assert cli.main([*args, "-o", str(tmp_path / "out")]) == 3
+        told = error_of(capsys)
+        assert "camera_model 'AAA" in told
+        assert len(told) < 1000
+    assert cli.main(["info", "a" * 5000 + ".ply"]) == 3
+    assert "File name too long; check the path" in error_of(capsys)
+
+
 # --- render ---
 
 

@@ -1,11 +1,11 @@
-"""Ctrl-C while something goes on that is not to be cut in two."""
+"""What a terminal is told; Ctrl-C while something goes on."""
 
 import signal
 import threading
 
 import pytest
 
-from gsjax.console import stopping_on_ctrl_c
+from gsjax.console import harmless, note, one_line, stopping_on_ctrl_c
 
 
 @pytest.fixture(autouse=True)
@@ -13,6 +13,26 @@ def _as_it_was():
     before = signal.getsignal(signal.SIGINT)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+def test_nothing_is_told_that_a_terminal_would_obey(capsys):
+    codes = [*range(32), *range(127, 160), *range(0x202A, 0x202F)]
+    text = "".join(map(chr, codes))
+    kept = harmless(f"a{text}é∞\u200d\tb\n")
+    assert kept.startswith("a\\x00\\x01")
+    assert kept.endswith("é∞\u200d\tb\n")
+    assert [letter for letter in kept if letter in text] == ["\t", "\n", "\t", "\n"]
+    assert one_line("a\x1b[31m\n b\r\x9b2J") == r"a\x1b[31m b \x9b2J"
+    note("\x1b[2J")
+    assert capsys.readouterr().err == "gsjax: \\x1b[2J\n"
+
+
+def test_what_is_too_long_keeps_both_its_ends():
+    line = one_line(f"start {'x' * 10**6} end", 100)
+    assert len(line) == 105
+    assert line.startswith("start x")
+    assert line.endswith("x end")
+    assert one_line("x" * 100, 100) == "x" * 100
 
 
 def test_once_asks_and_twice_stops(capsys):

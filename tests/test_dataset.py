@@ -34,6 +34,36 @@ def transforms(folder, scene=None, name="transforms.json"):
     (folder / name).write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
 
 
+# --- poses that cannot be ---
+
+
+@pytest.mark.parametrize("far", [1e29, 1e9])
+def test_a_camera_at_the_end_of_the_world_is_named(tmp_path, far):
+    scene = scene_of_views()
+    view = scene.views[2]
+    viewmat = view.viewmat.copy()
+    viewmat[:3, 3] += far
+    views = [*scene.views[:2], replace(view, viewmat=viewmat), *scene.views[3:]]
+    transforms(tmp_path, replace(scene, views=tuple(views)))
+    with pytest.raises(InputError, match=rf"camera of 'images/{view.name}' stands 1.7"):
+        load_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_cameras_all_too_far_are_refused(tmp_path, count):
+    transforms(tmp_path, scene_of_views(count=count, at=(0, 3e20, 0)))
+    with pytest.raises(InputError, match=r"stands at .*3e\+20, .* at most 1e\+15"):
+        load_dataset(tmp_path)
+
+
+def test_names_that_the_system_does_not_take(tmp_path):
+    transforms(tmp_path)
+    with pytest.raises(InputError, match="a: File name too long; check the path"):
+        load_dataset(tmp_path / ("a" * 5000))
+    with pytest.raises(InputError, match="File name too long"):
+        load_dataset(tmp_path, images="a" * 5000)
+
+
 # --- what is taken for what ---
 
 

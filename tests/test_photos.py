@@ -145,6 +145,15 @@ def test_orientation_of_a_tiff_is_ignored(tmp_path, orientation, dtype):
     assert image_size(path) == (32, 24)
 
 
+def test_a_lens_that_leaves_nothing_is_told(tmp_path):
+    """And not taken for a mask."""
+    path = save_photo(tmp_path / "a.png", NOISE)
+    lens = Lens("radial_tangential", (1e20, 0.0, 0.0, 0.0))
+    wanted = r"a\.png: of its 768 pixels 0 are left .* \(radial_tangential, 1e\+20, 0"
+    with pytest.raises(InputError, match=wanted):
+        load_photo(view_of(path, lens=lens))
+
+
 # --- sizes ---
 
 

@@ -15,6 +15,7 @@ from gsjax.errors import InputError
 from gsjax.export import export_scene
 from gsjax.gaussians import Gaussians, grow, make_gaussians, select
 from gsjax.io import load, save
+from gsjax.io.numerals import BLOCK
 from gsjax.io.ply import read_ply, write_ply
 
 GUITAR = Path(__file__).resolve().parents[2] / "shared" / "data" / "guitar/guitar.ply"
@@ -300,6 +301,23 @@ def test_other_elements_before_and_after(tmp_path, kind):
     content = encode(table_of(fields), kind=kind, before=(face, lists))
     with pytest.raises(InputError, match=r"element face has a list.*before vertex"):
         read_ply(put(tmp_path, content))
+
+
+@pytest.mark.parametrize("eol", ["\n", "\r\n"])
+def test_text_in_many_blocks(tmp_path, eol):
+    fields = random_fields(5_000, 0)
+    after = ("element extra 2\nproperty int a", f"1{eol}2{eol}".encode())
+    content = encode(table_of(fields), kind="ascii", eol=eol, after=after)
+    assert len(content) > 3 * BLOCK
+    assert_bits_equal(read_ply(put(tmp_path, content)), fields)
+    start = content.index(b"end_header") + len("end_header" + eol)
+    lines = content[start:].split(eol.encode())
+    for at in (0, 2_345, 4_999):
+        before = start + sum(len(line) + len(eol) for line in lines[:at])
+        bad = content[:before] + b"x" + content[before:]
+        wanted = rf"vertex {at} \(byte {before}\): could not convert string .*'x"
+        with pytest.raises(InputError, match=wanted):
+            read_ply(put(tmp_path, bad))
 
 
 @pytest.mark.parametrize("degree", [0, 3])

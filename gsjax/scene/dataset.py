@@ -17,6 +17,12 @@ from gsjax.scene.nerf import find_transforms, load_nerf
 from gsjax.scene.rebase import rebase
 from gsjax.scene.types import Scene
 
+# How far a camera may stand from the middle of all, in medians of that; a heuristic.
+_MOST_APART = 1e6
+# Coordinates of cameras: in float64 a tenth of the unit is left there, and products of
+# two are finite in float32.
+_FARTHEST = 1e15
+
 
 def load_dataset(
     path: str | PathLike[str],
@@ -62,6 +68,26 @@ def load_dataset(
         and what to do.
     """
     path = Path(path)
+    try:
+        return _finished(
+            _read(path, images, skip_missing, factor, poses_only=poses_only)
+        )
+    except OSError as error:  # of names that the system does not take, say
+        raise InputError(
+            f"{str(error.filename or path)[:200]}: {error.strerror or error}; check "
+            "the path and its permissions"
+        ) from error
+
+
+def _read(
+    path: Path,
+    images: str | PathLike[str] | None,
+    skip_missing: bool,
+    factor: int | None,
+    *,
+    poses_only: bool,
+) -> Scene:
+    """What is there, as its reader gives it."""
     where: dict[str, Any] = {
         "images": images,
         "factor": factor,
@@ -73,17 +99,17 @@ def load_dataset(
         raise InputError(f"{path}: does not exist; pass the folder of a dataset")
     if not path.is_dir():
         if path.suffix.lower() == ".json":
-            return _finished(nerf([path]))
+            return nerf([path])
         if path.suffix.lower() == ".npy":
-            return _finished(llff(path))
+            return llff(path)
         raise InputError(f"{path}: pass the folder of a dataset, a .json or a .npy")
     if find_colmap(path) is not None:
-        return _finished(load_colmap(path, skip_missing=skip_missing, **where))
+        return load_colmap(path, skip_missing=skip_missing, **where)
     lists = find_transforms(path)
     if lists:
-        return _finished(nerf(lists))
+        return nerf(lists)
     if (path / "poses_bounds.npy").exists():
-        return _finished(llff(path / "poses_bounds.npy"))
+        return llff(path / "poses_bounds.npy")
     names = sorted(entry.name for entry in path.iterdir())
     raise InputError(
         f"{path}: no dataset is known by its content ({', '.join(names[:12]) or 'none'}"
@@ -103,9 +129,34 @@ def _finished(scene: Scene) -> Scene:
                 f"{scene.source}: the photograph {after.name!r} is listed more than "
                 "once; remove all but one"
             )
-    near = near_plane(np.stack([view.centre for view in views]))
+    centres = np.stack([view.centre for view in views])
+    _check_places(scene, [view.name for view in views], centres)
+    near = near_plane(centres)
     views = tuple(replace(view, near=near) for view in views)
     return rebase(replace(scene, views=views))
+
+
+def _check_places(scene: Scene, names: list[str], centres: np.ndarray) -> None:
+    """Refuse cameras that stand where nothing could be learnt with them.
+
+    One alone at the end of the world makes the extent of the scene, by which all is
+    measured, that of the world.
+    """
+    apart = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    usual, worst = float(np.median(apart)), int(np.argmax(apart))
+    if usual > 0 and apart[worst] > _MOST_APART * usual:
+        raise InputError(
+            f"{scene.source}: the camera of {names[worst]!r} stands {apart[worst]:.3g} "
+            f"from the middle of all, of which half are within {usual:.3g}; its pose "
+            "is damaged: remove the photograph, or estimate the cameras again"
+        )
+    worst = int(np.argmax(np.abs(centres).max(axis=1)))
+    if np.abs(centres[worst]).max() > _FARTHEST:
+        where = ", ".join(f"{value:.3g}" for value in centres[worst])
+        raise InputError(
+            f"{scene.source}: the camera of {names[worst]!r} stands at {where}; at "
+            f"most {_FARTHEST:g} from the origin is wanted: estimate the cameras again"
+        )
 
 
 def is_dataset(path: Path) -> bool:

@@ -10,7 +10,7 @@ import sys
 import tempfile
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -33,19 +33,26 @@ _MOST_HEARD = 2**20
 _stderr_lock = threading.RLock()  # that of the process, which others must not swap too
 
 
-def decode(path: Path, flags: int) -> np.ndarray:
+def decode(
+    path: Path, flags: int, check: Callable[[int, int], object] | None = None
+) -> np.ndarray:
     """Pixels of an image file, in OpenCV's order of channels.
 
     Args:
       path: the file; its own bytes are checked before anything is decoded.
       flags: of cv2.imdecode.
+      check: given the width and height in px that its header declares, before memory
+        is taken for them; raises if they are not what is wanted.
 
     Raises:
-      InputError: if it cannot be read, is no image, is truncated, declares more
-        pixels than any camera makes, or is a TIFF of half-transparent pixels.
+      InputError: as ``check``; if the file cannot be read, is no image, is truncated,
+        declares more pixels than any camera makes, or is a TIFF of half-transparent
+        pixels.
     """
     data = read_bytes(path, "a photograph")
-    check_image(path, data)
+    size = check_image(path, data)
+    if check is not None:
+        check(*size)
     cv2 = opencv()
     if flags & cv2.IMREAD_IGNORE_ORIENTATION:  # IMREAD_UNCHANGED is among them
         data = tiff_as_stored(data)  # of which OpenCV takes no notice in a TIFF

@@ -22,6 +22,11 @@ from gsjax.scene.undistort import undistortion_maps
 
 # Sizes that differ from the camera's by rounding only: 1 px a side and this much.
 _ASPECT_TOLERANCE = 0.01
+# How much longer than its camera's a side may be. Cameras are found in photographs made
+# smaller, by 8 or 16; a few bytes may declare a picture of any size.
+_MOST_LARGER = 64
+# Share of the pixels of a photograph that undoing its lens leaves; a heuristic.
+_LEAST_SEEN = 0.01
 _MAX_REMAP = 32766  # of cv2.remap
 _BATCH = 8  # photographs a thread, before anything is told of them
 Filter = Callable[[np.ndarray], np.ndarray]
@@ -42,7 +47,8 @@ def load_photo(view: View, max_size: int | None = None) -> Photo:
 
     Raises:
       InputError: if the file cannot be read, is no image, is truncated or too large,
-        has not the aspect ratio of the camera, or max_size is below 1.
+        has not the aspect ratio of the camera, as its header says, or is more than
+        64 times as wide; if its lens leaves nothing of it; or max_size is below 1.
     """
     with telling_of_damage(_files([view])):
         return _load(view, max_size)
@@ -56,7 +62,8 @@ def _files(views: Sequence[View]) -> list[Path]:
 def _load(view: View, max_size: int | None) -> Photo:
     if max_size is not None and max_size < 1:
         raise InputError(f"max_size {max_size}: at least 1 px is wanted")
-    stored = decode(view.image, opencv().IMREAD_UNCHANGED)  # which does not rotate
+    as_stored = opencv().IMREAD_UNCHANGED  # which does not rotate
+    stored = decode(view.image, as_stored, partial(_ratio, view))
     pixels, alpha = _to_rgb(view.image, stored)
     height, width = pixels.shape[:2]
     K = _scaled(view.K, *_ratio(view, width, height))
@@ -67,7 +74,8 @@ def _load(view: View, max_size: int | None) -> Photo:
                 f"{view.image}: {width} × {height} px; at most {_MAX_REMAP} px a side "
                 "are undistorted: make it smaller"
             )
-        pixels, alpha, invalid = _undistorted(view.lens, K, pixels, alpha, invalid)
+        given = (pixels, alpha, invalid)
+        pixels, alpha, invalid = _undistorted(view.image, view.lens, K, *given)
     if max_size is not None and max(width, height) > max_size:
         scale = max_size / max(width, height)
         size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -148,6 +156,12 @@ def _ratio(view: View, width: int, height: int) -> tuple[float, float]:
             f"× {view.height}; "
             + (remedy if turned else "one of the same aspect ratio is wanted")
         )
+    if max(sx, sy) > _MOST_LARGER:
+        raise InputError(
+            f"{view.image}: {width} × {height} px, but its camera is for {view.width} "
+            f"× {view.height}; at most {_MOST_LARGER} times as many a side are read: "
+            "make it smaller"
+        )
     return sx, sy
 
 
@@ -156,19 +170,25 @@ def _scaled(K: np.ndarray, sx: float, sy: float) -> np.ndarray:
     return np.asarray(K, np.float64) * np.asarray([[sx], [sy], [1.0]])
 
 
+def _check_mask(path: Path, size: tuple[int, int], across: int, down: int) -> None:
+    """See that a mask of so many px is one of a photograph of that size."""
+    width, height = size
+    rounding = 1 / across + 1 / down + 1 / width + 1 / height
+    stretched = abs(np.log(across / width * height / down))
+    if stretched > _ASPECT_TOLERANCE + rounding or across > _MOST_LARGER * width:
+        raise InputError(
+            f"{path}: a mask of {across} × {down} px for a photograph of {width} × "
+            f"{height}; one of the same aspect ratio, at most {_MOST_LARGER} times as "
+            "wide, is wanted"
+        )
+
+
 def _masked(path: Path, width: int, height: int) -> np.ndarray:
     """[H, W] bool: where the mask is 0."""
     cv2 = opencv()
-    mask = decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    mask = decode(path, flags, partial(_check_mask, path, (width, height)))
     if mask.shape != (height, width):
-        rounding = sum(1 / side for side in (*mask.shape, height, width))
-        stretch = mask.shape[1] / width * height / mask.shape[0]
-        if abs(np.log(stretch)) > _ASPECT_TOLERANCE + rounding:
-            raise InputError(
-                f"{path}: a mask of {mask.shape[1]} × {mask.shape[0]} px for a "
-                f"photograph of {width} × {height}; one of the same aspect ratio is "
-                "wanted"
-            )
         rows = (np.arange(height) + 0.5) * (mask.shape[0] / height)
         columns = (np.arange(width) + 0.5) * (mask.shape[1] / width)
         mask = mask[rows.astype(int)[:, None], columns.astype(int)]
@@ -199,6 +219,7 @@ def _maps(lens: Lens, values: tuple[float, ...], width: int, height: int):
 
 
 def _undistorted(
+    path: Path,
     lens: Lens,
     K: np.ndarray,
     pixels: np.ndarray,
@@ -208,6 +229,13 @@ def _undistorted(
     height, width = pixels.shape[:2]
     with _maps_lock:  # one thread computes what the others then find
         map_x, map_y, seen = _maps(lens, tuple(K.ravel().tolist()), width, height)
+    if seen.mean() < _LEAST_SEEN:
+        told = ", ".join(f"{value:g}" for value in lens.coefficients)
+        raise InputError(
+            f"{path}: of its {seen.size:,} pixels {int(seen.sum())} are left when the "
+            f"lens of its camera ({lens.kind}, {told}) is undone; estimate the camera "
+            "again, or remove the photograph"
+        )
     cv2 = opencv()
     remap = partial(
         cv2.remap,

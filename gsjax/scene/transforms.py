@@ -24,6 +24,7 @@ from gsjax.scene.transforms_fields import (
     model_of,
     pose_of,
     read_frames,
+    shown,
     size_of,
     text_of,
     warn_of_scaled,
@@ -150,7 +151,7 @@ def _model(frame: Frame) -> str:
     model = _MODELS.get(name)
     if model is None:
         raise InputError(
-            f"{frame.where}: camera_model {name!r} is not rendered; supported: "
+            f"{frame.where}: camera_model {shown(name)} is not rendered; supported: "
             f"{', '.join(_MODELS)}. Undistort the images to a pinhole first"
         )
     return model

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsjax import files
 from gsjax.errors import InputError
-from gsjax.files import read_json
 from gsjax.scene.colmap_model import MAX_COORDINATE, MAX_SIDE
 
 _RIGID_TOLERANCE = 1e-3
@@ -33,12 +33,13 @@ class Frame(NamedTuple):
 
 
 def shown(value) -> str:
-    return "missing" if value is None else repr(value)[:80]
+    """A value as found, for a message."""
+    return "missing" if value is None else files.shown(value)
 
 
 def read_frames(path: Path) -> list[Frame]:
     """The frames of a file, at least one."""
-    data = read_json(path, "a transforms.json")
+    data = files.read_json(path, "a transforms.json")
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(
@@ -94,12 +95,13 @@ def model_of(frame: Frame) -> str:
     for key in sorted(keys):
         if key.startswith(_OTHER_LENSES) and frame.get(key) not in (None, False):
             raise InputError(
-                f"{frame.where}: {key} is {shown(frame.get(key))}, of a lens that is "
-                "not supported; undistort the photographs to a pinhole first"
+                f"{frame.where}: {key[:40]} is {shown(frame.get(key))}, of a lens that "
+                "is not supported; undistort the photographs to a pinhole first"
             )
     if frame.get("is_fisheye") is True:  # instant-ngp
         return "OPENCV_FISHEYE"
-    return str(frame.get("camera_model") or "PINHOLE").upper()
+    name = frame.get("camera_model") or "PINHOLE"
+    return (name if isinstance(name, str) else shown(name)).upper()
 
 
 def size_of(frame: Frame) -> tuple[int, int] | None:

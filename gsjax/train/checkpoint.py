@@ -40,11 +40,13 @@ class Checkpoint(NamedTuple):
     """A file as read.
 
     Attributes:
+      path: of the file.
       step: at which it was written.
       arrays: by path in the state.
       meta: what was saved with it: ``capacity``, ``pair_capacity``, …
     """
 
+    path: Path
     step: int
     arrays: dict[str, np.ndarray]
     meta: dict[str, Any]
@@ -109,8 +111,12 @@ def _files(folder: Path) -> list[Path]:
     return [path for path in names if re.fullmatch(r"step_\d{9}\.npz", path.name)]
 
 
-def load_latest(folder: Path) -> Checkpoint:
-    """The latest checkpoint that can be read; a warning names those that cannot.
+def load_latest(folder: Path, steps: int | None = None) -> Checkpoint:
+    """The latest checkpoint that can be used; a warning names those that cannot.
+
+    Args:
+      folder: of the checkpoints.
+      steps: of the whole run; see `load_checkpoint`.
 
     Raises:
       InputError: if there is none.
@@ -118,7 +124,7 @@ def load_latest(folder: Path) -> Checkpoint:
     failed = []
     for path in reversed(_files(folder)):
         try:
-            found = load_checkpoint(path)
+            found = load_checkpoint(path, steps)
         except InputError as error:
             failed.append(str(error))
             continue
@@ -129,11 +135,16 @@ def load_latest(folder: Path) -> Checkpoint:
     raise InputError(f"{folder}: no checkpoint to go on from{told}; train anew")
 
 
-def load_checkpoint(path: Path) -> Checkpoint:
+def load_checkpoint(path: Path, steps: int | None = None) -> Checkpoint:
     """One file.
 
+    Args:
+      path: of the file.
+      steps: of the whole run, beyond which it cannot have come; None for any.
+
     Raises:
-      InputError: if it is damaged, cut short or no checkpoint.
+      InputError: if it is damaged, cut short or no checkpoint, or holds values that no
+        run can have come to.
     """
     where = f"{path}: no readable checkpoint"
     arrays = {
@@ -164,7 +175,58 @@ def load_checkpoint(path: Path) -> Checkpoint:
             found = repr(meta.get(key, "missing"))[:80]
             told = f"; {_FORMAT} is wanted" if key == "format" else ""
             raise InputError(f"{where}: {_META}: {key} {found}{told}; {_REMEDY}")
-    return Checkpoint(meta["step"], arrays, meta)
+    fault = _step_fault(path, arrays, meta["step"], steps) or _fault(arrays)
+    if fault is not None:
+        raise InputError(f"{path}: damaged checkpoint: {fault}; {_REMEDY}")
+    return Checkpoint(path, meta["step"], arrays, meta)
+
+
+def _step_fault(
+    path: Path, arrays: dict[str, np.ndarray], step: int, steps: int | None
+) -> str | None:
+    """What contradicts the step that a checkpoint says it is of."""
+    named = re.fullmatch(r"step_(\d{9})\.npz", path.name)
+    if named is not None and int(named[1]) != step:
+        return f"{_META} says step {step}, and its name another"
+    if steps is not None and step > steps:
+        return f"{_META} says step {step} of a run of {steps} (config.json)"
+    told = arrays.get(".step", np.int32(step)).tolist()
+    if told != step:
+        return f".step is {str(told)[:40]}, and {_META} says {step}"
+    for name in (".moments.count", ".tuning_moments.count"):
+        # Steps without a gradient are not counted.
+        count = arrays.get(name, np.int32(0)).tolist()
+        if not (isinstance(count, int) and 0 <= count <= step):
+            return f"{name} is {str(count)[:40]}; 0 to {step}, the step, is wanted"
+    return None
+
+
+def _fault(arrays: dict[str, np.ndarray]) -> str | None:
+    """What no training leaves behind: numbers that are not finite, squares below 0.
+
+    What stands in an inactive slot does not matter.
+    """
+    active = arrays.get(".gaussians.active", np.ones(0, bool))
+    if active.dtype != bool or active.ndim != 1 or (active.view(np.uint8) > 1).any():
+        return ".gaussians.active is no list of what is true or false"
+    for name, array in arrays.items():
+        if array.dtype.kind != "f":
+            continue
+        squares = name.startswith((".moments.nu", ".tuning_moments.nu", ".stats"))
+        good = np.isfinite(array)
+        if squares:
+            good &= array >= 0
+        if name.startswith(".tuning"):
+            bad = ~good
+        elif array.shape[:1] == active.shape:
+            bad = active & ~good.reshape(len(active), -1).all(axis=1)
+        else:  # of other settings, which `restore` tells of
+            continue
+        if bad.any():
+            wanted = "finite numbers" + " of at least 0" * squares
+            where = f"{np.argwhere(bad)[0].tolist()} the first"
+            return f"{name}: {bad.sum()} of {bad.size} are not {wanted}, {where}"
+    return None
 
 
 def _lengths(arrays: dict[str, np.ndarray]) -> set[int]:
@@ -221,8 +283,8 @@ def restore(checkpoint: Checkpoint, template: TrainState) -> TrainState:
     if set(names) != set(checkpoint.arrays):
         differing = sorted(set(names) ^ set(checkpoint.arrays))[:3]
         raise InputError(
-            f"the checkpoint of step {checkpoint.step} is of other settings: "
-            f"{differing} differ; pass those of the run, or train anew"
+            f"{checkpoint.path}: the checkpoint of step {checkpoint.step} is of other "
+            f"settings: {differing} differ; pass those of the run, or train anew"
         )
     out = []
     for name, (_, leaf) in zip(names, leaves):
@@ -230,9 +292,10 @@ def restore(checkpoint: Checkpoint, template: TrainState) -> TrainState:
         wanted = jax.random.key_data(leaf) if _is_key(leaf) else leaf
         if array.shape != wanted.shape or array.dtype != wanted.dtype:
             raise InputError(
-                f"the checkpoint of step {checkpoint.step} has {name} as {array.dtype} "
-                f"{array.shape}; {wanted.dtype} {wanted.shape} is wanted: its settings "
-                "are others"
+                f"{checkpoint.path}: the checkpoint of step {checkpoint.step} has "
+                f"{name} as {array.dtype} {array.shape}; {wanted.dtype} {wanted.shape} "
+                "is wanted: its settings are others; pass those of the run, or train "
+                "anew"
             )
         value = jnp.asarray(array)
         out.append(jax.random.wrap_key_data(value) if _is_key(leaf) else value)

@@ -1,14 +1,16 @@
 """What a run wrote of its steps, read back, and as a picture."""
 
+import io
 import json
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsjax.curves import Series, curves_png
+from gsjax.curves import Mark, Series, curves_png
 from gsjax.errors import InputError
 from gsjax.files import append_to_file, finite_or_none, read_bytes, write_file
 
@@ -53,23 +55,50 @@ class Journal:
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Lines of a `metrics.jsonl` or `held_out.jsonl`, but for those that were cut short
-    by a kill; none if it is not there.
+    """Records of a `metrics.jsonl` or `held_out.jsonl`; none if it is not there.
+
+    A last one that a kill cut short is left out; of what else is none, it is warned.
 
     Raises:
       InputError: if it cannot be read.
     """
     if not path.exists():
         return []
-    lines = []
-    for line in read_bytes(path, "a metrics.jsonl").splitlines():
-        try:
-            record = json.loads(line)
-        except (ValueError, RecursionError):
-            continue
-        if isinstance(record, dict) and all(map(_is_number, _needed(record))):
+    lines, odd = [], []
+    for number, line in enumerate(_lines(path), 1):
+        record = _record(line)
+        if record is not None:
             lines.append(record)
+        elif not _is_cut_short(line) and line.strip():
+            odd.append(number)
+    if odd:
+        warnings.warn(
+            f"{path}: {len(odd)} of {len(lines) + len(odd)} lines are no records of a "
+            f"step and left out, the first: line {odd[0]}; the file is damaged: train "
+            "anew for a whole one",
+            UserWarning,
+            stacklevel=2,
+        )
     return lines
+
+
+def _is_cut_short(line: bytes) -> bool:
+    return not line.endswith(b"\n") and b'{"'.startswith(line[:2])
+
+
+def _lines(path: Path) -> Iterator[bytes]:
+    """Of a file, whose content is not held a second time."""
+    return iter(io.BytesIO(read_bytes(path, "a metrics.jsonl")))
+
+
+def _record(line: bytes) -> dict[str, Any] | None:
+    """What a line holds; None if that is no record."""
+    try:
+        record = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    good = isinstance(record, dict) and all(map(_is_number, _needed(record)))
+    return record if good else None
 
 
 def keep_steps(path: Path, steps: int) -> None:
@@ -101,6 +130,8 @@ def write_curves(
 ) -> None:
     """PSNR by step: of the view that each step saw, its mean, and of held-out views.
 
+    A thin line marks where the size of the images changed, if the records have it.
+
     Args:
       path: of the PNG; replaced if it exists.
       metrics, held_out: see `read_metrics`.
@@ -128,5 +159,21 @@ def write_curves(
     curves_png(
         path,
         series,
-        title=f"PSNR in training, dB ({left:,} Gaussians)",
+        title="PSNR in training, dB",
+        # At the end more are dropped, those that no photograph shows.
+        x_label=f"step ({left:,} Gaussians after the last)",
+        marks=_sizes(metrics),
     )
+
+
+def _sizes(metrics: Sequence[dict[str, Any]]) -> list[Mark]:
+    """Where images of another size began, unless all were of one."""
+    marks: list[Mark] = []
+    for record in metrics:
+        divisor = record.get("divisor")
+        if type(divisor) is not int:  # of an older run
+            continue
+        label = "full size" if divisor == 1 else f"1/{divisor} of the size"
+        if not marks or marks[-1].label != label:
+            marks.append(Mark(label, record["step"]))
+    return marks if len(marks) > 1 else []

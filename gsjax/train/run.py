@@ -175,7 +175,7 @@ def resume_run(
 
 
 def _last_checkpoint(files: RunFiles, config: TrainConfig, scene: Scene) -> Start:
-    found = load_latest(files.checkpoints)
+    found = load_latest(files.checkpoints, config.steps)
     capacity = int(found.meta["capacity"])
     template = empty_state(config, extent_of(scene), len(scene.views), capacity)
     return Start(

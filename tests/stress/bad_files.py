@@ -1,5 +1,6 @@
 """Bad files of every format, made of good ones: what is done to them, and the error."""
 
+import io
 import json
 import struct
 import zipfile
@@ -86,6 +87,33 @@ def meta(key, to):
 
 def first_array(found):
     return next(name for name in found if "means" in name)
+
+
+def values(name: str, edit: Callable):
+    """Other values in an array of the checkpoint, whose checksums are right."""
+
+    def change(found):
+        array = np.load(io.BytesIO(found[name + ".npy"]))
+        found[name + ".npy"] = npy(edit(array))
+
+    return entries(change)
+
+
+def spoilt(index, value):
+    """Puts a value into an array."""
+
+    def edit(array):
+        array[index] = value
+        return array
+
+    return edit
+
+
+def webp(width: int, height: int) -> bytes:
+    """A lossless WebP of 34 bytes, of which little but the size is there."""
+    bits = struct.pack("<BI", 0x2F, (width - 1) | (height - 1) << 14) + bytes(9)
+    chunk = b"VP8L" + struct.pack("<I", len(bits)) + bits
+    return b"RIFF" + struct.pack("<I", len(chunk) + 4) + b"WEBP" + chunk
 
 
 def jpeg_of(width: int, height: int):
@@ -178,6 +206,16 @@ BAD = {
         lambda d: d[:-2] + b"1_0\n",
         r"vertex 3 \(byte \d+\): an underscore",
     ),
+    "ply row endless": Bad(
+        "ascii.ply",
+        lambda d: d[: d.index(b"end_header") + 11] + b"1 " * 500_000,
+        r"vertex 0 \(byte \d+\): a line of \d+ bytes or more, 17 values are wanted",
+    ),
+    "ply digits": Bad(
+        "ascii.ply",
+        lambda d: d[:-2] + "\uff11\n".encode(),
+        r"vertex 3 \(byte \d+\): could not convert",
+    ),
     "cloud without y": Bad(
         "cloud.ply", swap("float y", "float why"), "x, y, z are wan"
     ),
@@ -236,6 +274,46 @@ BAD = {
     "text colour": Bad("text/points3D.txt", swap("255", "256"), "line 3: colour .256"),
     "text track": Bad("text/points3D.txt", swap("2 1\n", "2\n"), "line 3: the track"),
     "text point": Bad("text/points3D.txt", swap("0.5 1", "0.5 1_"), "line 3: .*1_"),
+    "text digits": Bad(
+        "text/cameras.txt", swap("42", "\uff14\uff12"), "line 3: could not convert"
+    ),
+    "text point digits": Bad(
+        "text/points3D.txt", swap("0.5 1", "0.\uff15 1"), "line 3: could not convert"
+    ),
+    "text point id": Bad(
+        "text/points3D.txt", swap("\n1 ", "\n1.0 "), "line 3: the point id is '1.0'"
+    ),
+    "text point id long": Bad(
+        "text/points3D.txt", swap("\n1 ", "\n18446744073709551616 "), "line 3: the poi"
+    ),
+    "text track of nan": Bad(
+        "text/points3D.txt",
+        swap("1 0 2 1\n", "1 nan 2 1\n"),
+        "line 3: a value of the track is 'nan'; a whole number",
+    ),
+    "text point control": Bad(
+        "text/points3D.txt", swap("0.5 1", "0.5\x1c1"), "after line 0: characters that"
+    ),
+    "text camera endless": Bad(
+        "text/cameras.txt",
+        constant("1 PINHOLE 640 480 " + "5 " * 500_000),
+        "line 1: a line of more than 16384 characters",
+    ),
+    "text image endless": Bad(
+        "text/images.txt",
+        constant("# a\n" + "1 " * 500_000),
+        "line 2: a line of more than 16384 characters",
+    ),
+    "text comment endless": Bad(
+        "text/images.txt",
+        constant("#" * 500_000),
+        "line 1: a line of more than 16384 characters",
+    ),
+    "text track endless": Bad(
+        "text/points3D.txt",
+        constant("1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 0" + " 1 2" * 500_000),
+        "line 2: a line of more than 1048576 characters",
+    ),
     # transforms.json
     "json empty": Bad("transforms.json", constant(b""), "not JSON: .*char 0"),
     "json deep": Bad("transforms.json", constant(DEEP), "not JSON"),
@@ -243,6 +321,21 @@ BAD = {
         "transforms.json",
         constant('{"frames":[' + "{}," * 50_000 + "{}]}"),
         "50003 objects and lists in 150015 bytes",
+    ),
+    "json of keys": Bad(
+        "transforms.json",
+        constant("{" + "".join(f'"k{i}":1,' for i in range(50_000)) + '"frames":[]}'),
+        "50001 keys in 1 objects, which no list of cameras has",
+    ),
+    "json of numbers": Bad(
+        "transforms.json",
+        constant('{"frames":[' + "1.5," * 50_000 + "1]}"),
+        "50000 values in 1 objects and 200014 bytes",
+    ),
+    "json of words": Bad(
+        "transforms.json",
+        constant('{"frames":[' + '"a",' * 50_000 + "1]}"),
+        "50000 values in 1 objects and 200014 bytes",
     ),
     "json encoding": Bad("transforms.json", constant(b"\xff\xfe\xff"), "not JSON"),
     "json list": Bad(
@@ -274,6 +367,9 @@ BAD = {
     "json text": Bad("transforms.json", frame("fl_x", "40"), r"\[1\]: fl_x is '40'; a"),
     "json focal": Bad("transforms.json", frame("fl_x", 0), r"\[1\]: focal lengths 0"),
     "json lens": Bad("transforms.json", frame("camera_model", "SPHERE"), "'SPHERE'"),
+    "json lens endless": Bad(
+        "transforms.json", frame("camera_model", "A" * 500_000), "A' is not|A'? is not"
+    ),
     "json path number": Bad("transforms.json", frame("file_path", 7), "file_path is 7"),
     "json path up": Bad(
         "transforms.json", frame("file_path", "../../etc/passwd"), rf"\[1\]: {LEAVING}"
@@ -331,6 +427,17 @@ BAD = {
     "photo bomb": Bad("photo.png", constant(png(15_000, 15_000)), "cannot fit in it"),
     "photo zero": Bad("photo.png", constant(png(0, 5)), "0 × 5 px"),
     "photo aspect": Bad("photo.png", constant(png(16, 20, 0)), "16 × 20 px, but it"),
+    "photo aspect by header": Bad(
+        "photo.webp", constant(webp(16_383, 16_383)), "16383 × 16383 px, but it"
+    ),
+    "photo size by header": Bad(
+        "photo.webp",
+        constant(webp(16_380, 12_285)),
+        "16380 × 12285 px, but its camera is for 8 × 6; at most 64 times",
+    ),
+    "mask size by header": Bad(
+        "mask.png", constant(webp(16_380, 12_285)), "a mask of 16380 × 12285 px"
+    ),
     "photo checksum": Bad("photo.png", put(50, "B", 77), "cannot be decoded"),
     "jpeg cut": Bad("photo.jpg", lambda d: d[:-9], "no end-of-image marker"),
     "jpeg bomb": Bad("photo.jpg", jpeg_of(8000, 8000), "8000 × 8000 px cannot fit"),
@@ -380,6 +487,41 @@ BAD = {
         STEP,
         entries(lambda e: e.update({first_array(e): npy_of(NPY % "9999999999999,")})),
         r"means.*8 bytes follow the header, .* takes 7999",
+    ),
+    "zip other step": Bad(
+        STEP, meta("step", 8), "meta.json says step 8, and its name another"
+    ),
+    "zip step below 0": Bad(
+        STEP,
+        values(".step", lambda a: a * 0 - 5),
+        r"\.step is -5, and meta.json says 7",
+    ),
+    "zip steps": Bad(
+        STEP, values(".step", lambda a: np.full(9, 7, a.dtype)), r"\.step is \[7, 7"
+    ),
+    "zip count": Bad(
+        STEP, values(".moments.count", lambda a: a + 8), r"count is 8; 0 to 7, the step"
+    ),
+    "zip nan": Bad(
+        STEP,
+        values(".gaussians.params.means", spoilt(2, np.nan)),
+        r"means: 1 of 4 are not finite numbers, \[2\] the first",
+    ),
+    "zip infinite square": Bad(
+        STEP,
+        values(".moments.nu.sh", spoilt(1, np.inf)),
+        r"nu\.sh: 1 of 4 are not finite numbers of at least 0, \[1\] the first",
+    ),
+    "zip square below 0": Bad(
+        STEP, values(".moments.nu.quats", spoilt(0, -1)), "nu.quats: 1 of 4 are not fin"
+    ),
+    "zip statistic": Bad(
+        STEP, values(".stats.gradient", spoilt(0, np.nan)), "gradient: 1 of 4 are not"
+    ),
+    "zip truth": Bad(
+        STEP,
+        values(".gaussians.active", lambda a: (a * np.uint8(3)).view(bool)),
+        "active is no list of what is true or false",
     ),
     # what a run writes
     "config empty": Bad("config.json", constant(b""), "not JSON"),

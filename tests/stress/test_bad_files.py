@@ -148,7 +148,11 @@ def test_a_log_cut_short_is_what_was_whole(tmp_path):
         assert found == [1, 2, 3][: int((ends <= length).sum())]
     for bad in (b"\xff\0\0", b"[" * 200_000, b'{"step": "1"}', b"3"):
         path.write_bytes(bad + b"\n" + whole)
-        assert [line["step"] for line in read_metrics(path)] == [1, 2, 3]
+        with pytest.warns(UserWarning, match="1 of 4 lines .* the first: line 1"):
+            assert [line["step"] for line in read_metrics(path)] == [1, 2, 3]
+        path.write_bytes(bad + b"\n")
+        with pytest.warns(UserWarning, match="1 of 1 lines are no records"):
+            assert read_metrics(path) == []
 
 
 # --- names of COLMAP, and of files in general ---
