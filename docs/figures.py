@@ -12,7 +12,7 @@ from gsjax.raster.order import depth_order
 from gsjax.raster.project import project
 from gsjax.scene.synthetic import torus_knot_scene
 from gsjax.sh import rgb_to_dc
-from gsjax.sheets import depth_colors, put_text, text_width
+from gsjax.sheets import depth_colors, put_text, text_width, wrapped
 
 ASSETS = Path(__file__).parent / "assets"
 
@@ -56,6 +56,8 @@ def order() -> None:
 
 _PAPER, _INK, _BACK = (255, 255, 255), (60, 64, 72), (190, 70, 40)
 _GAP, _TILE = 46, 16
+# Shown half as wide on the pages.
+_HEAD, _TEXT, _LINE = 1.15, 0.9, 32
 
 
 def pipeline() -> None:
@@ -81,29 +83,33 @@ def pipeline() -> None:
         ("blend", "tile by tile, front to back"),
     ]
     height, width = dots.shape[:2]
-    page = np.full((height + 116, 4 * width + 3 * _GAP + 20, 3), 255, np.uint8)
-    for index, (panel, (title, text)) in enumerate(zip(panels, captions)):
+    texts = [wrapped(text, width, _TEXT) for _, text in captions]
+    below = height + 80 + _LINE * max(map(len, texts))
+    page = np.full((below + 50, 4 * width + 3 * _GAP + 20, 3), 255, np.uint8)
+    for index, (panel, (title, _), text) in enumerate(zip(panels, captions, texts)):
         left = 10 + index * (width + _GAP)
         pixels = np.rint(255 * np.clip(panel, 0, 1)).astype(np.uint8)
         page[10 : 10 + height, left : left + width] = pixels
         cv2.rectangle(page, (left, 10), (left + width, 10 + height), _INK, 1)
-        put_text(page, title, (left, height + 36), _INK, 0.6)
-        put_text(page, text, (left, height + 57), _INK)
+        put_text(page, title, (left, height + 48), _INK, _HEAD)
+        for number, line in enumerate(text):
+            put_text(page, line, (left, height + 86 + _LINE * number), _INK, _TEXT)
         if index:
             middle = 10 + height // 2
             _arrow(page, (left - _GAP + 8, middle), (left - 8, middle), _INK)
-    row, right = height + 84, page.shape[1] - 12
+    row, right = below + 20, page.shape[1] - 12
     _arrow(page, (right, row), (12, row), _BACK)
     told = "jax.grad, jax.jvp: by Gaussians, camera and background"
-    left = (page.shape[1] - text_width(told, 0.5)) // 2
-    page[row - 8 : row + 9, left - 10 : left + text_width(told, 0.5) + 10] = _PAPER
-    put_text(page, told, (left, row + 5), _BACK, 0.5)
+    wide = text_width(told, _TEXT)
+    left = (page.shape[1] - wide) // 2
+    page[row - 14 : row + 15, left - 16 : left + wide + 16] = _PAPER
+    put_text(page, told, (left, row + 9), _BACK, _TEXT)
     write("pipeline.webp", page / 255)
 
 
 def _arrow(page: np.ndarray, start: tuple[int, int], end: tuple[int, int], color):
-    tip = 9 / max(abs(end[0] - start[0]), 1)
-    cv2.arrowedLine(page, start, end, color, 2, cv2.LINE_AA, tipLength=tip)
+    tip = 12 / max(abs(end[0] - start[0]), 1)
+    cv2.arrowedLine(page, start, end, color, 3, cv2.LINE_AA, tipLength=tip)
 
 
 def _ellipses(seen, shape: tuple[int, ...]) -> np.ndarray:

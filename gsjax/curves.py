@@ -12,6 +12,7 @@ from gsjax.files import write_file
 from gsjax.sheets import put_text, text_width
 
 PAPER, _INK, _GRID = (255, 255, 255), (70, 74, 82), (228, 230, 234)
+_MARK = (150, 154, 162)
 COLORS = (
     (38, 98, 186), (214, 92, 52), (44, 142, 92), (142, 82, 168), (176, 138, 28),
     (20, 150, 170), (190, 60, 120), (110, 110, 110), (90, 60, 30), (0, 0, 0),
@@ -32,15 +33,27 @@ class Series(NamedTuple):
     faint: bool = False
 
 
+class Mark(NamedTuple):
+    """A thin line upright at ``x``, from which on something holds, with its name."""
+
+    label: str
+    x: float
+
+
 def curves_png(
-    path: Path, series: Sequence[Series], *, title: str = "", x_label: str = "step"
+    path: Path,
+    series: Sequence[Series],
+    *,
+    title: str = "",
+    x_label: str = "step",
+    marks: Sequence[Mark] = (),
 ) -> None:
     """Write `curves` to a PNG, in place of what may be there.
 
     Raises:
       InputError: as `curves`, or if the file cannot be written.
     """
-    pixels = curves(series, title=title, x_label=x_label)
+    pixels = curves(series, title=title, x_label=x_label, marks=marks)
     write_file(path, images.encode_png(pixels))
 
 
@@ -50,6 +63,7 @@ def curves(
     title: str = "",
     x_label: str = "step",
     size: tuple[int, int] = (720, 420),
+    marks: Sequence[Mark] = (),
 ) -> np.ndarray:
     """A plot [H, W, 3] uint8 of all series in one frame, with a legend.
 
@@ -58,6 +72,7 @@ def curves(
       title: above the frame.
       x_label: below it.
       size: (width, height) in px, at least 200 × 120.
+      marks: by ``x``; those that lie within the frame are drawn, behind the series.
 
     Raises:
       InputError: if ``x`` and ``y`` differ in length, or the size is too small.
@@ -68,6 +83,9 @@ def curves(
     )
     ranges = _range(finite[:, 0], 0.0), _range(finite[:, 1], 0.06)
     plot, place = axes(*ranges, title=title, x_label=x_label, size=size)
+    inside = [m for m in marks if ranges[0][0] <= m.x <= ranges[0][1]]
+    at = place(np.asarray([(mark.x, ranges[1][0]) for mark in inside]).reshape(-1, 2))
+    _draw_marks(plot, inside, np.rint(at[:, 0]).astype(int).tolist())
     for index, points in enumerate(lines):
         gaps = np.flatnonzero(~np.isfinite(points).all(axis=1))
         for piece in np.split(points, gaps):
@@ -137,6 +155,18 @@ def draw_line(
         cv2.polylines(plot, [at], False, _color(index, faint), width, 16, _FINE)
 
 
+def _draw_marks(plot: np.ndarray, marks: Sequence[Mark], where: list[int]) -> None:
+    """Lines at these px, and names beside them, lower where one is in the way."""
+    bottom, taken = plot.shape[0] - BOTTOM, list[int]()
+    for mark, u in zip(marks, where):
+        images.opencv().line(plot, (u, TOP), (u, bottom), _MARK, 1)
+        width = text_width(mark.label, 0.38)
+        left = min(u + 4, plot.shape[1] - RIGHT - width)
+        row = next((i for i, end in enumerate(taken) if end < left), len(taken))
+        taken[row : row + 1] = [left + width + 4]
+        put_text(plot, mark.label, (left, bottom - 6 - 14 * row), _INK, 0.38)
+
+
 def _color(index: int, faint: bool) -> tuple[int, ...]:
     color = COLORS[index % len(COLORS)]
     return tuple(255 - (255 - c) * 45 // 100 for c in color) if faint else color
@@ -182,8 +212,9 @@ def _decades(low: float, high: float, most: int) -> list[tuple[float, str]]:
     first = step * int(np.floor(low / step))
     powers = range(first, int(np.ceil(high)) + 1, step)
     found = [(k + float(np.log10(f)), f, k) for k in powers for f in factors]
+    short = low >= -4 and high < 6  # one notation for all
     return [
-        (place, short_number(f * 10.0**k) if -4 <= k < 6 else f"{f}e{k}")
+        (place, short_number(f * 10.0**k) if short else f"{f}e{k}")
         for place, f, k in found
         if low <= place <= high
     ]

@@ -11,6 +11,7 @@ from gsjax.curves import axes, draw_line, legend
 from gsjax.gaussians import Gaussians
 
 _BINS, _SIZE = 60, (720, 300)
+_TAIL = 1e-3  # of the values at either end may lie beyond a logarithmic axis
 
 
 class Group(NamedTuple):
@@ -34,7 +35,9 @@ def histograms(gaussians: Gaussians, *, title: str = "") -> np.ndarray:
     """Three plots [H, W, 3] uint8, one above the other, of the active Gaussians.
 
     Opacity; the scales, by length of axis, in world units; and the longest scale over
-    the shortest. The latter two on logarithmic axes.
+    the shortest. The latter two on logarithmic axes, which hold what lies between the
+    0.1 and the 99.9 % quantile: a few outliers would else own them. How many values lie
+    beyond, and how many are not finite, is said.
     """
     active = np.asarray(gaussians.active)
     logits = np.asarray(gaussians.params.logit_opacities, np.float64)[active]
@@ -67,9 +70,16 @@ def _histogram(
     bounds = x or _rounded(every)
     edges = np.linspace(*bounds, _BINS + 1)
     counts = [np.histogram(values, edges)[0] for values in finite]
+    left_out = {
+        "below": np.count_nonzero(every < bounds[0]),
+        "above": np.count_nonzero(every > bounds[1]),
+        "not finite": sum(group.values.size for group in groups) - every.size,
+    }
+    told = ", ".join(f"{count:,} {what}" for what, count in left_out.items() if count)
     top = 1.06 * max(1, *(int(each.max()) for each in counts))
     plot, place = axes(
-        bounds, (0.0, top), title=title, x_label=x_label, size=_SIZE,
+        bounds, (0.0, top), size=_SIZE,
+        title=title, x_label=f"{x_label} ({told})" if told else x_label,
         log=(not x, False), y_label="" if len(groups) > 1 else "count",
     )  # fmt: skip
     for index, each in enumerate(counts):
@@ -83,8 +93,12 @@ def _histogram(
 
 
 def _rounded(logs: np.ndarray) -> tuple[float, float]:
-    """A range of whole or half decades, of at least one, that holds these log10."""
+    """A range of whole or half decades, of at least one, that holds these log10: all of
+    fewer than a thousand, of more all but `_TAIL` at either end.
+    """
     if not len(logs):
         return -1.0, 0.0
-    low, high = np.floor(2 * logs.min()) / 2, np.ceil(2 * logs.max()) / 2
+    least = np.quantile(logs, _TAIL, method="lower")
+    most = np.quantile(logs, 1 - _TAIL, method="higher")
+    low, high = np.floor(2 * least) / 2, np.ceil(2 * most) / 2
     return float(low), float(max(high, low + 1))

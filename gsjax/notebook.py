@@ -250,7 +250,8 @@ def _preview(view: Render, photo: np.ndarray | None, name: str) -> np.ndarray:
     rgb, depth = np.asarray(view.rgb), np.asarray(view.depth)
     if photo is not None:
         width = min(max(photo.shape[1], 120), 240)
-        row = SheetRow(name, photo, np.clip(rgb, 0, 1), depth)
+        rgb = np.clip(rgb, 0, 1)
+        row = SheetRow("photograph", photo, rgb, depth, rendered=f"{name},")
         return comparison([row], width=width)
     found = sketches.of_depth(depth)
     return sketches.sheet([Cell(sketches.visible(rgb), name), found], None, _MOST)

@@ -18,23 +18,26 @@ MAGNIFIED = 4  # the error is shown so many times as large
 _PAPER, _TEXT, _FAINT = (24, 26, 31), (232, 234, 238), (150, 156, 166)
 _MISSING = (255, 0, 255)  # what is not finite
 _NOTHING = (44, 47, 54)  # where there is no depth
-_GAP, _BAR = 6, 20  # between cells, and the height of a caption, in px
+# In px: between cells, the height of a caption, and of each line that it has more.
+_GAP, _BAR, _LINE = 6, 20, 15
 
 
 class SheetRow(NamedTuple):
     """One view.
 
     Attributes:
-      name: what the caption calls it.
+      name: what the caption calls it, below the photograph.
       truth: [H, W, 3] the photograph, uint8, or floats in [0, 1].
       render: [H, W, 3] alike.
       depth: [H, W] of the render, 0 where nothing is; or None.
+      rendered: what is said below the render, before its PSNR.
     """
 
     name: str
     truth: np.ndarray
     render: np.ndarray
     depth: np.ndarray | None = None
+    rendered: str = "render"
 
 
 def comparison(rows: Sequence[SheetRow], *, width: int = 320) -> np.ndarray:
@@ -45,7 +48,7 @@ def comparison(rows: Sequence[SheetRow], *, width: int = 320) -> np.ndarray:
 
     Args:
       rows: the views, of any sizes.
-      width: of a cell in px; pictures are scaled to it.
+      width: of a cell in px; pictures are scaled to it, and captions broken into lines.
 
     Raises:
       InputError: if there is no row, or the pictures of one are not of one size.
@@ -82,14 +85,38 @@ def put_text(
 ) -> None:
     """Write into ``picture`` [H, W, 3]; ``place`` (x, y) is where the line begins."""
     cv2 = images.opencv()
-    text = text.encode("ascii", "replace").decode()
+    text = _ascii(text)
     cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, 16)
 
 
 def text_width(text: str, size: float = 0.42) -> int:
     """Width in px of what `put_text` writes."""
     cv2 = images.opencv()
-    return cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0]
+    return cv2.getTextSize(_ascii(text), cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0]
+
+
+def _ascii(text: str) -> str:
+    return text.encode("ascii", "replace").decode()
+
+
+def wrapped(text: str, width: int, size: float = 0.42) -> list[str]:
+    """Lines that `put_text` writes into ``width`` px: words, broken where one is wider.
+
+    Every character but for the blanks between lines is in them, at least one in each.
+    """
+    lines = [""]
+    for word in text.split():
+        longer = f"{lines[-1]} {word}".lstrip()
+        if text_width(longer, size) <= width:
+            lines[-1] = longer
+            continue
+        if lines[-1]:
+            lines.append("")
+        for letter in word:
+            if lines[-1] and text_width(lines[-1] + letter, size) > width:
+                lines.append("")
+            lines[-1] += letter
+    return lines
 
 
 def _row(row: SheetRow, width: int, with_depth: bool) -> np.ndarray:
@@ -103,17 +130,16 @@ def _row(row: SheetRow, width: int, with_depth: bool) -> np.ndarray:
             f"{row.name}: the depth is {row.depth.shape}, the photograph {truth.shape}"
         )
     error = np.abs(truth - render)
-    cells = [
-        _cell(visible(truth), row.name, width),
-        _cell(visible(render), f"render  {_psnr(error)}", width),
-        _cell(visible(MAGNIFIED * error), f"error x {MAGNIFIED}", width),
-    ]
+    pictures = [visible(truth), visible(render), visible(MAGNIFIED * error)]
+    captions = [row.name, f"{row.rendered} {_psnr(error)}", f"error x {MAGNIFIED}"]
     if row.depth is not None:
         pixels, near, far = depth_colors(row.depth)
-        cells.append(
-            _cell(pixels, f"depth, 2 to 98 %:  {near:.3g} to {far:.3g}", width)
-        )
-    elif with_depth:
+        pictures.append(pixels)
+        captions.append(f"depth, 2 to 98 %: {near:.3g} to {far:.3g}")
+    texts = [wrapped(caption, width - 2) for caption in captions]
+    bar = _BAR + _LINE * (max(map(len, texts)) - 1)
+    cells = [_cell(*one, width, bar) for one in zip(pictures, texts)]
+    if with_depth and row.depth is None:
         cells.append(np.full_like(cells[0], _PAPER))
     return np.concatenate(cells, axis=1)
 
@@ -138,19 +164,18 @@ def visible(picture: np.ndarray) -> np.ndarray:
     return np.where(finite, pixels, np.asarray(_MISSING, np.uint8))
 
 
-def _cell(pixels: np.ndarray, caption: str, width: int) -> np.ndarray:
-    """A picture scaled to ``width`` over its caption, with a margin."""
+def _cell(pixels: np.ndarray, lines: list[str], width: int, bar: int) -> np.ndarray:
+    """A picture scaled to ``width`` over its caption of ``bar`` px, with a margin."""
     cv2 = images.opencv()
     height = max(1, round(width * pixels.shape[0] / pixels.shape[1]))
     shrinks = width < pixels.shape[1]
     how = cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST
-    cell = np.full((height + _BAR + _GAP, width + _GAP, 3), _PAPER, np.uint8)
+    cell = np.full((height + bar + _GAP, width + _GAP, 3), _PAPER, np.uint8)
     left = _GAP // 2
     top = left
     cell[top : top + height, left : left + width] = cv2.resize(
         np.ascontiguousarray(pixels), (width, height), interpolation=how
     )
-    while len(caption) > 1 and text_width(caption) > width:
-        caption = caption[:-1]
-    put_text(cell, caption, (left + 2, top + height + 14), _FAINT)
+    for index, line in enumerate(lines):
+        put_text(cell, line, (left + 2, top + height + 14 + _LINE * index), _FAINT)
     return cell

@@ -17,12 +17,13 @@ from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.raster.types import Render
 from gsjax.sh import dc_to_rgb
-from gsjax.sheets import depth_colors, put_text, text_width
+from gsjax.sheets import depth_colors, put_text, text_width, wrapped
 from gsjax.viewer.splats import Cut, most_important, within
 
 _PAPER, _TEXT, _ALARM = (24, 26, 31), (200, 204, 212), (255, 120, 90)
-_GAP, _BAR, _LINE = 4, 18, 17
+_GAP, _BAR, _LINE, _SMALL = 4, 18, 17, 0.38
 _SHEET = 960  # px, how wide a sheet becomes by itself
+_NARROW = 96  # px, as wide as captions may make a cell
 _MOST_CELLS = 24
 _DISCS = 20_000
 _SIZE = (320, 240)
@@ -219,20 +220,24 @@ def viewpoint(gaussians: Gaussians) -> Viewpoint:
 
 def sheet(cells: Sequence[Cell], columns: int | None, most: int) -> np.ndarray:
     """Cells in rows [H, W, 3] uint8, at most ``most`` px wide; captions where any."""
-    widest = max(cell.pixels.shape[1] for cell in cells) + _GAP
+    longest = max(text_width(cell.caption, _SMALL) for cell in cells) + 2
+    widest = max(min(longest, _NARROW), *(c.pixels.shape[1] for c in cells)) + _GAP
     columns = columns or max(1, min(len(cells), _SHEET // widest))
-    bar = _BAR if any(cell.caption for cell in cells) else 0
+    captioned = any(cell.caption for cell in cells)
     rows = []
     for first in range(0, len(cells), columns):
         some = cells[first : first + columns]
+        captions = [wrapped(c.caption, widest - _GAP - 2, _SMALL) for c in some]
+        bar = _BAR + _LINE * (max(map(len, captions)) - 1) if captioned else 0
         height = max(cell.pixels.shape[0] for cell in some) + bar + _GAP
         row = np.full((height, columns * widest, 3), _PAPER, np.uint8)
-        for index, (pixels, caption) in enumerate(some):
+        for index, ((pixels, caption), lines) in enumerate(zip(some, captions)):
             left, top = index * widest + _GAP // 2, _GAP // 2
             row[top : top + pixels.shape[0], left : left + pixels.shape[1]] = pixels
             color = _ALARM if caption.startswith("INCOMPLETE") else _TEXT
-            caption = _fitting(caption, widest - _GAP)
-            put_text(row, caption, (left + 2, top + pixels.shape[0] + 13), color, 0.38)
+            for number, line in enumerate(lines):
+                below = top + pixels.shape[0] + 13 + _LINE * number
+                put_text(row, line, (left + 2, below), color, _SMALL)
         rows.append(row)
     whole = np.concatenate(rows)
     if whole.shape[1] <= most:
@@ -255,9 +260,3 @@ def stacked(pictures: Sequence[np.ndarray]) -> np.ndarray:
         page[:, : picture.shape[1]] = picture
         out.append(page)
     return np.concatenate(out)
-
-
-def _fitting(caption: str, width: int) -> str:
-    while len(caption) > 1 and text_width(caption, 0.38) > width:
-        caption = caption[:-1]
-    return caption

@@ -223,7 +223,7 @@ photo, tangents, overflowed = program(jnp.zeros(6))
 assert not overflowed
 WAYS = ["turn about x", "turn about y", "turn about z", "shift x", "shift y", "shift z"]
 shades = [0.5 + 0.25 * tangents[..., i] / np.std(tangents[..., i]) for i in range(6)]
-show(photo, *shades, captions=["photograph", *WAYS], columns=7)
+show(photo, *shades, captions=["photograph", *WAYS], columns=4, zoom=2)
 
 # %% [markdown]
 # Each held against what it is the limit of, the difference of two pictures a

@@ -58,6 +58,12 @@ def mentions(text: str) -> list[list[str]]:
     return [shlex.split(span)[1:] for span in spans]
 
 
+def bare_options(text: str) -> list[str]:
+    """Every ``--option`` in a code span that begins with one, of whatever command."""
+    spans = re.findall(r"`(-[^`]*)`", _BLOCK.sub("", text))
+    return [option for span in spans for option in re.findall(r"--[a-z][\w-]*", span)]
+
+
 def run_pages(paths: list[Path], *, claims: str = "", cwd: Path) -> str:
     """What went wrong when these pages were run in a process of their own; or "".
 

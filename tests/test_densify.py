@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import gsjax
 from gsjax.densify.adaptive import AdaptiveSettings, AdaptiveStats, adaptive
+from gsjax.densify.mcmc import McmcSettings, mcmc
 from gsjax.densify.slots import assign, copy_into
 from gsjax.densify.types import Observation, apply_edit
 from gsjax.errors import InputError
@@ -392,6 +393,18 @@ def test_statistics_are_in_units_of_each_image():
         np.testing.assert_array_equal(found, wanted)
 
 
+def test_the_penalties_are_those_of_mcmc():
+    """Where they are asked for; by default, as in the paper, there are none."""
+    gaussians, _ = scene_with(garbage=np.nan)
+    assert adaptive(AdaptiveSettings(), 3.0).penalty is None
+    weights = {"opacity_penalty": 0.3, "scale_penalty": 0.7}
+    penalty = adaptive(AdaptiveSettings(**weights), 3.0).penalty
+    wanted = mcmc(McmcSettings(**weights), 3.0).penalty
+    assert penalty is not None
+    assert wanted is not None
+    assert penalty(gaussians) == wanted(gaussians) > 0.3 * 0.5
+
+
 def test_copies_are_exact():
     gaussians, _ = scene_with()
     born = jax.tree.map(lambda a: a + 1, gaussians.params)
@@ -405,7 +418,13 @@ def test_copies_are_exact():
 
 @pytest.mark.parametrize(
     "changes",
-    [{"every": 0}, {"start": -1}, {"reset_opacity": 1.0}, {"max_gaussians": 0}],
+    [
+        {"every": 0},
+        {"start": -1},
+        {"reset_opacity": 1.0},
+        {"opacity_penalty": -0.1},
+        {"max_gaussians": 0},
+    ],
     ids=str,
 )
 def test_settings_out_of_range(changes):

@@ -18,7 +18,16 @@ from types import ModuleType
 
 import pytest
 import yaml
-from snippets import ROOT, blocks, commands, mentions, program, run_pages
+from snippets import (
+    ROOT,
+    bare_options,
+    blocks,
+    commands,
+    mentions,
+    program,
+    run_pages,
+)
+from viewing import CHROMIUM, opened
 
 import gsjax.public
 from gsjax import cli
@@ -81,10 +90,22 @@ def test_commands_are_those_of_the_program(path, helps):
             assert options_in(" ".join(words)) <= options_in(helps[words[0]]), words
 
 
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.stem)
+def test_options_are_those_of_some_command(path, helps):
+    """Or, in the README, of one of the benchmarks."""
+    known = {"--help", "--version"}.union(*map(options_in, helps.values()))
+    for source in (ROOT / "benchmarks").glob("*.py"):
+        known |= set(re.findall(r'"(--\w+)" in sys.argv', source.read_text("utf-8")))
+    assert [x for x in bare_options(TEXTS[path]) if x not in known] == []
+
+
 def test_commands_are_found_where_they_stand():
     text = "`gsjax eval RUN`\n```sh\nls && gsjax info a.ply  # of a\n```"
     assert commands(text) == [["info", "a.ply"]]
     assert mentions(text) == [["eval", "RUN"]]
+    text = "`-o a`, `--up +z --no_such`,\n`x --y`"
+    assert bare_options(text) == ["--up", "--no_such"]
+    assert sum(len(bare_options(text)) for text in TEXTS.values()) > 80
     assert sum(len(commands(text)) for text in TEXTS.values()) > 50
 
 
@@ -195,6 +216,17 @@ def test_pages_fetch_nothing_from_elsewhere(site):
     for sheet in site.rglob("*.css"):
         text = sheet.read_text(encoding="utf-8")
         assert not re.search(r"(?:@import|url\()\s*[\"']?(?:https?:)?//", text), sheet
+
+
+@pytest.mark.long
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_the_search_works_from_a_disk(site, tmp_path):
+    """Where a browser starts no workers; and the network is asked for nothing."""
+    page = f"{(site / 'index.html').as_uri()}?q=refine-intrinsics"
+    html, asked = opened(page, tmp_path)
+    assert re.search(r'search-result__meta">\d+ matching documents', html)
+    assert re.search(r'href="[^"]*/cli.html\?h=refine[^"]*#train"', html)
+    assert asked == []
 
 
 def test_reference_shows_what_docstrings_say(site):

@@ -55,6 +55,7 @@ def test_ticks_of_decades_leave_room_for_one_another(decades):
     assert not any(text.endswith("M") for _, text in ticks), "1e9, not 1000M"
     for place, text in ticks:
         value = float(text.replace("k", "e3"))
+        assert ("e" in text) == ("e" in ticks[0][1]), "one notation"
         assert abs(np.log10(value) - place) < 1e-6
 
 
@@ -69,6 +70,35 @@ def test_what_is_counted_is_said(monkeypatch):
     histograms(scene(0.1), title="a")
     # A legend stands where the second would have the label.
     assert said == [("a: 64 Gaussians", "count"), ("count by axis", ""), ("", "count")]
+
+
+def test_outliers_do_not_own_the_axes(monkeypatch):
+    """One value in a thousand at either end; and none is left out in silence."""
+    said = []
+
+    def axes(x, *args, x_label="", **more):
+        said.append((x, x_label))
+        return curves.axes(x, *args, x_label=x_label, **more)
+
+    monkeypatch.setattr("gsjax.histograms.axes", axes)
+    for count, low, high in ((4000, 2, 1), (4000, 0, 0), (300, 1, 1)):
+        scales = np.full((count, 3), 0.02)
+        scales[:low, 0], scales[low : low + high, 0] = 1e-9, 1e7
+        broken = scene(scales, count=count)
+        logs = broken.params.log_scales.at[-1, 0].set(np.nan)
+        said.clear()
+        histograms(broken.replace(params=broken.params.replace(log_scales=logs)))
+        (_, opacity), (x, told), (ratio, _) = said
+        assert opacity == "opacity"
+        if count < 1000:  # too few for quantiles of a thousandth
+            assert x[0] <= -9
+            assert x[1] >= 7
+            assert told == "scale, world units (1 not finite)"
+            continue
+        assert x == (-2.0, -1.0)
+        assert 0 <= ratio[0] < ratio[1] <= 1
+        outside = f"{low} below, {high} above, " if low else ""
+        assert told == f"scale, world units ({outside}1 not finite)"
 
 
 def test_any_scene_is_a_picture():

@@ -14,10 +14,11 @@ import pytest
 from conftest import WIDTH, camera_of, scene_of
 
 import gsjax
-from gsjax import notebook, sketches
+from gsjax import notebook, sheets, sketches
 from gsjax.images import to_8_bit
 from gsjax.notebook import Picture, live, movie, picture, show
 from gsjax.raster.types import Demand, Render
+from gsjax.sheets import text_width
 
 MAGENTA = (255, 0, 255)
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.py"))
@@ -95,6 +96,22 @@ def test_a_sheet_is_small():
     assert sheet.shape[1] == 1200
 
 
+@pytest.mark.parametrize("width", [4, 60, 96, 150, 400])
+def test_no_caption_of_a_sheet_is_cut(width, monkeypatch):
+    """All of it is written, in lines that leave neither their cell nor the sheet."""
+    captions = ["rgb", "median depth 3.42 to 5.99", "depth 1 to 2"]
+    written = []
+
+    def put_text(row, text, place, _, size):
+        written.append(text)
+        assert place[0] + text_width(text, size) <= row.shape[1]
+        assert place[1] + 4 < row.shape[0], "what hangs below a line"
+
+    monkeypatch.setattr(sketches, "put_text", put_text)
+    picture(*[np.zeros((9, width))] * 3, captions=captions, columns=1)
+    assert " ".join(written) == " ".join(captions)
+
+
 def test_wrong_pictures():
     with pytest.raises(gsjax.InputError, match=r"a picture is \(1, 2, 3, 4, 5\)"):
         picture(np.zeros((1, 2, 3, 4, 5)))
@@ -114,7 +131,8 @@ def test_a_render_shows_its_images():
     alone = render_of(rgb=jnp.asarray(image))
     np.testing.assert_array_equal(shown(alone), to_8_bit(image))
     full = shown(render_of(rgb=image, alpha=image[..., 0], depth=1 + image[..., 0]))
-    assert full.shape == shown(picture(*[image] * 3, captions=["x"] * 3)).shape
+    told = ["rgb", "alpha", "depth 1.00 to 1.00"]
+    assert full.shape == shown(picture(*[image] * 3, captions=told)).shape
     incomplete = shown(render_of(rgb=image, overflowed=True))
     assert incomplete.shape != shown(alone).shape
 
@@ -122,7 +140,8 @@ def test_a_render_shows_its_images():
 def test_a_batch_of_renders_is_a_sheet():
     images = np.stack([random_picture(seed=seed) for seed in range(5)])
     found = shown(render_of((5,), rgb=images))
-    assert found.shape == shown(picture(images, captions=["x"] * 5)).shape
+    told = [f"{index}: rgb" for index in range(5)]
+    assert found.shape == shown(picture(images, captions=told)).shape
     many = np.zeros((1000, 8, 8, 3))
     cells = sketches.of_render(render_of((1000,), rgb=many))
     assert len(cells) == 24
@@ -275,7 +294,14 @@ def test_live_draws_in_one_place(displayed, monkeypatch):
         calls.append((gaussians, camera, config))
         return render_of(rgb=jnp.asarray(image), depth=jnp.ones((24, 32)))
 
+    def comparison(rows, **options):
+        (row,) = rows
+        told.append((row.name, row.rendered))
+        return sheets.comparison(rows, **options)
+
+    told = []
     monkeypatch.setattr(notebook, "render_exact", render_exact)
+    monkeypatch.setattr(notebook, "comparison", comparison)
     first, replaced = displayed
     for photo in (None, to_8_bit(image)):
         first.clear(), replaced.clear(), calls.clear()
@@ -294,6 +320,8 @@ def test_live_draws_in_one_place(displayed, monkeypatch):
         assert len(replaced) == 2
         assert all(isinstance(one, Picture) for one in replaced)
         assert not np.array_equal(replaced[0].pixels, replaced[1].pixels)
+    # The step is that of the render.
+    assert told == [("photograph", f"step {step},") for step in (1, 3, 6)]
     with pytest.raises(gsjax.InputError, match="every is 0"):
         live("camera", every=0)
 

@@ -1,12 +1,24 @@
 """Sheets and curves: sizes, what the cells hold, and values that are not finite."""
 
+import re
+from itertools import combinations, pairwise
+
 import cv2
 import numpy as np
 import pytest
 
 import gsjax
-from gsjax.curves import Series, curves, curves_png
-from gsjax.sheets import MAGNIFIED, SheetRow, comparison, depth_colors
+from gsjax import sheets
+from gsjax.curves import Mark, Series, curves, curves_png
+from gsjax.sheets import (
+    MAGNIFIED,
+    SheetRow,
+    comparison,
+    depth_colors,
+    text_width,
+    wrapped,
+)
+from gsjax.train import history
 
 WIDTH = 64
 
@@ -52,16 +64,47 @@ def test_the_caption_says_which_depths_are_coloured(monkeypatch):
     monkeypatch.setattr("gsjax.sheets.put_text", lambda _, text, *__: said.append(text))
     comparison([row()], width=300)
     (told,) = [text for text in said if text.startswith("depth")]
-    assert told.startswith("depth, 2 to 98 %:  ")
+    assert told.startswith("depth, 2 to 98 %: ")
+
+
+@pytest.mark.parametrize("width", [64, 96, 120, 128, 155, 320])
+def test_no_caption_is_cut(width, monkeypatch):
+    """All of it is written, in lines that neither leave their cell nor its bar."""
+    written = []
+
+    def put_text(cell, text, place, *_):
+        written.append(text)
+        assert place[0] + text_width(text) <= cell.shape[1]
+        assert place[1] + 5 < cell.shape[0], "what hangs below a line"
+
+    monkeypatch.setattr("gsjax.sheets.put_text", put_text)
+    name = "a long name/" + 40 * "x" + "Ü.png"
+    comparison([row(name=name, rendered="step 12345,")], width=width)
+    told = "".join(written).replace(" ", "")
+    assert told.startswith(name.replace(" ", "") + "step12345,26.")
+    assert re.search(r"dBerrorx4depth,2to98%:[\d.]+to[\d.]+$", told)
+
+
+@pytest.mark.parametrize("width", [1, 30, 90, 500])
+def test_wrapped_lines_are_words_that_fit(width):
+    text = "depth, 2 to 98 %: 3.42 to 5.99 of " + 30 * "W"
+    lines = wrapped(text, width)
+    assert "".join(lines).replace(" ", "") == text.replace(" ", "")
+    assert all(text_width(line) <= width or len(line) == 1 for line in lines)
+    for first, second in pairwise(lines):  # none is broken that has room
+        assert text_width(f"{first} {second.split()[0]}") > width
+    assert wrapped("", width) == [""]
 
 
 def test_rows_of_several_sizes_and_without_depth():
     rows = [row(), row(128, 40), row(33, 70, depth=False, name="Ünï" + 90 * "x")]
     sheet = comparison(rows, width=100)
-    heights = [round(100 * h / w) + 26 for w, h in ((64, 48), (128, 40), (33, 70))]
-    assert sheet.shape == (sum(heights), 4 * 106, 3)
-    assert comparison([row(depth=False)], width=100).shape == (101, 3 * 106, 3)
-    assert comparison([row(1, 1)], width=1).shape == (27, 28, 3)
+    heights = [round(100 * h / w) for w, h in ((64, 48), (128, 40), (33, 70))]
+    assert sheet.shape[1:] == (4 * 106, 3)
+    assert sheet.shape[0] >= sum(heights) + 3 * 26
+    wide = comparison([row(depth=False)], width=200)
+    assert wide.shape == (176, 3 * 206, 3), "captions of one line"
+    assert comparison([row(1, 1)], width=1).shape[1] == 28
 
 
 def test_what_is_not_finite_is_magenta():
@@ -138,6 +181,52 @@ def test_curves_of_anything_are_a_picture(series):
     plot = curves(series, title="title ×", size=(300, 200))
     assert plot.shape == (200, 300, 3)
     assert (plot < 128).any()
+
+
+def test_marks_stand_where_they_say_and_their_names_apart(monkeypatch):
+    """Each name within the frame and none over another, however close the marks."""
+    boxes = []
+
+    def put_text(plot, text, place, color, size=0.42):
+        if text.startswith("1/"):
+            boxes.append((place, text_width(text, size)))
+        sheets.put_text(plot, text, place, color, size)
+
+    monkeypatch.setattr("gsjax.curves.put_text", put_text)
+    x = np.arange(101)
+    line = Series("flat", x, np.full(101, 3.0))
+    marks = [Mark(f"1/{i} of the size", at) for i, at in enumerate((0, 4, 60, 98))]
+    bare = curves([line], size=(400, 300))
+    plot = curves([line], size=(400, 300), marks=[*marks, Mark("1/9", 500)])
+    changed = (plot != bare).any(axis=-1)
+    full = np.flatnonzero(changed[40:200].mean(axis=0) > 0.9)  # the line lies over them
+    frame = np.asarray([62, 400 - 18])
+    wanted = [round(frame[0] + np.ptp(frame) * at / 100) for at in (0, 4, 60, 98)]
+    assert full.tolist() == wanted
+    assert len(boxes) == 4, "none beyond the frame"
+    for (a, wide), (b, _) in combinations(sorted(boxes), 2):
+        assert abs(a[1] - b[1]) >= 12 or b[0] > a[0] + wide
+    assert all(frame[0] < u and u + wide <= frame[1] for (u, _), wide in boxes)
+
+
+def test_the_curves_of_a_run_mark_the_size_of_its_images(tmp_path, monkeypatch):
+    """And say of which moment the count is."""
+    told = {}
+    monkeypatch.setattr(history, "curves_png", lambda *_, **more: told.update(more))
+
+    def records(divisors):
+        return [
+            {"step": i + 1, "psnr": 20.0, "gaussians": 1000 + i, "divisor": divisor}
+            for i, divisor in enumerate(divisors)
+        ]
+
+    history.write_curves(tmp_path / "a.png", records([4, 4, 2, 1, 1]), 2)
+    marks = [("1/4 of the size", 1), ("1/2 of the size", 3), ("full size", 4)]
+    assert told["marks"] == marks
+    assert told["x_label"] == "step (1,004 Gaussians after the last)"
+    for same in ([1, 1], [None, None]):
+        history.write_curves(tmp_path / "a.png", records(same), 2)
+        assert told["marks"] == []
 
 
 def test_curves_file_and_refusals(tmp_path):

@@ -40,6 +40,7 @@ from gsjax.viewer.stage import (
     eye_of_gaussians,
     frusta_of,
     open_server,
+    photo_distances,
     stop_server,
 )
 
@@ -184,6 +185,12 @@ class Browser:
         self.reader = threading.Thread(target=lambda: list(self.socket), daemon=True)
         self.reader.start()
 
+    def look_from(self, position) -> None:
+        """Say that the camera is there now."""
+        self.socket.send(
+            self.encode(CAMERA | {"position": tuple(map(float, position))})
+        )
+
     def click(self, session, name: str) -> None:
         """On what has this name in the scene of its own session."""
         click = {
@@ -301,6 +308,65 @@ def test_a_click_on_a_camera_stands_there_and_shows_its_photograph(window, joine
     assert stands_at(views[1])
     assert session.photo is first
     np.testing.assert_array_equal(first.image, flat[1])
+
+
+def test_what_the_view_stands_in_is_not_drawn_before_it(window, joined):
+    """Of all cameras only that one, and it comes back when the view has left; over an
+    exact picture is none.
+    """
+    browser, session = joined
+    views = training.scene().views
+
+    def drawn() -> list[bool]:
+        return [handle.visible for handle in session.cameras]
+
+    wait_for(lambda: drawn() == [True] * (1 + len(views)))
+    browser.click(session, "/cameras/0003")
+    wait_for(lambda: session.go_to.value == views[3].name)
+    assert drawn() == [True, *(view is not views[3] for view in views)]
+    # As far as the photograph is from the camera that took it.
+    (reach,) = photo_distances(window.exhibit.frusta, session.cameras[1].scale)[3:4]
+    back = -views[3].viewmat[2, :3]
+    near = views[3].centre + 0.9 * reach * back
+    browser.look_from(near)
+    wait_for(lambda: np.allclose(session.client.camera.position, near, atol=1e-6))
+    session.look_around()
+    assert not session.cameras[4].visible
+    browser.look_from(views[3].centre + 1.1 * reach * back)
+    wait_for(lambda: drawn() == [True] * (1 + len(views)))
+    wait_for(lambda: session.go_to.value not in [view.name for view in views])
+    session.go_to.value = views[3].name  # so it can be chosen again
+    wait_for(lambda: not session.cameras[4].visible)
+    session.height.value = "270"
+    wait_for(lambda: session.render() or session.covered)
+    assert not session.cameras[0].visible, "the parent of all"
+    browser.look_from((0, 0, 0))
+    wait_for(lambda: drawn() == [True] * (1 + len(views)))
+
+
+def test_photographs_are_drawn_as_far_as_the_browser_has_them():
+    """viser: pyramids of one size have one volume, whatever their angles."""
+    view = frusta_of(training.scene().views)[0]
+    wide = view._replace(fov=np.pi / 2, aspect=3.0)
+    np.testing.assert_allclose(photo_distances([wide], 2.0), [2.0])
+    for fov, aspect in ((0.3, 1.5), (2.0, 0.5)):
+        (depth,) = photo_distances([view._replace(fov=fov, aspect=aspect)], 2.0)
+        np.testing.assert_allclose(depth**3 * np.tan(fov / 2) ** 2 * aspect / 3, 8.0)
+
+
+def test_the_count_is_of_what_is_drawn(window, joined):
+    """The browser leaves out what is fainter than its floor, and the panel says so."""
+    _, session = joined
+    logits = scene().params.logit_opacities.at[:3].set(-9.0)
+    params = scene().params.replace(logit_opacities=logits)
+    window.show(scene().replace(params=params))
+    told = (
+        f"**{COUNT - 3}** of {COUNT} Gaussians<br/>3 of opacity below {LEAST_OPACITY}"
+    )
+    wait_for(lambda: told in session.counts.content)
+    assert session.splats.buffer.shape == (COUNT - 3, 8)
+    session.render()
+    assert int(window.calls[-1][0].active.sum()) == COUNT, "the exact picture has all"
 
 
 def test_the_scale_slider_sends_the_smallest_so_many_percent(window, joined):

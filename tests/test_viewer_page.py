@@ -5,7 +5,6 @@ browser then shows.
 import base64
 import json
 import re
-import shutil
 import struct
 import subprocess
 import sys
@@ -21,7 +20,7 @@ import pytest
 import training
 from captures import save_photo
 from conftest import LIGHT
-from viewing import COUNT, scene, wait_for
+from viewing import CHROMIUM, COUNT, WEBGL, opened, scene, wait_for
 
 import gsjax
 from gsjax import cli
@@ -38,8 +37,8 @@ from gsjax.train.folder import (
     save_settings,
     with_views,
 )
-from gsjax.viewer.exact import camera_of, picture
-from gsjax.viewer.stage import UPS, eye_of_gaussians
+from gsjax.viewer.exact import ExactRenderer, camera_of, picture
+from gsjax.viewer.stage import UPS, Frustum, eye_of_gaussians
 
 # --- the command ---
 
@@ -216,9 +215,6 @@ def test_up_in_a_page_is_what_was_said(run, tmp_path, capsys, up):
 # --- in a browser ---
 
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-
-
 @pytest.fixture
 def pictures_of_page(tmp_path):
     """A function: pictures [H, W, 3] of a page in Chromium, one after another.
@@ -232,8 +228,7 @@ def pictures_of_page(tmp_path):
     def look(url: str, size: str = "500,400"):
         browsers.append(
             subprocess.Popen(
-                [CHROMIUM, "--headless", "--no-sandbox", "--use-angle=swiftshader",
-                 "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
+                [CHROMIUM, "--headless", "--no-sandbox", *WEBGL,
                  "--remote-debugging-port=0", f"--user-data-dir={profile}",
                  f"--window-size={size}", url],
                 stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -264,6 +259,22 @@ def pictures_of_page(tmp_path):
     for browser in browsers:
         browser.kill()
         browser.wait()
+
+
+@pytest.mark.long
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_a_page_asks_the_network_for_nothing(ply, tmp_path, capsys):
+    """And would be found to if it did."""
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    out, elsewhere = tmp_path / "a.html", "http://127.0.0.1:9/a.png"
+    assert cli.main(["view", str(ply), "--html", str(out)]) == 0
+    capsys.readouterr()
+    html, asked = opened(out.as_uri(), tmp_path)
+    assert "<canvas" in html, "it has run"
+    assert asked == []
+    script = f"<script>new Image().src = '{elsewhere}'</script>"
+    out.write_text(out.read_text().replace("<head>", f"<head>{script}", 1))
+    assert opened(out.as_uri(), tmp_path)[1] == [elsewhere]
 
 
 def shell_and_core():
@@ -376,6 +387,37 @@ def test_a_browser_shows_the_splats_and_then_our_own_picture(
     assert 0.1 < ball.mean() < 0.9
     assert np.median(np.abs(shown - ours)[ball]) < 4
     assert np.median(np.abs(splats - ours)[ball]) > 40
+
+
+@pytest.mark.long
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_a_photograph_does_not_hide_what_is_seen_from_its_camera(pictures_of_page):
+    """*Go to* a camera of a ball, from where its photograph is seen."""
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    from gsjax.viewer.opening import _exhibit
+    from gsjax.viewer.window import Window
+
+    photo = np.full((12, 16, 3), 255 * MAGENTA, np.uint8)
+    places = [(3 * np.sin(a), 0.0, -3 * np.cos(a)) for a in (0.0, 0.6, 1.2)]
+    frusta = [
+        Frustum(str(i), gsjax.look_at(place, (0, 0, 0), (0, -1, 0)), 1.0, 4 / 3, photo)
+        for i, place in enumerate(places)
+    ]
+    renderer = ExactRenderer(gsjax.RasterConfig(**LIGHT), (0, 0, 0))
+    window = Window(_exhibit(shell_and_core(), renderer, frusta, None), port=8690)
+    try:
+        pictures = pictures_of_page(window.url, "900,600")
+        first_with(ORANGE, (page[:, :550] for page in pictures))
+        assert share_of(MAGENTA, next(pictures)[:, :550]) > 0.001
+        (session,) = window.sessions.values()
+        session.go_to.value = frusta[0].name
+        # The panel, at the right, has the photograph from now on.
+        end, page = time.monotonic() + 60, next(pictures)
+        while share_of(MAGENTA, page) > 1e-4 or share_of(ORANGE, page) < 0.2:
+            assert time.monotonic() < end, "the photograph hides the view"
+            page = next(pictures)[:, :550]
+    finally:
+        window.close()
 
 
 @pytest.mark.long

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from gsjax.densify.penalties import mean_penalty
 from gsjax.densify.schedule import is_due
 from gsjax.densify.slots import assign, copy_into, where_slots
 from gsjax.densify.types import Densifier, Observation, SlotEdit
@@ -47,6 +48,8 @@ class AdaptiveSettings:
       reset_every: bring all opacities down to ``reset_opacity``, so that what is not
         needed shows, at the first edit from every so many-th step on; 0 never. Not at
         the last edit, which no pruning follows.
+      opacity_penalty, scale_penalty: weights of the means over all Gaussians, see
+        `gsjax.densify.penalties`; 0 in the paper.
       max_gaussians: never more than that.
       initial_opacity: of the Gaussians that a run starts from.
       initial_scale: of those, times the distance to the nearest neighbours.
@@ -68,6 +71,8 @@ class AdaptiveSettings:
     prune_radius: float | None = None
     reset_every: int = 3000
     reset_opacity: float = 0.01
+    opacity_penalty: float = 0.0
+    scale_penalty: float = 0.0
     max_gaussians: int = 5_000_000
     initial_opacity: float = 0.1
     initial_scale: float = 1.0
@@ -81,6 +86,8 @@ class AdaptiveSettings:
             "prune_opacity": 0 <= self.prune_opacity < 1,
             "reset_every": self.reset_every >= 0,
             "reset_opacity": 0 < self.reset_opacity < 1,
+            "opacity_penalty": self.opacity_penalty >= 0,
+            "scale_penalty": self.scale_penalty >= 0,
             "max_gaussians": self.max_gaussians >= 1,
         }
         for name, good in checks.items():
@@ -142,7 +149,19 @@ def adaptive(settings: AdaptiveSettings, extent: float) -> Densifier:
         dense = _densified(settings, extent, key, step, gaussians, stats)
         return _reset(settings, step, dense), init(gaussians)
 
-    return Densifier(init, observe, due, plan, absgrad=settings.absgrad)
+    weights = settings.opacity_penalty, settings.scale_penalty
+
+    def penalty(gaussians: Gaussians) -> Array:
+        return mean_penalty(gaussians, *weights, extent)
+
+    return Densifier(
+        init=init,
+        observe=observe,
+        due=due,
+        plan=plan,
+        penalty=penalty if any(weights) else None,
+        absgrad=settings.absgrad,
+    )
 
 
 def _densified(

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from gsjax.cameras import USUAL_EXTENT
+from gsjax.densify.penalties import mean_penalty
 from gsjax.densify.schedule import is_due
 from gsjax.densify.slots import copy_into
 from gsjax.densify.types import Densifier, SlotEdit
@@ -110,14 +111,8 @@ def mcmc(settings: McmcSettings, extent: float = USUAL_EXTENT) -> Densifier:
         return edit, stats
 
     def penalty(gaussians: Gaussians) -> Array:
-        params, active = gaussians.params, gaussians.active
-        count = jnp.maximum(jnp.sum(active), 1)
-        opacity = jax.nn.sigmoid(jnp.where(active, params.logit_opacities, 0))
-        scales = exp_log_scale(jnp.where(active[:, None], params.log_scales, 0))
-        of_opacity = jnp.sum(jnp.where(active, opacity, 0)) / count
-        of_scale = jnp.sum(jnp.where(active[:, None], scales, 0)) / (3 * count)
-        by_scale = settings.scale_penalty / unit * of_scale
-        return settings.opacity_penalty * of_opacity + by_scale
+        weights = settings.opacity_penalty, settings.scale_penalty
+        return mean_penalty(gaussians, *weights, extent)
 
     def perturb(key: Array, gaussians: Gaussians, rate: Array):
         params = gaussians.params

@@ -16,12 +16,21 @@ from gsjax.console import note, one_line
 from gsjax.errors import GsjaxError
 from gsjax.gaussians import Gaussians, select
 from gsjax.viewer.exact import KINDS, ExactRenderer, camera_of, picture
-from gsjax.viewer.splats import Cut, longest_axes, most_important, pack, within
+from gsjax.viewer.splats import (
+    LEAST_OPACITY,
+    Cut,
+    longest_axes,
+    most_important,
+    opacities_of,
+    pack,
+    within,
+)
 from gsjax.viewer.stage import (
     Eye,
     Frustum,
     add_cameras,
     paint_background,
+    photo_distances,
     size_of_frusta,
     wxyz_of,
 )
@@ -82,11 +91,14 @@ class Session:
         self.closed = False
         self.covered = False  # by an exact picture, over the view
         self.cameras: list[Any] = []
+        self.places = np.zeros((0, 4))  # of cameras, and how far photographs are drawn
+        self.stood_at = _NOWHERE  # the camera that the view is in
         self.result: Any = None
         self.photo: Any = None
         self.rest: threading.Timer | None = None
         self.refresh = Latest(self._draw)
         self.render = Latest(self._render)
+        self.look_around = Latest(self._show_what_is_not_in_the_way)
         self._add_controls()
         self.show_cameras()
         client.camera.on_update(lambda _: self._moved())
@@ -136,35 +148,53 @@ class Session:
         self.album.visible = bool(frusta)
         if not frusta or self.closed:
             return
-        size = size_of_frusta(frusta, eye.distance)
-        self.cameras = add_cameras(self.client.scene, frusta, size)
-        for handle, frustum in zip(self.cameras[1:], frusta):
-            handle.on_click(lambda _, chosen=frustum: self._go(chosen))
         if self.go_to is None:
             with self.album:
                 self.drawn = self.client.gui.add_checkbox("Show", True)
                 names = (_NOWHERE, *(frustum.name for frustum in frusta))
                 self.go_to = self.client.gui.add_dropdown("Go to", names)
-            self.drawn.on_update(lambda _: self._set_cameras_visible())
+            self.drawn.on_update(lambda _: self.look_around())
             self.go_to.on_update(lambda _: self._go_to_chosen())
-        self._set_cameras_visible()
+        size = size_of_frusta(frusta, eye.distance)
+        self.places = np.column_stack(
+            [[frustum.centre for frustum in frusta], photo_distances(frusta, size)]
+        )
+        self.cameras = add_cameras(self.client.scene, frusta, size)
+        for handle, frustum in zip(self.cameras[1:], frusta):
+            handle.on_click(lambda _, chosen=frustum: self._go(chosen))
+        self.look_around()
 
-    def _set_cameras_visible(self) -> None:
-        self.cameras[0].visible = self.drawn.value
+    def _show_what_is_not_in_the_way(self) -> None:
+        """The cameras that are wanted: none over an exact picture, and none that the
+        view stands in, whose photograph would hide what is seen from there.
+        """
+        if not self.cameras or self.closed:
+            return
+        away = np.linalg.norm(self.client.camera.position - self.places[:, :3], axis=1)
+        hides = away <= self.places[:, 3]
+        self.cameras[0].visible = self.drawn.value and not self.covered
+        for handle, hidden in zip(self.cameras[1:], hides.tolist()):
+            handle.visible = not hidden
+        frusta = self.exhibit.frusta
+        near = [frusta[i].name for i in np.argsort(away)[: hides.sum()]]
+        if self.stood_at not in near:  # said, and free to be chosen again
+            self.stood_at = near[0] if near else _NOWHERE
+            self.go_to.value = self.stood_at
 
     def _go_to_chosen(self) -> None:
         names = [frustum.name for frustum in self.exhibit.frusta]
-        if self.go_to.value in names:
+        if self.go_to.value in names and self.go_to.value != self.stood_at:
             self._go(self.exhibit.frusta[names.index(self.go_to.value)])
 
     def _go(self, frustum: Frustum) -> None:
         """Stand where a photograph was taken, and put it into the panel."""
-        rotation = frustum.viewmat[:3, :3]
         camera = self.client.camera
         with self.client.atomic():
-            camera.position = -rotation.T @ frustum.viewmat[:3, 3]
-            camera.wxyz = wxyz_of(rotation.T)
+            camera.position = frustum.centre
+            camera.wxyz = wxyz_of(frustum.viewmat[:3, :3].T)
             camera.fov = frustum.fov
+        self.stood_at = self.go_to.value = frustum.name
+        self.look_around()
         if frustum.photo is None:
             return
         if self.photo is None:
@@ -201,7 +231,11 @@ class Session:
             self.splats.remove()
             self.splats = None
         found = np.count_nonzero(np.asarray(gaussians.active))
-        lines = [f"**{shown.sum():,}** of {found:,} Gaussians"]
+        faint = np.count_nonzero(opacities_of(gaussians)[self.shown] < LEAST_OPACITY)
+        lines = [f"**{len(splats.centers):,}** of {found:,} Gaussians"]
+        if faint:
+            told = f"{faint:,} of opacity below {LEAST_OPACITY} in exact pictures only"
+            lines.append(told)
         if limit < float("inf"):
             lines.append(f"scales up to {limit:.3g}")
         if exhibit.status:
@@ -263,6 +297,7 @@ class Session:
             self.client.scene.set_background_image(pixels, format="png")
             if self.splats is not None:
                 self.splats.visible = False
+        self.look_around()
 
     def _uncover(self) -> None:
         """The browser's own splats again."""
@@ -274,10 +309,12 @@ class Session:
             paint_background(self.client.scene, background)
             if self.splats is not None:
                 self.splats.visible = True
+        self.look_around()
 
     def _moved(self) -> None:
         """A picture is only right for where it was taken from."""
         self._uncover()
+        self.look_around()
         if self.rest is not None:
             self.rest.cancel()
         if self.follow.value:

@@ -48,6 +48,11 @@ class Frustum(NamedTuple):
     aspect: float
     photo: np.ndarray | None = None
 
+    @property
+    def centre(self) -> np.ndarray:
+        """[3] of the camera, in the world."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
 
 class Eye(NamedTuple):
     """Where a browser looks from at first, [3] each.
@@ -195,8 +200,8 @@ def small(pixels: np.ndarray, most: int = THUMBNAIL) -> np.ndarray:
 def eye_of_cameras(frusta: Sequence[Frustum]) -> Eye:
     """Behind and above the first camera, turning about what all of them look at."""
     viewmats = np.stack([frustum.viewmat for frustum in frusta])
-    first, focus = frusta[0].viewmat, paths.focus_point(viewmats)
-    position, ahead = -first[:3, :3].T @ first[:3, 3], first[2, :3]
+    focus = paths.focus_point(viewmats)
+    position, ahead = frusta[0].centre, frusta[0].viewmat[2, :3]
     away = np.linalg.norm(focus - position)
     distance = max((focus - position) @ ahead, 0.3 * away, 1e-6)
     up, target = paths.up_direction(viewmats), position + distance * ahead
@@ -256,7 +261,6 @@ def add_cameras(scene: Any, frusta: Sequence[Frustum], size: float) -> list[Any]
     """
     handles = [scene.add_frame("/cameras", show_axes=False)]
     for index, frustum in enumerate(frusta):
-        rotation = frustum.viewmat[:3, :3]
         handle = scene.add_camera_frustum(
             f"/cameras/{index:04d}",
             fov=frustum.fov,
@@ -266,8 +270,8 @@ def add_cameras(scene: Any, frusta: Sequence[Frustum], size: float) -> list[Any]
             color=_CAMERA_COLOR,
             image=frustum.photo,
             format="jpeg",
-            wxyz=wxyz_of(rotation.T),
-            position=-rotation.T @ frustum.viewmat[:3, 3],
+            wxyz=wxyz_of(frustum.viewmat[:3, :3].T),
+            position=frustum.centre,
         )
         handles.append(handle)
     return handles
@@ -277,10 +281,19 @@ def size_of_frusta(frusta: Sequence[Frustum], distance: float) -> float:
     """World units: to be seen from ``distance``, and not to hide one another."""
     if len(frusta) < 2:
         return 0.03 * distance
-    centres = np.stack([-f.viewmat[:3, :3].T @ f.viewmat[:3, 3] for f in frusta])
+    centres = np.stack([frustum.centre for frustum in frusta])
     gaps = np.linalg.norm(centres[:, None] - centres, axis=-1)
     nearest = np.where(gaps > 0, gaps, np.inf).min(axis=1)
     return float(np.clip(0.4 * np.median(nearest), 0.01 * distance, 0.03 * distance))
+
+
+def photo_distances(frusta: Sequence[Frustum], size: float) -> np.ndarray:
+    """[B] of each photograph from the apex of its pyramid, in world units.
+
+    viser scales pyramids to one volume, whatever their angles.
+    """
+    half = np.tan([frustum.fov / 2 for frustum in frusta])
+    return size * np.cbrt(3 / (half**2 * [frustum.aspect for frustum in frusta]))
 
 
 def wxyz_of(rotation: np.ndarray) -> np.ndarray:
