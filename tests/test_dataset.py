@@ -37,16 +37,29 @@ def transforms(folder, scene=None, name="transforms.json"):
 # --- poses that cannot be ---
 
 
-@pytest.mark.parametrize("far", [1e29, 1e9])
-def test_a_camera_at_the_end_of_the_world_is_named(tmp_path, far):
+@pytest.mark.parametrize(("far", "told"), [(1e29, "at -1.4"), (1e9, "1.7")])
+def test_a_camera_at_the_end_of_the_world_is_named(tmp_path, far, told):
     scene = scene_of_views()
     view = scene.views[2]
     viewmat = view.viewmat.copy()
     viewmat[:3, 3] += far
     views = [*scene.views[:2], replace(view, viewmat=viewmat), *scene.views[3:]]
     transforms(tmp_path, replace(scene, views=tuple(views)))
-    with pytest.raises(InputError, match=rf"camera of 'images/{view.name}' stands 1.7"):
+    with pytest.raises(InputError, match=rf"of 'images/{view.name}' stands {told}"):
         load_dataset(tmp_path)
+
+
+def test_cameras_on_a_tripod_and_one_elsewhere_are_read(tmp_path):
+    """Of which all but one stand in one place, but for rounding."""
+    scene = scene_of_views()
+    first, *others = scene.views
+    views = [first]
+    for k, view in enumerate(others):
+        viewmat = view.viewmat.copy()
+        viewmat[:3, 3] = -viewmat[:3, :3] @ (np.array([4.0, 5, 6]) + k * 1e-15)
+        views.append(replace(view, viewmat=viewmat))
+    transforms(tmp_path, replace(scene, views=tuple(views)))
+    assert len(load_dataset(tmp_path).views) == len(views) > 2
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])

@@ -17,8 +17,9 @@ from gsjax.scene.nerf import find_transforms, load_nerf
 from gsjax.scene.rebase import rebase
 from gsjax.scene.types import Scene
 
-# How far a camera may stand from the middle of all, in medians of that; a heuristic.
-_MOST_APART = 1e6
+# How far one camera may stand from the middle of all, times the next; a heuristic. From
+# the other on, the next stand in one place, as those of one tripod, but for rounding.
+_MOST_APART, _ROUNDING = 1e6, 1e12
 # Coordinates of cameras: in float64 a tenth of the unit is left there, and products of
 # two are finite in float32.
 _FARTHEST = 1e15
@@ -143,12 +144,13 @@ def _check_places(scene: Scene, names: list[str], centres: np.ndarray) -> None:
     measured, that of the world.
     """
     apart = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
-    usual, worst = float(np.median(apart)), int(np.argmax(apart))
-    if usual > 0 and apart[worst] > _MOST_APART * usual:
+    worst = int(np.argmax(apart))
+    others = float(np.max(np.delete(apart, worst), initial=0))
+    if _MOST_APART * others < apart[worst] < _ROUNDING * others:
         raise InputError(
             f"{scene.source}: the camera of {names[worst]!r} stands {apart[worst]:.3g} "
-            f"from the middle of all, of which half are within {usual:.3g}; its pose "
-            "is damaged: remove the photograph, or estimate the cameras again"
+            f"from the middle of all, the others within {others:.3g}; its pose is "
+            "damaged: remove the photograph, or estimate the cameras again"
         )
     worst = int(np.argmax(np.abs(centres).max(axis=1)))
     if np.abs(centres[worst]).max() > _FARTHEST:
