@@ -13,7 +13,7 @@ from gsjax.files import refuse_existing
 from gsjax.flights import path_entries, write_flight
 from gsjax.scene.caster import DemoDatasetSettings, write_demo_dataset
 from gsjax.subjects import open_subject
-from gsjax.train.config import Level, TrainConfig, preset, scaled
+from gsjax.train.config import TrainConfig, preset, scaled
 from gsjax.train.folder import RunSettings, load_data, run_files
 from gsjax.train.run import RunResult, start_run
 
@@ -46,17 +46,15 @@ def demo_files(folder: Path) -> DemoFiles:
 
 
 def demo_config(steps: int = STEPS, seed: int = 0) -> TrainConfig:
-    """The preset "fast", smaller still: compiled once, and for few Gaussians.
-
-    One resolution and one size of the work, for each is compiled anew, which takes as
-    long as a hundred steps.
+    """The preset "fast", smaller still: for few Gaussians, and from the points of the
+    dataset, which are many here.
     """
     config = scaled(preset("fast"), steps)
     return config.replace(
         seed=seed,
         strategy="adaptive",
         max_size=None,
-        levels=(Level(0.0, 1),),
+        initial="points",
         adaptive=replace(config.adaptive, max_gaussians=_MAX_GAUSSIANS),
     )
 

@@ -244,6 +244,36 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
 
 
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Within, no other process that asks has the folder; that ends with this process,
+    whatever ends it. Where the system has no such locks, nothing is held.
+
+    Raises:
+      InputError: if another has it.
+    """
+    try:
+        import fcntl
+
+        handle = os.open(folder, os.O_RDONLY)
+    except (ImportError, OSError):  # Windows has no fcntl, nor opens folders
+        yield
+        return
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"{folder}: another training is at work in it; wait until it has "
+                "ended, or use another folder"
+            ) from None
+        except OSError:  # a disk without locks
+            pass
+        yield
+    finally:
+        os.close(handle)
+
+
 def refuse_existing(
     paths: Iterable[Path], overwrite: bool, instead: str = "another name"
 ) -> None:

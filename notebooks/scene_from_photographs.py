@@ -40,7 +40,7 @@ from gsjax.notebook import Picture, live, movie, show
 from gsjax.scene.caster import DemoDatasetSettings, cast, write_demo_dataset
 from gsjax.scene.paths import median_intrinsics, orbit
 from gsjax.sheets import SheetRow, comparison
-from gsjax.train.config import Level, preset, scaled
+from gsjax.train.config import preset, scaled
 from gsjax.train.fit import Hooks
 
 PHOTOS, WIDTH, HEIGHT, STEPS = 28, 128, 96, 360
@@ -78,8 +78,9 @@ show(
 # ## What training starts from
 #
 # One Gaussian for each point, round, half as wide as its neighbours are far, of the
-# point's colour, and half opaque: so the preset `fast`, used below, begins. This is a
-# sketch of it, that is, discs:
+# point's colour, and half opaque: so the preset `fast`, used below, begins. Of real
+# photographs it would first look for more points on which they agree
+# (`initial="dense"`); here there are enough. This is a sketch of it, that is, discs:
 
 # %%
 start = gsjax.init_gaussians(scene, sh_degree=1, opacity=0.5, scale=0.5)
@@ -91,8 +92,7 @@ start
 # The settings are those of the preset `fast`, made shorter: L1 and SSIM, Adam with a
 # rate for each kind of number, and adaptive density control, which clones and splits
 # Gaussians where the picture wants to move them, and removes those that hardly show.
-# One resolution throughout, since each is compiled anew, and room for 4000 Gaussians at
-# most.
+# There is room for 4000 Gaussians at most.
 #
 # `fit` calls back after each step. `live` is such a hook: it draws the held-out view it
 # is given, beside its photograph, over and over in the same place. What is left of it
@@ -102,7 +102,7 @@ start
 config = scaled(preset("fast"), STEPS)
 config = config.replace(
     strategy="adaptive",
-    levels=(Level(0.0, 1),),
+    initial="points",
     max_size=None,
     raster=gsjax.RasterConfig(rungs=1, devices=1, occlusion=False),
     adaptive=replace(config.adaptive, max_gaussians=4000),

@@ -3,9 +3,13 @@
 import json
 import os
 import shutil
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hostile import HOSTILE, harmless, write_hostile
 
@@ -13,6 +17,7 @@ import gsjax.train.run as run_module
 from gsjax import cli
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import InputError
+from gsjax.files import alone_in
 from gsjax.raster.types import RasterConfig
 from gsjax.train.config import TrainConfig, from_json, to_json
 from gsjax.train.folder import (
@@ -24,6 +29,7 @@ from gsjax.train.folder import (
     with_views,
 )
 from gsjax.train.held_out import evaluate_run
+from gsjax.train.history import read_metrics
 from gsjax.train.run import RunResult, resume_run, start_run
 
 pytestmark = pytest.mark.usefixtures("float32")
@@ -134,6 +140,38 @@ def test_a_run_that_cannot_be_removed_still_is_one(made, monkeypatch):
     assert start_run(again, made / "run", overwrite=True).finished
 
 
+def test_one_training_at_a_time_in_a_folder(made):
+    before, settings = contents(made / "run"), RunSettings(made / "data", CONFIG)
+    with alone_in(made / "run"):
+        for begin in (
+            lambda: start_run(settings, made / "run", overwrite=True),
+            lambda: resume_run(made / "run"),
+        ):
+            with pytest.raises(InputError, match="another training is at work in it"):
+                begin()
+            assert contents(made / "run") == before
+    assert resume_run(made / "run").finished
+
+
+def test_what_is_held_is_free_once_its_process_is_killed(tmp_path):
+    program = (
+        "import sys, time, pathlib\nfrom gsjax.files import alone_in\n"
+        "with alone_in(pathlib.Path(sys.argv[1])):\n"
+        "    print('held', flush=True)\n    time.sleep(600)\n"
+    )
+    arguments = [sys.executable, "-c", program, str(tmp_path)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE) as other:
+        try:
+            assert other.stdout is not None
+            assert other.stdout.readline() == b"held\n"
+            with pytest.raises(InputError, match="another"), alone_in(tmp_path):
+                pass
+        finally:
+            other.kill()
+    with alone_in(tmp_path):
+        assert not list(tmp_path.iterdir())
+
+
 # --- killed, and gone on with ---
 
 
@@ -231,6 +269,33 @@ def test_without_points_it_starts_from_random_ones(tmp_path, capsys):
 
 def test_with_points_it_starts_from_them(whole):
     assert load_settings(whole / "run").config == CONFIG.replace(initial="points")
+
+
+def test_looking_for_points_counts_as_training(whole, tmp_path, monkeypatch, capsys):
+    """Where a kill came before anything was saved, it is done again, to the same."""
+
+    def found(scene, photos, config):
+        assert len(photos) == len(scene.views)
+        assert config.initial == "dense"
+        time.sleep(0.5)
+        points = np.concatenate([scene.points, scene.points[:7] + 0.01])
+        colors = np.concatenate([scene.colors, scene.colors[:7]])
+        return replace(scene, points=points, colors=colors)
+
+    monkeypatch.setattr(run_module, "with_dense", found)
+    settings = RunSettings(whole / "data", CONFIG.replace(initial="dense"))
+    start_run(settings, tmp_path / "run")
+    assert "found 7 in 0." in capsys.readouterr().err
+    files = run_files(tmp_path / "run")
+    first, *_ = read_metrics(files.metrics)
+    assert first["seconds"] > first["compile_seconds"] + 0.5
+    scene = files.splat.read_bytes()
+    shutil.rmtree(files.checkpoints)
+    files.splat.unlink()
+    assert load_settings(tmp_path / "run").config.initial == "dense"
+    resume_run(tmp_path / "run")
+    assert "found 7 in 0." in capsys.readouterr().err
+    assert files.splat.read_bytes() == scene
 
 
 # --- true to its dataset ---

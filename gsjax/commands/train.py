@@ -46,9 +46,9 @@ class TrainCommand(HeavyCommand):
     background: Literal["auto", "black", "white", "random"] | None = None
     """Behind the scene; default: auto, which is random where photographs are
     transparent, else black."""
-    initial: Literal["points", "random"] | None = None
-    """Start from the dataset's points, or from anywhere in view; default: from its
-    points if it has any."""
+    initial: Literal["points", "dense", "random"] | None = None
+    """Start from the dataset's points; from those and many more on which the
+    photographs agree (the default); or from anywhere in view."""
     antialias: bool = False
     """Compensate thin splats for the blur of a pixel, to look right at other sizes."""
     absgrad: bool = False

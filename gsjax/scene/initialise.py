@@ -85,7 +85,8 @@ def init_gaussians(
     """
     rng = np.random.default_rng(seed)
     if random_count is not None:
-        points, colors = _random_points(scene, random_count, rng)
+        points = points_in_ball(scene, random_count, rng)
+        colors = rng.uniform(size=(random_count, 3))
     else:
         require_points(scene)
         finite = _finite(scene)
@@ -124,11 +125,13 @@ def neighbour_distance(points: np.ndarray, extent: float) -> np.ndarray:
     return np.clip(rms, 1e-7 * extent, 0.1 * extent)
 
 
-def _random_points(scene: Scene, count: int, rng) -> tuple[np.ndarray, np.ndarray]:
+def points_in_ball(scene: Scene, count: int, rng: np.random.Generator) -> np.ndarray:
+    """[count, 3] drawn evenly from the ball of the scene's extent around the point that
+    the cameras look at."""
     centres = np.stack([view.centre for view in scene.views])
     extent = scene_extent(centres)
     middle = focus_point([view.viewmat for view in scene.views], depth=extent)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     radius = extent * rng.uniform(size=(count, 1)) ** (1 / 3)
-    return middle + radius * direction, rng.uniform(size=(count, 3))
+    return middle + radius * direction

@@ -16,6 +16,7 @@ from gsjax.errors import CapacityError
 from gsjax.gaussians import Gaussians, grow, make_gaussians
 from gsjax.memory import require
 from gsjax.raster.types import RasterConfig
+from gsjax.scene.dense import find_points
 from gsjax.scene.initialise import has_points, init_gaussians, scene_extent
 from gsjax.scene.types import Photo, Scene
 from gsjax.sh import num_bases
@@ -26,6 +27,8 @@ from gsjax.train.health import Health, check_photos, check_points
 from gsjax.train.room import pairs_for, roomy_pairs, with_slots
 from gsjax.train.step import Metrics, TrainState, init_state, make_train_step
 from gsjax.train.unseen import without_unseen
+
+_LEAST_FOUND = 1000
 
 
 class Progress(NamedTuple):
@@ -117,25 +120,53 @@ def with_initial(scene: Scene, config: TrainConfig) -> TrainConfig:
     """
     if config.initial == "auto":
         config = config.replace(initial="points" if has_points(scene) else "random")
-    if config.initial == "points":
+    dense = config.initial == "dense" and has_points(scene)
+    if config.initial == "points" or dense:
         check_points(scene)
     return config
+
+
+def with_dense(scene: Scene, photos: Sequence[Photo], config: TrainConfig) -> Scene:
+    """The scene with more points, where `TrainConfig.initial` is "dense".
+
+    Fewer than a thousand, where so many are wanted, are left out if the scene has none
+    of its own: random ones are the better start then.
+
+    Raises:
+      MissingExtraError: if OpenCV is absent.
+    """
+    if config.initial != "dense":
+        return scene
+    found = find_points(scene, photos, config.dense_count, seed=config.seed)
+    too_few = len(found.points) < min(_LEAST_FOUND, config.dense_count)
+    if too_few and not has_points(scene):
+        return scene
+    return replace(
+        scene,
+        points=np.concatenate([scene.points, found.points]),
+        colors=np.concatenate([scene.colors, found.colors]),
+    )
 
 
 def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
     """A run on this scene before its first step.
 
+    Args:
+      scene: from `with_dense`, if more points than the dataset's are wanted.
+      config: the settings.
+
     Raises:
       InputError: as `with_initial`.
     """
     config = with_initial(scene, config)
+    drawn = config.initial == "random" or not has_points(scene)
     gaussians = init_gaussians(
         scene,
         sh_degree=config.sh_degree,
         opacity=config.chosen.initial_opacity,
         scale=config.chosen.initial_scale,
         max_count=min(config.max_initial, config.max_gaussians),
-        random_count=config.initial_count if config.initial == "random" else None,
+        random_count=config.initial_count if drawn else None,
         seed=config.seed,
     )
     gaussians = grow(gaussians, first_slots(gaussians.capacity, config))
@@ -191,12 +222,14 @@ def fit(
         in view.
     """
     check_photos(scene, photos)
-    hooks = hooks or Hooks()
+    run = _Run(scene, photos, config, hooks or Hooks())
+    if state is None:
+        if config.initial == "dense":
+            run.hooks.phase("looking for points on which the photographs agree")
+        state = initial_state(with_dense(scene, photos, config), config)
     # The step takes the state's memory over: not the caller's, and none twice.
-    own: TrainState = jax.tree.map(
-        jnp.copy, initial_state(scene, config) if state is None else state
-    )
-    return _Run(scene, photos, config, hooks).loop(own, pair_capacity)
+    own: TrainState = jax.tree.map(jnp.copy, state)
+    return run.loop(own, pair_capacity)
 
 
 @dataclass

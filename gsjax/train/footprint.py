@@ -122,7 +122,10 @@ def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) ->
     """
     if state is None:
         given = len(scene.points)
-        given = config.initial_count if config.initial == "random" else given
+        if config.initial == "dense":
+            given = given + config.dense_count if given else _most_without(config)
+        elif config.initial == "random":
+            given = config.initial_count
         count = max(1, min(given, config.max_initial, config.max_gaussians))
         slots = first_slots(count, config)
     else:
@@ -142,6 +145,11 @@ def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) ->
             f"warning: {_gaussians(most)} would not fit; the run is saved and stops "
             "where it would take more than there is: lower --max-gaussians to avoid it"
         )
+
+
+def _most_without(config: TrainConfig) -> int:
+    """Points that "dense" may begin with where the dataset has none."""
+    return max(config.dense_count, config.initial_count)
 
 
 def _gaussians(count: int) -> str:

@@ -60,7 +60,9 @@ def roomy_pairs(wanted: int, state: TrainState, config: TrainConfig) -> int:
         worth = _PAIRS_OF_PROGRAM / views
         growing = float(np.clip(1 + worth / wanted, *_GROWING_MARGINS))
         growth = config.max_gaussians / max(1, int(num_active(state.gaussians)))
-        margin = max(margin, min(_PER_GROWTH * growth, growing))
+        # At the start they are as wide as they are told to be, and not as they will.
+        likely = _PER_GROWTH * growth if step else np.inf
+        margin = max(margin, min(likely, growing))
     return min(capacity_bucket(int(margin * wanted)), 2**30 - 1)
 
 

@@ -1,6 +1,7 @@
 """A training run from a dataset to its folder: started, gone on with, saved."""
 
 import shutil
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -12,7 +13,7 @@ import numpy as np
 from gsjax.console import note
 from gsjax.errors import DivergedError, InputError
 from gsjax.evaluation import Summary
-from gsjax.files import make_folder, writing
+from gsjax.files import alone_in, make_folder, writing
 from gsjax.raster.render import device_count
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
@@ -25,6 +26,7 @@ from gsjax.train.fit import (
     fit,
     initial_state,
     subset,
+    with_dense,
     with_initial,
 )
 from gsjax.train.folder import (
@@ -93,7 +95,8 @@ def start_run(
 
     Raises:
       InputError: if the folder holds a run and ``overwrite`` is not set, or files that
-        are not a run's, or what is read or written fails.
+        are not a run's, or another process trains in it, or what is read or written
+        fails.
       DivergedError: as `fit`; the last good checkpoint is kept, and its scene.
     """
     files = run_files(folder)
@@ -110,13 +113,14 @@ def start_run(
     settings = replace(with_views(settings, data), config=_begun(settings.config, data))
     sitting = Sitting(settings.config, data, files, Start())
     photos = _photographs(sitting)
-    state = initial_state(sitting.scene, settings.config)
-    # What says that it is a run goes last: where something stays, it still is one.
-    for path in sorted(ours, key=lambda path: path == files.config):
-        _remove(path)
+    state = _first_state(sitting, photos)
     make_folder(folder)
-    save_settings(folder, settings)
-    return _train(sitting, photos, state, watch)
+    with alone_in(folder):
+        # What says that it is a run goes last: where something stays, it still is one.
+        for path in sorted(ours, key=lambda path: path == files.config):
+            _remove(path)
+        save_settings(folder, settings)
+        return _train(sitting, photos, state, watch)
 
 
 def _remove(path: Path) -> None:
@@ -148,10 +152,18 @@ def resume_run(
       watch: gives `Hooks.state`.
 
     Raises:
-      InputError: if there is no run, its files are damaged, or the dataset holds other
-        views than it did.
+      InputError: if there is no run, its files are damaged, another process trains in
+        it, or the dataset holds other views than it did.
     """
-    settings, files = load_settings(folder), run_files(folder)
+    settings = load_settings(folder)
+    with alone_in(folder):
+        return _resumed(settings, folder, dataset, watch)
+
+
+def _resumed(
+    settings: RunSettings, folder: Path, dataset: Path | None, watch: Watch | None
+) -> RunResult:
+    files = run_files(folder)
     if dataset is not None:
         settings = replace(settings, dataset=dataset)
     data, start = load_data(settings), Start()
@@ -170,7 +182,7 @@ def resume_run(
             )
     sitting = Sitting(settings.config, data, files, start)
     photos = _photographs(sitting)
-    state = start.state or initial_state(sitting.scene, settings.config)
+    state = start.state or _first_state(sitting, photos)
     return _train(sitting, photos, state, watch)
 
 
@@ -206,6 +218,22 @@ def _photographs(sitting: Sitting) -> list[Photo]:
     )
     check_memory(sitting.scene, config, sitting.start.state)
     return load_photos(sitting.scene.views, config.max_size)
+
+
+def _first_state(sitting: Sitting, photos: list[Photo]) -> TrainState:
+    """The run before its first step; what it takes counts as training."""
+    scene, config, begun = sitting.scene, sitting.config, time.perf_counter()
+    if config.initial == "dense":
+        note("looking for points on which the photographs agree (--initial dense)")
+    dense = with_dense(scene, photos, config)
+    state = initial_state(dense, config)
+    seconds = time.perf_counter() - begun
+    sitting.start = sitting.start._replace(seconds=seconds)
+    if config.initial == "dense":
+        found = len(dense.points) - len(scene.points)
+        told = "" if len(dense.points) else ": starting from random ones"
+        note(f"found {found:,} in {seconds:.1f} s{told}")
+    return state
 
 
 def _train(

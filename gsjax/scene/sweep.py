@@ -1,0 +1,229 @@
+"""How far away what a photograph shows is, by plane sweep (Collins 1996).
+
+For every depth of a list the neighbours of a view are warped into it, as if all that it
+shows lay in a plane of that depth. Where it does, windows around a pixel look alike:
+their zero-mean normalised cross-correlation (ZNCC) is near 1, whatever the exposure.
+
+Axis legend: D depths, H W image.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gsjax.images import opencv
+
+# px, a side: small ones keep edges, large ones find what has little texture.
+_WINDOWS = (3, 7)
+_LEAST_DEPTHS, _MOST_DEPTHS = 16, 128
+# Variance of a window that is told from noise: of 1.5 of 255 grey levels.
+_LEAST_VARIANCE = (1.5 / 255) ** 2
+_OUTSIDE = -10.0  # grey level of what is not there
+
+
+class Shot(NamedTuple):
+    """A photograph as it is swept.
+
+    Attributes:
+      grey: [H, W] float32 in [0, 1], `_OUTSIDE` where nothing counts.
+      colors: [H, W, 3] uint8.
+      viewmat: [4, 4] world → camera.
+      K: [3, 3] intrinsics, px.
+    """
+
+    grey: np.ndarray
+    colors: np.ndarray
+    viewmat: np.ndarray
+    K: np.ndarray
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, px."""
+        return self.grey.shape[1], self.grey.shape[0]
+
+
+class DepthMap(NamedTuple):
+    """What a sweep found.
+
+    Attributes:
+      inverse: [H, W] 1 / z.
+      score: [H, W] ZNCC there; −1 where nothing was found.
+      step: between two depths, as inverses.
+    """
+
+    inverse: np.ndarray
+    score: np.ndarray
+    step: float
+
+
+def make_shot(
+    pixels: np.ndarray, valid: np.ndarray | None, viewmat: np.ndarray, K: np.ndarray,
+    longest: int,
+) -> Shot:  # fmt: skip
+    """A photograph made small.
+
+    Args:
+      pixels: [H, W, 3] uint8 RGB.
+      valid: [H, W] bool, what counts; or None for all.
+      viewmat, K: its camera.
+      longest: side, px.
+    """
+    cv2 = opencv()
+    height, width = pixels.shape[:2]
+    scale = min(1.0, longest / max(width, height))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
+    if valid is not None:
+        missing = (~valid).astype(np.float32)
+        grey[cv2.resize(missing, size, interpolation=cv2.INTER_AREA) > 0] = _OUTSIDE
+    ratios = [[size[0] / width], [size[1] / height], [1]]
+    return Shot(grey, small, np.asarray(viewmat, float), np.asarray(K) * ratios)
+
+
+def project(shot: Shot, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(pixels [M, 2], z [M]) of points [M, 3]; pixels −1 of what is not in view."""
+    seen = points @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]
+    z = seen[:, 2]
+    before = z > 0
+    pixels = (seen @ shot.K.T)[:, :2] / np.where(before, z, 1)[:, None]
+    inside = before & np.all((pixels >= 0) & (pixels < shot.size), 1)
+    return np.where(inside[:, None], pixels, -1), z
+
+
+def unproject(shot: Shot, rows, cols, inverse: np.ndarray) -> np.ndarray:
+    """[M, 3] world points behind pixels, by their 1 / z."""
+    rays = np.stack([cols + 0.5, rows + 0.5, np.ones(len(rows))], 1)
+    seen = rays @ np.linalg.inv(shot.K).T / inverse[:, None]
+    return (seen - shot.viewmat[:3, 3]) @ shot.viewmat[:3, :3]
+
+
+def sweep(
+    shot: Shot, neighbours: Sequence[Shot], nearest: float, farthest: float
+) -> DepthMap:
+    """Find the depth of every pixel that looks alike in the neighbours at one.
+
+    At each depth the better half of the neighbours count: what is hidden in the others
+    looks like nothing. Depths are as dense as a pixel of the neighbour that sees most
+    of a shift, up to 128, evenly in 1 / z; between them by a parabola.
+
+    Args:
+      shot: the view.
+      neighbours: one or more.
+      nearest, farthest: z to look between.
+    """
+    width, height = shot.size
+    warps = [_Warp(shot, other) for other in neighbours]
+    shift = max(warp.shift(1 / farthest, 1 / nearest) for warp in warps)
+    count = int(np.clip(np.ceil(shift), _LEAST_DEPTHS, _MOST_DEPTHS))
+    inverses = np.linspace(1 / farthest, 1 / nearest, count)
+    windows = [_Window(shot.grey, side) for side in _WINDOWS]
+    counted = (len(warps) + 1) // 2
+    scores = np.empty((count, height, width), np.float32)
+    for depth, inverse in enumerate(inverses):
+        best = [np.full((height, width), -1, np.float32) for _ in range(counted)]
+        for warp in warps:
+            image = warp.image(inverse)
+            square = image * image
+            new = sum(window.likeness(image, square) for window in windows)
+            for place, held in enumerate(best):
+                best[place], new = np.maximum(held, new), np.minimum(held, new)
+        np.sum(best, axis=0, out=scores[depth])
+    scores /= counted * len(windows)
+    return _chosen(scores, inverses, windows[-1].usable & windows[0].inside)
+
+
+class _Warp:
+    """A neighbour, seen from the view through a plane: H = A + b (0 0 1) / z."""
+
+    def __init__(self, shot: Shot, other: Shot):
+        turn = other.viewmat[:3, :3] @ shot.viewmat[:3, :3].T
+        move = other.viewmat[:3, 3] - turn @ shot.viewmat[:3, 3]
+        self.turn = other.K @ turn @ np.linalg.inv(shot.K)
+        self.move = np.outer(other.K @ move, [0, 0, 1])
+        self.size, self.grey = shot.size, other.grey
+
+    def shift(self, low: float, high: float) -> float:
+        """The longest way, px, of a pixel in the neighbour's image over the depths."""
+        width, height = self.size
+        x, y = (a.ravel() for a in np.meshgrid([0, 0.5, 1], [0, 0.5, 1]))
+        corners = np.stack([x * width, y * height, np.ones(9)])
+        ways = np.zeros(9)
+        before = None
+        for inverse in np.linspace(low, high, 33):
+            seen = (self.turn + inverse * self.move) @ corners
+            good = seen[2] > 1e-9
+            place = seen[:2] / np.where(good, seen[2], 1)
+            limit = [[self.grey.shape[1]], [self.grey.shape[0]]]
+            good &= np.all((place > 0) & (place < limit), 0)
+            if before is not None:
+                both = good & before[1]
+                way = np.linalg.norm(place - before[0], axis=0)
+                ways += np.where(both, way, 0)
+            before = place, good
+        return float(ways.max())
+
+    def image(self, inverse: float) -> np.ndarray:
+        """[H, W] the neighbour warped into the view."""
+        cv2 = opencv()
+        centred = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+        matrix = np.linalg.inv(centred) @ (self.turn + inverse * self.move) @ centred
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        return cv2.warpPerspective(
+            self.grey, matrix, self.size, flags=flags, borderValue=_OUTSIDE
+        )
+
+
+class _Window:
+    """The windows of a view, to be held against those of others."""
+
+    def __init__(self, grey: np.ndarray, side: int):
+        self.grey, self.side = grey, side
+        self.mean = _box(grey, side)
+        variance = _box(grey * grey, side) - self.mean * self.mean
+        self.inside = _inside(grey, side)
+        self.usable = variance > _LEAST_VARIANCE
+        self.scale = 1 / np.sqrt(np.maximum(variance, _LEAST_VARIANCE))
+
+    def likeness(self, other: np.ndarray, square: np.ndarray) -> np.ndarray:
+        """[H, W] ZNCC with an image, whose square is given too; −1 where it reaches
+        out of it."""
+        mean = _box(other, self.side)
+        variance = _box(square, self.side) - mean * mean
+        both = _box(other * self.grey, self.side) - mean * self.mean
+        score = both * self.scale / np.sqrt(np.maximum(variance, _LEAST_VARIANCE))
+        return np.where(_inside(other, self.side), score, np.float32(-1))
+
+
+def _box(image: np.ndarray, side: int) -> np.ndarray:
+    cv2 = opencv()
+    return cv2.boxFilter(image, -1, (side, side), borderType=cv2.BORDER_REFLECT)
+
+
+def _inside(image: np.ndarray, side: int) -> np.ndarray:
+    """Where a window holds nothing that is not there."""
+    return opencv().erode(image, np.ones((side, side), np.uint8)) > -1e-3
+
+
+def _chosen(scores: np.ndarray, inverses: np.ndarray, usable: np.ndarray) -> DepthMap:
+    """The best of scores [D, H, W]; none where that is the first or last depth."""
+    count = len(inverses)
+    best = np.argmax(scores, axis=0)
+    middle = np.clip(best, 1, count - 2)
+
+    def at(offset: int) -> np.ndarray:
+        return np.take_along_axis(scores, (middle + offset)[None], 0)[0]
+
+    before, here, after = at(-1), at(0), at(1)
+    bend = before - 2 * here + after
+    bent = bend < -1e-6
+    beside = 0.5 * (before - after) / np.where(bent, bend, 1)
+    beside = np.where(bent, np.clip(beside, -0.5, 0.5), 0)
+    step = float(inverses[1] - inverses[0])
+    found = usable & (best == middle)
+    return DepthMap(
+        inverse=inverses[0] + step * (middle + beside),
+        score=np.where(found, here, -1),
+        step=step,
+    )

@@ -1,0 +1,278 @@
+"""Points on which photographs agree, held against a still life whose depths are known:
+that of the analytic ray caster."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gsjax
+import gsjax.train.fit as fit_module
+from gsjax.scene import dense
+from gsjax.scene.caster import cast, demo_cameras, surface_points
+from gsjax.scene.dense import find_points
+from gsjax.scene.sweep import make_shot, project, sweep, unproject
+from gsjax.scene.types import Photo, Scene, View
+from gsjax.train.fit import initial_state, with_dense
+
+WIDTH, HEIGHT, VIEWS = 160, 120, 6
+ALL = 10**9
+
+
+@cache
+def taken() -> tuple[Scene, list[Photo], np.ndarray]:
+    """Six neighbours of a ring, 15° apart, with depths [V, H, W]."""
+    viewmats, K = demo_cameras(48, WIDTH, HEIGHT)
+    views, photos, depths = [], [], []
+    for index, viewmat in enumerate(viewmats[:VIEWS]):
+        rgb, depth = cast(viewmat, K, WIDTH, HEIGHT, samples=2)
+        name = f"{index}.png"
+        views.append(View(name, Path(name), viewmat, K, WIDTH, HEIGHT))
+        photos.append(Photo(np.uint8(255 * rgb + 0.5), None, None, K))
+        depths.append(depth)
+    points, colors = surface_points(400)
+    scene = Scene(Path("still life"), "made up", tuple(views), points, colors)
+    return scene, photos, np.stack(depths)
+
+
+def shots_of(photos, views):
+    return [
+        make_shot(photo.pixels, photo.valid, view.viewmat, photo.K, WIDTH)
+        for photo, view in zip(photos, views)
+    ]
+
+
+def off_surface(points: np.ndarray) -> np.ndarray:
+    """[M] how far points are from what some view sees there, as a share of its depth;
+    of the view in which it is least."""
+    scene, photos, depths = taken()
+    least = np.full(len(points), np.inf)
+    for shot, depth in zip(shots_of(photos, scene.views), depths):
+        pixels, z = project(shot, points)
+        col, row = np.maximum(pixels, 0).astype(int).T
+        there = depth[row, col]
+        good = (pixels[:, 0] >= 0) & (there > 0)
+        least = np.where(good, np.minimum(least, np.abs(z / np.where(
+            there > 0, there, 1) - 1)), least)  # fmt: skip
+    return least
+
+
+def with_photos(change) -> list[Photo]:
+    return [change(index, photo) for index, photo in enumerate(taken()[1])]
+
+
+def test_a_sweep_finds_the_depth():
+    scene, photos, depths = taken()
+    first, *others = shots_of(photos, scene.views)
+    found = sweep(first, others[:3], 2.5, 12.0)
+    there = (found.score > 0.6) & (depths[0] > 0)
+    assert np.mean(there[depths[0] > 0]) > 0.5
+    # A step is 1.5 % there, and the floor is seen at 23°.
+    off = np.abs(found.inverse[there] * depths[0][there] - 1)
+    assert np.mean(off < 0.05) > 0.8
+    assert np.median(off) < 0.0125
+
+
+def test_points_are_there_and_back_again():
+    scene, photos, _ = taken()
+    shot = shots_of(photos, scene.views)[2]
+    rows, cols = np.random.default_rng(0).integers(0, 100, (2, 50))
+    inverse = np.random.default_rng(1).uniform(0.1, 0.4, 50)
+    pixels, z = project(shot, unproject(shot, rows, cols, inverse))
+    np.testing.assert_allclose(pixels, np.stack([cols, rows], 1) + 0.5, rtol=1e-9)
+    np.testing.assert_allclose(z, 1 / inverse, rtol=1e-9)
+    behind = unproject(shot, rows, cols, -inverse)
+    assert (project(shot, behind)[0] == -1).all()
+
+
+def test_what_is_found_lies_on_surfaces():
+    scene, photos, _ = taken()
+    found = find_points(scene, photos, ALL)
+    assert len(found.points) > 10_000
+    off = off_surface(found.points)
+    assert np.mean(off < 0.02) > 0.85
+    assert np.mean(off < 0.05) > 0.95
+    assert np.median(off) < 0.005
+    assert found.colors.dtype == np.uint8
+    assert found.points.shape == found.colors.shape
+
+
+def test_without_points_it_is_looked_for_where_the_cameras_look():
+    scene, photos, _ = taken()
+    found = find_points(replace(scene, points=np.zeros((0, 3))), photos, ALL)
+    assert len(found.points) > 5_000
+    assert np.mean(off_surface(found.points) < 0.05) > 0.9
+
+
+def test_so_many_are_drawn_and_the_same_each_time():
+    scene, photos, _ = taken()
+    every = find_points(scene, photos, ALL, seed=1)
+    few, again = (find_points(scene, photos, 500, seed=1) for _ in range(2))
+    np.testing.assert_array_equal(few.points, again.points)
+    np.testing.assert_array_equal(few.colors, again.colors)
+    assert len(few.points) == 500
+    rows = {row.tobytes() for row in every.points}
+    assert all(row.tobytes() in rows for row in few.points)
+    other = find_points(scene, photos, 500, seed=2)
+    assert (few.points != other.points).any()
+
+
+def test_the_unit_of_length_does_not_matter():
+    """A power of two, so that nothing is rounded otherwise."""
+    scene, photos, _ = taken()
+    grown = []
+    for view in scene.views:
+        viewmat = view.viewmat.copy()
+        viewmat[:3, 3] *= 1024
+        grown.append(replace(view, viewmat=viewmat))
+    large = replace(scene, views=tuple(grown), points=1024 * scene.points)
+    one, other = (find_points(s, photos, ALL).points for s in (scene, large))
+    np.testing.assert_array_equal(1024 * one, other)
+
+
+def test_exposures_do_not_matter():
+    """Windows are compared by how they vary, not by how bright they are."""
+    scene, photos, _ = taken()
+
+    def darker(index, photo):
+        pixels = photo.pixels * (1 - 0.1 * index) + 4 * index
+        return photo._replace(pixels=np.uint8(pixels))
+
+    usual = find_points(scene, photos, ALL)
+    found = find_points(scene, with_photos(darker), ALL)
+    assert len(found.points) > 0.9 * len(usual.points)
+    assert np.mean(off_surface(found.points) < 0.05) > 0.95
+
+
+@pytest.mark.parametrize("how", ["masked", "transparent"])
+def test_what_does_not_count_is_no_point(how):
+    """Whatever is found is seen, where it counts, by the view that found it and by two
+    that agree."""
+    scene, _, _ = taken()
+    kept = np.zeros((HEIGHT, WIDTH), bool)
+    kept[:, WIDTH // 2 :] = True
+
+    def half(_, photo):
+        if how == "masked":
+            return photo._replace(valid=kept)
+        return photo._replace(alpha=np.where(kept, 255, 254).astype(np.uint8))
+
+    photos = with_photos(half)
+    found = find_points(scene, photos, ALL)
+    assert len(found.points) > 1000
+    seen = np.zeros(len(found.points), int)
+    for shot in shots_of(photos, scene.views):
+        pixels, _ = project(shot, found.points)
+        seen += pixels[:, 0] >= WIDTH // 2
+    assert (seen >= 3).all()
+
+
+def no_view_overlaps(scene, photos):
+    turned = []
+    for index, view in enumerate(scene.views):
+        flip = np.diag([-1.0, 1, -1, 1]) if index % 2 else np.eye(4)
+        aside = np.eye(4)
+        aside[0, 3] = 1e3 * index
+        turned.append(replace(view, viewmat=flip @ view.viewmat @ aside))
+    return replace(scene, views=tuple(turned)), photos
+
+
+def one_view(scene, photos):
+    return replace(scene, views=scene.views[:1]), photos[:1]
+
+
+def nothing_to_tell_apart(scene, photos):
+    return scene, [p._replace(pixels=np.full_like(p.pixels, 127)) for p in photos]
+
+
+def all_masked(scene, photos):
+    none = np.zeros((HEIGHT, WIDTH), bool)
+    return scene, [p._replace(valid=none) for p in photos]
+
+
+def noise(scene, photos):
+    rng = np.random.default_rng(0)
+    shape = photos[0].pixels.shape
+    return scene, [
+        p._replace(pixels=rng.integers(0, 256, shape, np.uint8)) for p in photos
+    ]
+
+
+def of_one_place(scene, photos):
+    return replace(scene, views=(scene.views[0],) * len(photos)), photos
+
+
+@pytest.mark.parametrize(
+    "case",
+    [no_view_overlaps, one_view, nothing_to_tell_apart, all_masked, of_one_place],
+)
+def test_nothing_is_found_where_there_is_nothing(case):
+    scene, photos = case(*taken()[:2])
+    found = find_points(scene, photos, ALL)
+    assert found.points.shape == found.colors.shape == (0, 3)
+
+
+def test_of_noise_next_to_nothing_is_found():
+    scene, photos = noise(*taken()[:2])
+    found = find_points(scene, photos, ALL)
+    assert len(found.points) < 0.001 * VIEWS * HEIGHT * WIDTH
+
+
+@pytest.mark.parametrize("size", [(1, 1), (9, 5), (400, 3)])
+def test_photographs_of_odd_sizes(size):
+    scene, photos, _ = taken()
+    width, height = size
+    small = []
+    for photo in photos:
+        rows = np.linspace(0, HEIGHT - 1, height).astype(int)
+        cols = np.linspace(0, WIDTH - 1, width).astype(int)
+        K = photo.K * [[width / WIDTH], [height / HEIGHT], [1]]
+        small.append(photo._replace(pixels=photo.pixels[rows][:, cols], K=K))
+    found = find_points(scene, small, ALL)
+    assert np.isfinite(found.points).all()
+
+
+def test_of_many_views_those_far_apart_are_looked_at(monkeypatch):
+    scene, photos, _ = taken()
+    line = np.asarray([0, 1, 2.2, 3, 4, 5])[:, None] * [1, 0, 0]
+    assert dense._spread_out(line, 6) == [0, 1, 2, 3, 4, 5]
+    assert dense._spread_out(line, 3) == [0, 2, 5]
+    assert dense._spread_out(np.zeros((5, 3)), 3) == [0]
+    monkeypatch.setattr(dense, "_MOST_VIEWS", 3)
+    few = find_points(scene, photos, ALL)
+    centres = np.stack([view.centre for view in scene.views])
+    chosen = dense._spread_out(centres, 3)
+    views = tuple(scene.views[index] for index in chosen)
+    some = [photos[index] for index in chosen]
+    same = find_points(replace(scene, views=views), some, ALL)
+    assert len(few.points) > 0
+    np.testing.assert_array_equal(few.points, same.points)
+
+
+def test_a_run_starts_from_them_and_from_the_points_of_the_dataset():
+    scene, photos, _ = taken()
+    config = gsjax.TrainConfig(initial="dense", dense_count=1000, seed=3)
+    more = with_dense(scene, photos, config)
+    found = find_points(scene, photos, 1000, seed=3)
+    np.testing.assert_array_equal(more.points[:400], scene.points)
+    np.testing.assert_array_equal(more.points[400:], found.points)
+    np.testing.assert_array_equal(more.colors[400:], found.colors)
+    assert int(initial_state(more, config).gaussians.active.sum()) == 1400
+    for initial in ("points", "random", "auto"):
+        assert with_dense(scene, photos, config.replace(initial=initial)) is scene
+
+
+def test_where_nothing_is_found_it_starts_as_without(monkeypatch):
+    scene, photos = nothing_to_tell_apart(*taken()[:2])
+    config = gsjax.TrainConfig(initial="dense", initial_count=77)
+    usual = with_dense(scene, photos, config)
+    assert int(initial_state(usual, config).gaussians.active.sum()) == 400
+    bare = replace(scene, points=np.zeros((0, 3)), colors=np.zeros((0, 3), np.uint8))
+    random = with_dense(bare, photos, config)
+    assert int(initial_state(random, config).gaussians.active.sum()) == 77
+    some = with_dense(bare, taken()[1], config.replace(dense_count=5))
+    assert int(initial_state(some, config).gaussians.active.sum()) == 5
+    monkeypatch.setattr(fit_module, "_LEAST_FOUND", ALL)
+    assert with_dense(bare, taken()[1], config) is bare
