@@ -8,9 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.cameras import Camera
 from gsjax.errors import CapacityError
-from gsjax.gaussians import capacity_bucket, grow, num_active
+from gsjax.gaussians import Gaussians, capacity_bucket, grow, num_active
 from gsjax.raster.render import count_demand
+from gsjax.raster.types import RasterConfig
 from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Frames
 from gsjax.train.step import TrainState
@@ -29,17 +31,54 @@ _MAX_PROBED_VIEWS = 6
 def pairs_for(state: TrainState, frames: Frames, config: TrainConfig) -> int:
     """A pair capacity for these photographs, with room to spare.
 
+    Before the first step it is estimated: to count takes a program, and that seconds.
+
     Raises:
       CapacityError: as `roomy_pairs` and `count_demand`.
     """
+    begins = int(state.step) == 0
     probed = np.linspace(0, frames.count - 1, min(frames.count, _MAX_PROBED_VIEWS))
     most = 1
     for index in np.unique(probed.astype(int)):
         camera = jax.tree.map(lambda a, i=index: a[i], frames.camera)
-        # The same settings for each: one program.
-        demand = count_demand(state.gaussians, camera, config.raster)
-        most = max(most, int(demand.capacity))
+        if begins:
+            wanted = expected_pairs(state.gaussians, camera, config.raster)
+        else:  # the same settings for each: one program
+            wanted = count_demand(state.gaussians, camera, config.raster).capacity
+        most = max(most, int(wanted))
     return roomy_pairs(most, state, config)
+
+
+def expected_pairs(gaussians: Gaussians, camera: Camera, config: RasterConfig) -> float:
+    """How many pairs a view of round Gaussians wants, as runs begin with them.
+
+    A convex figure of area A that is w × h meets (A + c (w + h) + c²) / t² squares of
+    side c on a grid of t, on average over where it lies (Santaló 1976). Those that hold
+    the pixel centres of a tile of t px have c = t − 1. Nothing is hidden here, and of
+    what reaches out of the picture the part in it is taken as an ellipse.
+
+    Args:
+      gaussians: N slots; others than round ones are taken as round ones.
+      camera: one.
+      config: for the size of tiles, the α cut and the dilation.
+    """
+    params = jax.tree.map(lambda a: np.asarray(a, np.float64), gaussians.params)
+    viewmat, K = np.asarray(camera.viewmat, float), np.asarray(camera.K, float)
+    seen = params.means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    z = seen[:, 2]
+    drawn = np.asarray(gaussians.active) & (z > camera.near) & (z < camera.far)
+    seen, z = seen[drawn], z[drawn]
+    centre = (seen @ K.T)[:, :2] / z[:, None]
+    variance = np.mean(np.exp(2 * params.log_scales[drawn]), 1) * K[0, 0] * K[1, 1]
+    opacity = 1 / (1 + np.exp(-params.logit_opacities[drawn]))
+    reach = 2 * np.log(np.maximum(opacity / config.alpha_cut, 1))
+    radius = np.sqrt(reach * (variance / z**2 + config.dilation))[:, None]
+    size = np.asarray([camera.width, camera.height], float)
+    sides = np.clip(centre + radius, 0, size) - np.clip(centre - radius, 0, size)
+    wide, high = sides[(sides > 0).all(1)].T
+    tile, inner = config.tile_size, config.tile_size - 1
+    met = np.pi / 4 * wide * high + inner * (wide + high) + inner**2
+    return float(np.sum(met)) / tile**2
 
 
 def roomy_pairs(wanted: int, state: TrainState, config: TrainConfig) -> int:
