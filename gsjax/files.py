@@ -253,25 +253,35 @@ def alone_in(folder: Path) -> Iterator[None]:
       InputError: if another has it.
     """
     try:
-        import fcntl
-
-        handle = os.open(folder, os.O_RDONLY)
-    except (ImportError, OSError):  # Windows has no fcntl, nor opens folders
-        yield
-        return
+        handle = _locked(folder)
+    except BlockingIOError:
+        raise InputError(
+            f"{folder}: another training is at work in it; wait until it has ended, "
+            "or use another folder"
+        ) from None
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(
-                f"{folder}: another training is at work in it; wait until it has "
-                "ended, or use another folder"
-            ) from None
-        except OSError:  # a disk without locks
-            pass
         yield
     finally:
+        if handle is not None:
+            os.close(handle)
+
+
+def _locked(folder: Path) -> int | None:
+    """What holds a folder until it is closed; None where that cannot be."""
+    try:
+        import fcntl  # not on Windows
+
+        handle = os.open(folder, os.O_RDONLY)
+    except (ImportError, OSError):
+        return None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
         os.close(handle)
+        raise
+    except OSError:  # a disk without locks
+        pass
+    return handle
 
 
 def refuse_existing(

@@ -10,10 +10,11 @@ import pytest
 
 import gsjax
 import gsjax.train.fit as fit_module
+from gsjax.errors import InputError
 from gsjax.scene import dense
 from gsjax.scene.caster import cast, demo_cameras, surface_points
 from gsjax.scene.dense import find_points
-from gsjax.scene.sweep import make_shot, project, sweep, unproject
+from gsjax.scene.sweep import make_shot, pinhole, project, sweep, unproject
 from gsjax.scene.types import Photo, Scene, View
 from gsjax.train.fit import initial_state, with_dense
 
@@ -37,11 +38,17 @@ def taken() -> tuple[Scene, list[Photo], np.ndarray]:
     return scene, photos, np.stack(depths)
 
 
-def shots_of(photos, views):
+def cameras_of(scene, photos):
+    size = (WIDTH, HEIGHT)
     return [
-        make_shot(photo.pixels, photo.valid, view.viewmat, photo.K, WIDTH)
-        for photo, view in zip(photos, views)
+        pinhole(view.viewmat, photo.K, size, WIDTH)
+        for view, photo in zip(scene.views, photos)
     ]
+
+
+def shots_of(scene, photos):
+    cameras = cameras_of(scene, photos)
+    return [make_shot(c, photo.pixels) for c, photo in zip(cameras, photos)]
 
 
 def off_surface(points: np.ndarray) -> np.ndarray:
@@ -49,8 +56,8 @@ def off_surface(points: np.ndarray) -> np.ndarray:
     of the view in which it is least."""
     scene, photos, depths = taken()
     least = np.full(len(points), np.inf)
-    for shot, depth in zip(shots_of(photos, scene.views), depths):
-        pixels, z = project(shot, points)
+    for camera, depth in zip(cameras_of(scene, photos), depths):
+        pixels, z = project(camera, points)
         col, row = np.maximum(pixels, 0).astype(int).T
         there = depth[row, col]
         good = (pixels[:, 0] >= 0) & (there > 0)
@@ -65,7 +72,7 @@ def with_photos(change) -> list[Photo]:
 
 def test_a_sweep_finds_the_depth():
     scene, photos, depths = taken()
-    first, *others = shots_of(photos, scene.views)
+    first, *others = shots_of(scene, photos)
     found = sweep(first, others[:3], 2.5, 12.0)
     there = (found.score > 0.6) & (depths[0] > 0)
     assert np.mean(there[depths[0] > 0]) > 0.5
@@ -77,14 +84,14 @@ def test_a_sweep_finds_the_depth():
 
 def test_points_are_there_and_back_again():
     scene, photos, _ = taken()
-    shot = shots_of(photos, scene.views)[2]
+    camera = cameras_of(scene, photos)[2]
     rows, cols = np.random.default_rng(0).integers(0, 100, (2, 50))
     inverse = np.random.default_rng(1).uniform(0.1, 0.4, 50)
-    pixels, z = project(shot, unproject(shot, rows, cols, inverse))
+    pixels, z = project(camera, unproject(camera, rows, cols, inverse))
     np.testing.assert_allclose(pixels, np.stack([cols, rows], 1) + 0.5, rtol=1e-9)
     np.testing.assert_allclose(z, 1 / inverse, rtol=1e-9)
-    behind = unproject(shot, rows, cols, -inverse)
-    assert (project(shot, behind)[0] == -1).all()
+    behind = unproject(camera, rows, cols, -inverse)
+    assert (project(camera, behind)[0] == -1).all()
 
 
 def test_what_is_found_lies_on_surfaces():
@@ -163,8 +170,8 @@ def test_what_does_not_count_is_no_point(how):
     found = find_points(scene, photos, ALL)
     assert len(found.points) > 1000
     seen = np.zeros(len(found.points), int)
-    for shot in shots_of(photos, scene.views):
-        pixels, _ = project(shot, found.points)
+    for camera in cameras_of(scene, photos):
+        pixels, _ = project(camera, found.points)
         seen += pixels[:, 0] >= WIDTH // 2
     assert (seen >= 3).all()
 
@@ -234,21 +241,111 @@ def test_photographs_of_odd_sizes(size):
     assert np.isfinite(found.points).all()
 
 
-def test_of_many_views_those_far_apart_are_looked_at(monkeypatch):
+def test_photographs_are_made_smaller(monkeypatch):
+    """Cameras, masks and transparency with them."""
+    scene, photos, _ = taken()
+    monkeypatch.setattr(dense, "_LONGEST", 80)
+    found = find_points(scene, photos, ALL)
+    assert len(found.points) > 4_000
+    off = off_surface(found.points)
+    assert np.mean(off < 0.05) > 0.88
+    assert np.median(off) < 0.012
+    right = np.zeros((HEIGHT, WIDTH), bool)
+    right[:, WIDTH // 2 :] = True
+    half = find_points(scene, [p._replace(valid=right) for p in photos], ALL)
+    seen = [project(camera, half.points)[0] for camera in cameras_of(scene, photos)]
+    assert (np.sum([p[:, 0] >= WIDTH // 2 for p in seen], 0) >= 3).all()
+    assert len(half.points) > 500
+
+
+def test_photographs_of_other_sizes_and_upright_ones():
+    """Every other view rolled by 90° about its axis, and one of half the size: nothing
+    is found where it is not, nor half a pixel aside."""
+    scene, photos, _ = taken()
+    usual = find_points(scene, photos, ALL)
+    views, others = list(scene.views), list(photos)
+    for index in range(1, VIEWS, 2):
+        (fx, _, cx), (_, fy, cy), _ = photos[index].K
+        K = np.asarray([[fy, 0, HEIGHT - cy], [0, fx, cx], [0, 0, 1]])
+        roll = np.eye(4)
+        roll[:2, :2] = [[0, -1], [1, 0]]  # x is what −y was, y what x was
+        viewmat = roll @ views[index].viewmat
+        views[index] = replace(
+            views[index], viewmat=viewmat, K=K, width=HEIGHT, height=WIDTH
+        )
+        turned = np.ascontiguousarray(np.rot90(photos[index].pixels, -1))
+        others[index] = photos[index]._replace(pixels=turned, K=K)
+    turned = find_points(replace(scene, views=tuple(views)), others, ALL)
+    assert len(turned.points) == pytest.approx(len(usual.points), rel=0.05)
+    medians = [np.median(off_surface(f.points)) for f in (usual, turned)]
+    assert medians[1] < 1.1 * medians[0]
+    rgb, _ = cast(scene.views[2].viewmat, photos[2].K / [[2], [2], [1]], 80, 60)
+    pixels = np.uint8(255 * rgb + 0.5)
+    smaller = [*photos]
+    smaller[2] = photos[2]._replace(pixels=pixels, K=photos[2].K / [[2], [2], [1]])
+    found = find_points(scene, smaller, ALL)
+    assert np.mean(off_surface(found.points) < 0.05) > 0.92
+
+
+def test_two_views_are_enough():
+    scene, photos, _ = taken()
+    found = find_points(replace(scene, views=scene.views[:2]), photos[:2], ALL)
+    assert len(found.points) > 4_000
+    assert np.mean(off_surface(found.points) < 0.05) > 0.85
+
+
+def test_a_wall_before_parallel_cameras():
+    """As of LLFF: no points are known, and the wall is eight extents away."""
+    rng = np.random.default_rng(0)
+    tiles = rng.integers(0, 256, (60, 60, 3)).astype(np.uint8)
+    K = np.asarray([[120.0, 0, 80], [0, 120, 60], [0, 0, 1]])
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    views, photos = [], []
+    for index in range(5):
+        viewmat = np.eye(4)
+        viewmat[0, 3] = -0.5 * (index - 2)
+        x = (u - 80) / 120 * 8.8 + 0.5 * (index - 2) + 30
+        y = (v - 60) / 120 * 8.8 + 30
+        pixels = tiles[(3 * y).astype(int) % 60, (3 * x).astype(int) % 60]
+        name = f"{index}.png"
+        views.append(View(name, Path(name), viewmat, K, WIDTH, HEIGHT))
+        photos.append(Photo(pixels, None, None, K))
+    scene = Scene(Path("wall"), "made up", tuple(views))
+    found = find_points(scene, photos, ALL)
+    assert len(found.points) > 10_000
+    off = np.abs(found.points[:, 2] / 8.8 - 1)  # 0.07 is half a pixel
+    assert np.median(off) < 0.04
+    assert np.mean(off < 0.14) > 0.95
+
+
+def test_nor_do_cores_matter(monkeypatch):
+    scene, photos, _ = taken()
+    found = []
+    for cores in (1, 4):
+        monkeypatch.setattr(dense, "usable_cores", lambda cores=cores: cores)
+        found.append(find_points(scene, photos, ALL))
+    np.testing.assert_array_equal(found[0].points, found[1].points)
+
+
+def test_of_many_views_some_far_apart_and_their_neighbours(monkeypatch):
     scene, photos, _ = taken()
     line = np.asarray([0, 1, 2.2, 3, 4, 5])[:, None] * [1, 0, 0]
     assert dense._spread_out(line, 6) == [0, 1, 2, 3, 4, 5]
     assert dense._spread_out(line, 3) == [0, 2, 5]
     assert dense._spread_out(np.zeros((5, 3)), 3) == [0]
+    swept = []
+
+    def counted(shot, *rest):
+        swept.append(shot)
+        return sweep(shot, *rest)
+
+    monkeypatch.setattr(dense, "sweep", counted)
     monkeypatch.setattr(dense, "_MOST_VIEWS", 3)
-    few = find_points(scene, photos, ALL)
-    centres = np.stack([view.centre for view in scene.views])
-    chosen = dense._spread_out(centres, 3)
-    views = tuple(scene.views[index] for index in chosen)
-    some = [photos[index] for index in chosen]
-    same = find_points(replace(scene, views=views), some, ALL)
-    assert len(few.points) > 0
-    np.testing.assert_array_equal(few.points, same.points)
+    monkeypatch.setattr(dense, "_SEEDS", 1)
+    found = find_points(scene, photos, ALL)
+    assert len(swept) == 3
+    assert len(found.points) > 5_000
+    assert np.mean(off_surface(found.points) < 0.05) > 0.9
 
 
 def test_a_run_starts_from_them_and_from_the_points_of_the_dataset():
@@ -262,6 +359,9 @@ def test_a_run_starts_from_them_and_from_the_points_of_the_dataset():
     assert int(initial_state(more, config).gaussians.active.sum()) == 1400
     for initial in ("points", "random", "auto"):
         assert with_dense(scene, photos, config.replace(initial=initial)) is scene
+    assert with_dense(scene, photos, config.replace(dense_count=0)) is scene
+    with pytest.raises(InputError, match="5 photos for 6 views"):
+        find_points(scene, photos[1:], ALL)
 
 
 def test_where_nothing_is_found_it_starts_as_without(monkeypatch):

@@ -285,7 +285,7 @@ def test_looking_for_points_counts_as_training(whole, tmp_path, monkeypatch, cap
     monkeypatch.setattr(run_module, "with_dense", found)
     settings = RunSettings(whole / "data", CONFIG.replace(initial="dense"))
     start_run(settings, tmp_path / "run")
-    assert "found 7 in 0." in capsys.readouterr().err
+    assert "7 more points, after " in capsys.readouterr().err
     files = run_files(tmp_path / "run")
     first, *_ = read_metrics(files.metrics)
     assert first["seconds"] > first["compile_seconds"] + 0.5
@@ -294,7 +294,7 @@ def test_looking_for_points_counts_as_training(whole, tmp_path, monkeypatch, cap
     files.splat.unlink()
     assert load_settings(tmp_path / "run").config.initial == "dense"
     resume_run(tmp_path / "run")
-    assert "found 7 in 0." in capsys.readouterr().err
+    assert "7 more points, after " in capsys.readouterr().err
     assert files.splat.read_bytes() == scene
 
 

@@ -1,35 +1,49 @@
 """More points of a scene than structure from motion gives: those on which views agree.
 
-Every view is swept against its neighbours (`gsjax.scene.sweep`), and what it finds is a
+Views are swept against their neighbours (`gsjax.scene.sweep`), and what one finds is a
 point if others find it too. A training that starts from them need not grow a scene out
 of a few hundred points, and knows from the start how far away things are.
 
 Axis legend: V views, M points.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
+from gsjax.errors import InputError
 from gsjax.machine import usable_cores
-from gsjax.scene.initialise import has_points, points_in_ball
-from gsjax.scene.sweep import DepthMap, Shot, make_shot, project, sweep, unproject
+from gsjax.scene.initialise import has_points, points_in_ball, scene_extent
+from gsjax.scene.sweep import (
+    DepthMap,
+    Pinhole,
+    Shot,
+    make_shot,
+    pinhole,
+    project,
+    sweep,
+    unproject,
+)
 from gsjax.scene.types import Photo, Scene
 
 _LONGEST = 192  # px, of the photographs as they are swept
-_MOST_VIEWS = 48  # that are swept: a few hundred pixels each would do
+# Of more views some are swept, far from one another, and with each the two neighbours
+# that are to agree with it.
+_MOST_VIEWS, _SEEDS = 48, 16
 _NEIGHBOURS = 4
 # Between the directions from which two views see a point: narrow ones tell little of
 # how far it is, and at wide ones windows do not look alike.
-_BEST_ANGLE, _WIDEST_ANGLE = 12.0, 60.0  # degrees
+_LEAST_ANGLE, _BEST_ANGLE, _WIDEST_ANGLE = 0.5, 12.0, 60.0  # degrees
 _LEAST_SHARED = 0.1  # of what one view shows, in the other
 _SAMPLED = 2000  # points to choose neighbours by
 _LEAST_SCORE = 0.6
 _AGREEING = 2  # other views
 _STEPS = 1.5  # of depths, that two may differ by and still agree
 _ROOM = (0.8, 1.3)  # beyond the depths of the points that are known
+_FARTHEST = 10.0  # extents, where no points are known
+_MOST_THREADS = 16  # with 20 MB each
 
 
 class Found(NamedTuple):
@@ -42,11 +56,11 @@ class Found(NamedTuple):
 def find_points(
     scene: Scene, photos: Sequence[Photo], count: int, *, seed: int = 0
 ) -> Found:
-    """Points on which at least two views, and one more, agree.
+    """Points that a view found, and two of its neighbours too (of one, that one).
 
-    Of a scene of more than 48 views, so many that lie far from one another are looked
-    at. Depths are looked for where the scene's points are or, if it has none, in the
-    ball around what its cameras look at.
+    Of a scene of more than 48 views, 16 that lie far from one another are looked at,
+    each with two neighbours. Depths are looked for where the scene's points are or, if
+    it has none, from the ball around what its cameras look at to ten extents away.
 
     Args:
       scene: its cameras and points.
@@ -59,36 +73,125 @@ def find_points(
       be told from its surroundings.
 
     Raises:
+      InputError: if there is not one photo for each view.
       MissingExtraError: if OpenCV is absent.
     """
+    if len(photos) != len(scene.views):
+        raise InputError(
+            f"{len(photos)} photos for {len(scene.views)} views; one for each is wanted"
+        )
     rng = np.random.default_rng(seed)
-    if has_points(scene):
-        known = scene.points[np.isfinite(scene.points).all(1)]
-    else:
-        known = points_in_ball(scene, _SAMPLED, rng)
-    if len(known) > _SAMPLED:
-        known = known[np.sort(rng.choice(len(known), _SAMPLED, replace=False))]
-    chosen = _spread_out(np.stack([view.centre for view in scene.views]), _MOST_VIEWS)
-    shots = [_shot_of(scene, photos, index) for index in chosen]
-    pairing = _neighbours(shots, known)
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        maps = list(pool.map(lambda i: _swept(shots, pairing[i], known, i), pairing))
-    maps = dict(zip(pairing, maps))
-    found = [_agreed(shots, maps, pairing[i], i) for i in pairing]
+    around = _Surroundings(scene, photos, rng)
+    pairing = _paired(around)
+    needed = sorted({*pairing, *(view for some in pairing.values() for view in some)})
+    shots = {
+        view: make_shot(around.cameras[view], photo.pixels, _counts(photo))
+        for view, photo in ((view, photos[view]) for view in needed)
+    }
+
+    def swept(view: int) -> DepthMap:
+        others = [shots[other] for other in pairing[view]]
+        return sweep(shots[view], others, *around.depths(view))
+
+    maps = dict(zip(pairing, _threaded(swept, pairing)))
+    found = [_agreed(view, shots, maps, pairing[view]) for view in pairing]
     points = np.concatenate([np.zeros((0, 3)), *(some.points for some in found)])
-    colors = np.concatenate(
-        [np.zeros((0, 3), np.uint8), *(some.colors for some in found)]
-    )
+    none = np.zeros((0, 3), np.uint8)
+    colors = np.concatenate([none, *(some.colors for some in found)])
     if len(points) > count:
         drawn = np.sort(rng.choice(len(points), count, replace=False))
         points, colors = points[drawn], colors[drawn]
     return Found(points, colors)
 
 
+def _counts(photo: Photo) -> np.ndarray | None:
+    """[H, W] bool, which pixels of a photograph count; None for all."""
+    if photo.alpha is None:
+        return photo.valid
+    opaque = photo.alpha == 255
+    return opaque if photo.valid is None else photo.valid & opaque
+
+
+def _threaded(work, inputs: Iterable[int]) -> list:
+    """What it makes of each, on all cores; given up at once on Ctrl-C."""
+    with ThreadPoolExecutor(min(_MOST_THREADS, usable_cores())) as pool:
+        tasks = [pool.submit(work, one) for one in inputs]
+        try:
+            return [task.result() for task in tasks]
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+class _Surroundings:
+    """The cameras of all views, and points to tell by what they have in common.
+
+    Attributes:
+      cameras: of the photographs as they are swept.
+      points: [M, 3], of the scene or of a ball.
+      inside: [V, M] which of them a view shows.
+    """
+
+    def __init__(self, scene: Scene, photos: Sequence[Photo], rng: np.random.Generator):
+        self.cameras = [
+            pinhole(view.viewmat, photo.K, photo.pixels.shape[1::-1], _LONGEST)
+            for view, photo in zip(scene.views, photos)
+        ]
+        self.centres = np.stack([camera.centre for camera in self.cameras])
+        if has_points(scene):
+            points = scene.points[np.isfinite(scene.points).all(1)]
+            self._farthest = 0.0
+        else:
+            points = points_in_ball(scene, _SAMPLED, rng)
+            self._farthest = _FARTHEST * scene_extent(self.centres)
+        if len(points) > _SAMPLED:
+            points = points[np.sort(rng.choice(len(points), _SAMPLED, replace=False))]
+        self.points = points
+        seen = [project(camera, points) for camera in self.cameras]
+        self.inside = np.stack([pixels[:, 0] >= 0 for pixels, _ in seen])
+
+    def depths(self, view: int) -> tuple[float, float]:
+        """z to look for things between."""
+        _, z = project(self.cameras[view], self.points[self.inside[view]])
+        low, high = np.percentile(z, [1, 99])
+        return _ROOM[0] * low, max(_ROOM[1] * high, self._farthest)
+
+    def neighbours(self, view: int) -> list[int]:
+        """The views to hold a view against, the best first, four at most.
+
+        Best are those that see much of what it sees, from some 12° beside it and from
+        as near.
+        """
+        inside = self.inside[view]
+        shared = self.inside & inside
+        share = shared.sum(1) / max(1, inside.sum())
+        scores = np.zeros(len(self.cameras))
+        for other in np.flatnonzero(share >= _LEAST_SHARED):
+            points = self.points[shared[other]]
+            mine, theirs = points - self.centres[view], points - self.centres[other]
+            near, far = np.linalg.norm(mine, axis=1), np.linalg.norm(theirs, axis=1)
+            cosine = np.median(np.sum(mine * theirs, 1) / (near * far))
+            angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+            if other != view and _LEAST_ANGLE < angle < _WIDEST_ANGLE:
+                off = np.log(angle / _BEST_ANGLE), np.median(np.log(near / far))
+                scores[other] = share[other] * np.exp(-np.sum(np.square(off)))
+        best = np.argsort(-scores, kind="stable")[:_NEIGHBOURS]
+        return [int(other) for other in best if scores[other] > 0]
+
+
+def _paired(around: _Surroundings) -> dict[int, list[int]]:
+    """The views to sweep, each with its neighbours; those without are left out."""
+    chosen = list(range(len(around.cameras)))
+    if len(chosen) > _MOST_VIEWS:
+        seeds = _spread_out(around.centres, _SEEDS)
+        agreeing = [view for seed in seeds for view in around.neighbours(seed)[:2]]
+        chosen = sorted({*seeds, *agreeing})
+    pairing = {view: around.neighbours(view) for view in chosen}
+    return {view: others for view, others in pairing.items() if others}
+
+
 def _spread_out(centres: np.ndarray, count: int) -> list[int]:
     """At most so many views, each as far as can be from those before it."""
-    if len(centres) <= count:
-        return list(range(len(centres)))
     chosen = [0]
     apart = np.full(len(centres), np.inf)
     while len(chosen) < count:
@@ -98,78 +201,26 @@ def _spread_out(centres: np.ndarray, count: int) -> list[int]:
     return sorted(set(chosen))
 
 
-def _shot_of(scene: Scene, photos: Sequence[Photo], index: int) -> Shot:
-    view, photo = scene.views[index], photos[index]
-    valid = photo.valid
-    if photo.alpha is not None:
-        opaque = photo.alpha == 255
-        valid = opaque if valid is None else valid & opaque
-    return make_shot(photo.pixels, valid, view.viewmat, photo.K, _LONGEST)
-
-
-def _neighbours(shots: list[Shot], known: np.ndarray) -> dict[int, list[int]]:
-    """For each view that has any, the views to hold it against, the best first.
-
-    Best are those that see much of what it sees, from some 12° beside it and as near.
-    """
-    count = len(shots)
-    seen = [project(shot, known) for shot in shots]
-    inside = np.stack([pixels[:, 0] >= 0 for pixels, _ in seen])
-    centres = np.stack([_centre(shot) for shot in shots])
-    towards = known - centres[:, None]
-    distance = np.linalg.norm(towards, axis=2)
-    towards = towards / np.maximum(distance, 1e-300)[..., None]
-    pairing = {}
-    for one in range(count):
-        scores = np.zeros(count)
-        for other in range(count):
-            both = inside[one] & inside[other]
-            share = both.sum() / max(1, inside[one].sum())
-            if other == one or share < _LEAST_SHARED:
-                continue
-            cosine = np.sum(towards[one, both] * towards[other, both], axis=1)
-            angle = np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))
-            if not 0.5 < angle < _WIDEST_ANGLE:
-                continue
-            nearer = np.median(np.log(distance[one, both] / distance[other, both]))
-            off = np.log(angle / _BEST_ANGLE) ** 2 + nearer**2
-            scores[other] = share * np.exp(-off)
-        best = np.argsort(-scores, kind="stable")[:_NEIGHBOURS]
-        best = [int(other) for other in best if scores[other] > 0]
-        if best:
-            pairing[one] = best
-    return pairing
-
-
-def _centre(shot: Shot) -> np.ndarray:
-    return -shot.viewmat[:3, :3].T @ shot.viewmat[:3, 3]
-
-
-def _swept(
-    shots: list[Shot], others: list[int], known: np.ndarray, index: int
-) -> DepthMap:
-    pixels, z = project(shots[index], known)
-    low, high = np.percentile(z[pixels[:, 0] >= 0], [1, 99])
-    neighbours = [shots[other] for other in others]
-    return sweep(shots[index], neighbours, _ROOM[0] * low, _ROOM[1] * high)
-
-
 def _agreed(
-    shots: list[Shot], maps: dict[int, DepthMap], others: list[int], index: int
+    view: int, shots: dict[int, Shot], maps: dict[int, DepthMap], others: list[int]
 ) -> Found:
-    """What a view found, where enough of the others found it too."""
-    shot, mine = shots[index], maps[index]
+    """What a view found, where enough of the others that were swept found it too."""
+    shot, mine = shots[view], maps[view]
     rows, cols = np.nonzero(mine.score > _LEAST_SCORE)
-    points = unproject(shot, rows, cols, mine.inverse[rows, cols])
+    points = unproject(shot.camera, rows, cols, mine.inverse[rows, cols])
     votes = np.zeros(len(points), int)
     others = [other for other in others if other in maps]
     for other in others:
-        pixels, z = project(shots[other], points)
-        inside = pixels[:, 0] >= 0
-        col, row = np.where(inside[:, None], pixels, 0).astype(int).T
-        theirs = maps[other]
-        off = np.abs(1 / np.where(inside, z, 1) - theirs.inverse[row, col])
-        good = theirs.score[row, col] > _LEAST_SCORE
-        votes += inside & good & (off < _STEPS * theirs.step)
+        votes += _confirmed(points, shots[other].camera, maps[other])
     kept = votes >= min(_AGREEING, max(1, len(others)))
     return Found(points[kept], shot.colors[rows[kept], cols[kept]])
+
+
+def _confirmed(points: np.ndarray, camera: Pinhole, found: DepthMap) -> np.ndarray:
+    """[M] which points a view found where they are."""
+    pixels, z = project(camera, points)
+    inside = pixels[:, 0] >= 0
+    col, row = np.where(inside[:, None], pixels, 0).astype(int).T
+    off = np.abs(1 / np.where(inside, z, 1) - found.inverse[row, col])
+    scored = found.score[row, col] > _LEAST_SCORE
+    return inside & scored & (off < _STEPS * found.step)

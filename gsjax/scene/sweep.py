@@ -19,28 +19,40 @@ _WINDOWS = (3, 7)
 _LEAST_DEPTHS, _MOST_DEPTHS = 16, 128
 # Variance of a window that is told from noise: of 1.5 of 255 grey levels.
 _LEAST_VARIANCE = (1.5 / 255) ** 2
-_OUTSIDE = -10.0  # grey level of what is not there
+_OUTSIDE = -1e3  # grey level of what is not there
+
+
+class Pinhole(NamedTuple):
+    """The camera of a photograph as it is swept.
+
+    Attributes:
+      viewmat: [4, 4] world → camera.
+      K: [3, 3] intrinsics, px.
+      size: width and height, px.
+    """
+
+    viewmat: np.ndarray
+    K: np.ndarray
+    size: tuple[int, int]
+
+    @property
+    def centre(self) -> np.ndarray:
+        """[3] where it stands."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
 
 class Shot(NamedTuple):
     """A photograph as it is swept.
 
     Attributes:
+      camera: that took it.
       grey: [H, W] float32 in [0, 1], `_OUTSIDE` where nothing counts.
       colors: [H, W, 3] uint8.
-      viewmat: [4, 4] world → camera.
-      K: [3, 3] intrinsics, px.
     """
 
+    camera: Pinhole
     grey: np.ndarray
     colors: np.ndarray
-    viewmat: np.ndarray
-    K: np.ndarray
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height, px."""
-        return self.grey.shape[1], self.grey.shape[0]
 
 
 class DepthMap(NamedTuple):
@@ -57,46 +69,58 @@ class DepthMap(NamedTuple):
     step: float
 
 
-def make_shot(
-    pixels: np.ndarray, valid: np.ndarray | None, viewmat: np.ndarray, K: np.ndarray,
-    longest: int,
-) -> Shot:  # fmt: skip
-    """A photograph made small.
+def pinhole(
+    viewmat: np.ndarray, K: np.ndarray, size: tuple[int, int], longest: int
+) -> Pinhole:
+    """The camera of a photograph that is made small.
 
     Args:
+      viewmat, K: of the photograph.
+      size: its width and height, px.
+      longest: side, px, that it is scaled down to.
+    """
+    scale = min(1.0, longest / max(size))
+    width, height = (max(1, round(side * scale)) for side in size)
+    ratios = [[width / size[0]], [height / size[1]], [1]]
+    scaled = np.asarray(K, float) * ratios
+    return Pinhole(np.asarray(viewmat, float), scaled, (width, height))
+
+
+def make_shot(
+    camera: Pinhole, pixels: np.ndarray, valid: np.ndarray | None = None
+) -> Shot:
+    """A photograph, made as small as its camera is.
+
+    Args:
+      camera: from `pinhole`.
       pixels: [H, W, 3] uint8 RGB.
       valid: [H, W] bool, what counts; or None for all.
-      viewmat, K: its camera.
-      longest: side, px.
     """
     cv2 = opencv()
-    height, width = pixels.shape[:2]
-    scale = min(1.0, longest / max(width, height))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(pixels, camera.size, interpolation=cv2.INTER_AREA)
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
     if valid is not None:
         missing = (~valid).astype(np.float32)
-        grey[cv2.resize(missing, size, interpolation=cv2.INTER_AREA) > 0] = _OUTSIDE
-    ratios = [[size[0] / width], [size[1] / height], [1]]
-    return Shot(grey, small, np.asarray(viewmat, float), np.asarray(K) * ratios)
+        missing = cv2.resize(missing, camera.size, interpolation=cv2.INTER_AREA)
+        grey[missing > 0] = _OUTSIDE
+    return Shot(camera, grey, small)
 
 
-def project(shot: Shot, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def project(camera: Pinhole, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(pixels [M, 2], z [M]) of points [M, 3]; pixels −1 of what is not in view."""
-    seen = points @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]
+    seen = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     z = seen[:, 2]
     before = z > 0
-    pixels = (seen @ shot.K.T)[:, :2] / np.where(before, z, 1)[:, None]
-    inside = before & np.all((pixels >= 0) & (pixels < shot.size), 1)
+    pixels = (seen @ camera.K.T)[:, :2] / np.where(before, z, 1)[:, None]
+    inside = before & np.all((pixels >= 0) & (pixels < camera.size), 1)
     return np.where(inside[:, None], pixels, -1), z
 
 
-def unproject(shot: Shot, rows, cols, inverse: np.ndarray) -> np.ndarray:
+def unproject(camera: Pinhole, rows, cols, inverse: np.ndarray) -> np.ndarray:
     """[M, 3] world points behind pixels, by their 1 / z."""
     rays = np.stack([cols + 0.5, rows + 0.5, np.ones(len(rows))], 1)
-    seen = rays @ np.linalg.inv(shot.K).T / inverse[:, None]
-    return (seen - shot.viewmat[:3, 3]) @ shot.viewmat[:3, :3]
+    seen = rays @ np.linalg.inv(camera.K).T / inverse[:, None]
+    return (seen - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
 
 
 def sweep(
@@ -113,8 +137,8 @@ def sweep(
       neighbours: one or more.
       nearest, farthest: z to look between.
     """
-    width, height = shot.size
-    warps = [_Warp(shot, other) for other in neighbours]
+    width, height = shot.camera.size
+    warps = [_Warp(shot.camera, other) for other in neighbours]
     shift = max(warp.shift(1 / farthest, 1 / nearest) for warp in warps)
     count = int(np.clip(np.ceil(shift), _LEAST_DEPTHS, _MOST_DEPTHS))
     inverses = np.linspace(1 / farthest, 1 / nearest, count)
@@ -122,27 +146,30 @@ def sweep(
     counted = (len(warps) + 1) // 2
     scores = np.empty((count, height, width), np.float32)
     for depth, inverse in enumerate(inverses):
-        best = [np.full((height, width), -1, np.float32) for _ in range(counted)]
+        best = np.full((counted, height, width), -len(windows), np.float32)
         for warp in warps:
             image = warp.image(inverse)
             square = image * image
             new = sum(window.likeness(image, square) for window in windows)
-            for place, held in enumerate(best):
-                best[place], new = np.maximum(held, new), np.minimum(held, new)
+            for held in best:  # the best of them, then the next
+                better = np.maximum(held, new)
+                new = np.minimum(held, new)
+                held[:] = better
         np.sum(best, axis=0, out=scores[depth])
     scores /= counted * len(windows)
-    return _chosen(scores, inverses, windows[-1].usable & windows[0].inside)
+    return _chosen(scores, inverses, windows[-1].usable)
 
 
 class _Warp:
     """A neighbour, seen from the view through a plane: H = A + b (0 0 1) / z."""
 
-    def __init__(self, shot: Shot, other: Shot):
-        turn = other.viewmat[:3, :3] @ shot.viewmat[:3, :3].T
-        move = other.viewmat[:3, 3] - turn @ shot.viewmat[:3, 3]
-        self.turn = other.K @ turn @ np.linalg.inv(shot.K)
-        self.move = np.outer(other.K @ move, [0, 0, 1])
-        self.size, self.grey = shot.size, other.grey
+    def __init__(self, camera: Pinhole, other: Shot):
+        theirs = other.camera
+        turn = theirs.viewmat[:3, :3] @ camera.viewmat[:3, :3].T
+        move = theirs.viewmat[:3, 3] - turn @ camera.viewmat[:3, 3]
+        self.turn = theirs.K @ turn @ np.linalg.inv(camera.K)
+        self.move = np.outer(theirs.K @ move, [0, 0, 1])
+        self.size, self.grey = camera.size, other.grey
 
     def shift(self, low: float, high: float) -> float:
         """The longest way, px, of a pixel in the neighbour's image over the depths."""
@@ -168,11 +195,17 @@ class _Warp:
         """[H, W] the neighbour warped into the view."""
         cv2 = opencv()
         centred = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-        matrix = np.linalg.inv(centred) @ (self.turn + inverse * self.move) @ centred
+        plane = self.turn + inverse * self.move
+        matrix = np.linalg.inv(centred) @ plane @ centred
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        return cv2.warpPerspective(
+        image = cv2.warpPerspective(
             self.grey, matrix, self.size, flags=flags, borderValue=_OUTSIDE
         )
+        across, down = (np.arange(side) + 0.5 for side in self.size)
+        z = plane[2, 0] * across + plane[2, 1] * down[:, None] + plane[2, 2]
+        if z.min() <= 0:  # behind the neighbour, which would see it upside down
+            image[z <= 0] = _OUTSIDE
+        return image
 
 
 class _Window:
@@ -182,8 +215,7 @@ class _Window:
         self.grey, self.side = grey, side
         self.mean = _box(grey, side)
         variance = _box(grey * grey, side) - self.mean * self.mean
-        self.inside = _inside(grey, side)
-        self.usable = variance > _LEAST_VARIANCE
+        self.usable = (variance > _LEAST_VARIANCE) & _inside(grey, side)
         self.scale = 1 / np.sqrt(np.maximum(variance, _LEAST_VARIANCE))
 
     def likeness(self, other: np.ndarray, square: np.ndarray) -> np.ndarray:

@@ -133,9 +133,10 @@ def with_dense(scene: Scene, photos: Sequence[Photo], config: TrainConfig) -> Sc
     of its own: random ones are the better start then.
 
     Raises:
+      InputError: if there is not one photo for each view.
       MissingExtraError: if OpenCV is absent.
     """
-    if config.initial != "dense":
+    if config.initial != "dense" or config.dense_count == 0:
         return scene
     found = find_points(scene, photos, config.dense_count, seed=config.seed)
     too_few = len(found.points) < min(_LEAST_FOUND, config.dense_count)

@@ -24,7 +24,7 @@ _LEAST_SLOTS = 32_768
 # Compiling a step for two CPU devices, most of which stays with the process; and each
 # further size of the pictures.
 _COMPILING, _COMPILING_MORE = 900_000_000, 150_000_000
-# Pairs of a Gaussian before they are counted: four to five in trained scenes, with the
+# Pairs of a Gaussian before a run begins: four to five in trained scenes, with the
 # room that `gsjax.train.room` leaves beyond them.
 _PAIRS = 7.5
 # And of one of 10⁵ random ones, a pixel of the photographs, as two runs began.
@@ -79,7 +79,7 @@ def run_estimate(
     """What a run takes in all, from its photographs on.
 
     Of three runs of 1.3 GB to 4.4 GB it was within 1.25 times; how many pairs there
-    are is guessed here, and counted before a step is compiled.
+    are is guessed here, and found out before a step is compiled.
 
     Args:
       scene: the views to train on.

@@ -4,6 +4,8 @@ Each growth is a new program, which takes longer to compile than a little room b
 what is wanted costs in all its steps.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,13 +21,16 @@ from gsjax.train.step import TrainState
 
 # Room beyond what is wanted now, so that it lasts for a while.
 _SLOT_MARGIN = 1.3
-# For pairs: of a scene that does not grow, and from less to more of one that does.
+# For pairs: of a scene that does not grow, and from less to more of one that does, or
+# that begins.
 _PAIR_MARGIN, _GROWING_MARGINS = 1.5, (2.5, 4.0)
 _PER_GROWTH = 1.2  # pairs grow with Gaussians, and views not probed may want more
 # A program takes as long to compile as so many empty pairs take in one view: 22 s at
 # 0.12 µs each, on two cores.
 _PAIRS_OF_PROGRAM = 1.8e8
 _MAX_PROBED_VIEWS = 6
+# What the steps of the compositor want room in where tiles hold few pairs.
+_PAIRS_OF_TILE = 7
 
 
 def pairs_for(state: TrainState, frames: Frames, config: TrainConfig) -> int:
@@ -36,20 +41,43 @@ def pairs_for(state: TrainState, frames: Frames, config: TrainConfig) -> int:
     Raises:
       CapacityError: as `roomy_pairs` and `count_demand`.
     """
-    begins = int(state.step) == 0
     probed = np.linspace(0, frames.count - 1, min(frames.count, _MAX_PROBED_VIEWS))
-    most = 1
+    scene, most = None, 1
+    if int(state.step) == 0:
+        scene = round_ones(state.gaussians)
+        tile = config.raster.tile_size
+        tiles = np.prod([-(-side // tile) for side in frames.pixels.shape[1:3]])
+        most = _PAIRS_OF_TILE * int(tiles)
     for index in np.unique(probed.astype(int)):
         camera = jax.tree.map(lambda a, i=index: a[i], frames.camera)
-        if begins:
-            wanted = expected_pairs(state.gaussians, camera, config.raster)
+        if scene is not None:
+            wanted = expected_pairs(scene, camera, config.raster)
         else:  # the same settings for each: one program
             wanted = count_demand(state.gaussians, camera, config.raster).capacity
         most = max(most, int(wanted))
     return roomy_pairs(most, state, config)
 
 
-def expected_pairs(gaussians: Gaussians, camera: Camera, config: RasterConfig) -> float:
+class RoundOnes(NamedTuple):
+    """Gaussians as if they were round: means [N, 3], variances [N], opacities [N]."""
+
+    means: np.ndarray
+    variances: np.ndarray
+    opacities: np.ndarray
+
+
+def round_ones(gaussians: Gaussians) -> RoundOnes:
+    """The active ones, on the host."""
+    active, params = np.asarray(gaussians.active), gaussians.params
+    names = ("means", "log_scales", "logit_opacities")
+    means, scales, logits = (
+        np.asarray(getattr(params, name))[active].astype(np.float64) for name in names
+    )
+    variances = np.mean(np.exp(2 * scales), 1)
+    return RoundOnes(means, variances, 1 / (1 + np.exp(-logits)))
+
+
+def expected_pairs(scene: RoundOnes, camera: Camera, config: RasterConfig) -> float:
     """How many pairs a view of round Gaussians wants, as runs begin with them.
 
     A convex figure of area A that is w × h meets (A + c (w + h) + c²) / t² squares of
@@ -58,21 +86,19 @@ def expected_pairs(gaussians: Gaussians, camera: Camera, config: RasterConfig) -
     what reaches out of the picture the part in it is taken as an ellipse.
 
     Args:
-      gaussians: N slots; others than round ones are taken as round ones.
+      scene: from `round_ones`.
       camera: one.
       config: for the size of tiles, the α cut and the dilation.
     """
-    params = jax.tree.map(lambda a: np.asarray(a, np.float64), gaussians.params)
     viewmat, K = np.asarray(camera.viewmat, float), np.asarray(camera.K, float)
-    seen = params.means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    seen = scene.means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    drawn = (seen[:, 2] > camera.near) & (seen[:, 2] < camera.far)
+    seen = seen[drawn]
     z = seen[:, 2]
-    drawn = np.asarray(gaussians.active) & (z > camera.near) & (z < camera.far)
-    seen, z = seen[drawn], z[drawn]
     centre = (seen @ K.T)[:, :2] / z[:, None]
-    variance = np.mean(np.exp(2 * params.log_scales[drawn]), 1) * K[0, 0] * K[1, 1]
-    opacity = 1 / (1 + np.exp(-params.logit_opacities[drawn]))
-    reach = 2 * np.log(np.maximum(opacity / config.alpha_cut, 1))
-    radius = np.sqrt(reach * (variance / z**2 + config.dilation))[:, None]
+    variance = scene.variances[drawn] * K[0, 0] * K[1, 1] / z**2
+    reach = 2 * np.log(np.maximum(scene.opacities[drawn] / config.alpha_cut, 1))
+    radius = np.sqrt(reach * (variance + config.dilation))[:, None]
     size = np.asarray([camera.width, camera.height], float)
     sides = np.clip(centre + radius, 0, size) - np.clip(centre - radius, 0, size)
     wide, high = sides[(sides > 0).all(1)].T

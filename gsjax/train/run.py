@@ -15,6 +15,7 @@ from gsjax.errors import DivergedError, InputError
 from gsjax.evaluation import Summary
 from gsjax.files import alone_in, make_folder, writing
 from gsjax.raster.render import device_count
+from gsjax.scene.initialise import has_points
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.checkpoint import latest_step, load_latest, restore
@@ -99,6 +100,29 @@ def start_run(
         fails.
       DivergedError: as `fit`; the last good checkpoint is kept, and its scene.
     """
+    _replaced(folder, overwrite)
+    data = load_data(settings)
+    settings = replace(with_views(settings, data), config=_begun(settings.config, data))
+    sitting = Sitting(settings.config, data, run_files(folder), Start())
+    photos = _photographs(sitting)
+    state = _first_state(sitting, photos)
+    make_folder(folder)
+    with alone_in(folder):
+        # By now another may have been here.
+        for path in _replaced(folder, overwrite):
+            _remove(path)
+        save_settings(folder, settings)
+        return _train(sitting, photos, state, watch)
+
+
+def _replaced(folder: Path, overwrite: bool) -> list[Path]:
+    """The files of the run that a new one takes the place of.
+
+    What says that it is a run goes last: where something stays, it still is one.
+
+    Raises:
+      InputError: if there are any, and it may not, or they are no run's.
+    """
     files = run_files(folder)
     names = dict.fromkeys((*files, *run_files(folder, "train")))
     ours = [path for path in names if path.exists() or path.is_symlink()]
@@ -109,18 +133,7 @@ def start_run(
         )
     if ours:
         load_settings(folder)  # refuses what is no run
-    data = load_data(settings)
-    settings = replace(with_views(settings, data), config=_begun(settings.config, data))
-    sitting = Sitting(settings.config, data, files, Start())
-    photos = _photographs(sitting)
-    state = _first_state(sitting, photos)
-    make_folder(folder)
-    with alone_in(folder):
-        # What says that it is a run goes last: where something stays, it still is one.
-        for path in sorted(ours, key=lambda path: path == files.config):
-            _remove(path)
-        save_settings(folder, settings)
-        return _train(sitting, photos, state, watch)
+    return sorted(ours, key=lambda path: path == files.config)
 
 
 def _remove(path: Path) -> None:
@@ -155,15 +168,12 @@ def resume_run(
       InputError: if there is no run, its files are damaged, another process trains in
         it, or the dataset holds other views than it did.
     """
-    settings = load_settings(folder)
     with alone_in(folder):
-        return _resumed(settings, folder, dataset, watch)
+        return _resumed(folder, dataset, watch)
 
 
-def _resumed(
-    settings: RunSettings, folder: Path, dataset: Path | None, watch: Watch | None
-) -> RunResult:
-    files = run_files(folder)
+def _resumed(folder: Path, dataset: Path | None, watch: Watch | None) -> RunResult:
+    settings, files = load_settings(folder), run_files(folder)
     if dataset is not None:
         settings = replace(settings, dataset=dataset)
     data, start = load_data(settings), Start()
@@ -226,13 +236,15 @@ def _first_state(sitting: Sitting, photos: list[Photo]) -> TrainState:
     if config.initial == "dense":
         note("looking for points on which the photographs agree (--initial dense)")
     dense = with_dense(scene, photos, config)
+    if config.initial == "dense":
+        found = len(dense.points) - len(scene.points)
+        note(f"{found:,} more points, after {time.perf_counter() - begun:.1f} s")
+        if not has_points(dense):
+            note("too few, and the dataset has no points: starting from random ones")
+            check_memory(scene, config.replace(initial="random"), None)
     state = initial_state(dense, config)
     seconds = time.perf_counter() - begun
     sitting.start = sitting.start._replace(seconds=seconds)
-    if config.initial == "dense":
-        found = len(dense.points) - len(scene.points)
-        told = "" if len(dense.points) else ": starting from random ones"
-        note(f"found {found:,} in {seconds:.1f} s{told}")
     return state
 
 
