@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -419,7 +420,7 @@ def test_the_same_options_again_go_on(made, monkeypatch):
     # What is not given is the run's, as in one of before it could be left open.
     change(run / "config.json", every=8)
     assert cli.main([*args, "--resume"]) == 130
-    for initial, other in (("random", "points"), ("points", "random")):
+    for initial, other in pairwise(("random", "points", "dense", "random")):
         train = json.loads((run / "config.json").read_text())["train"]
         change(run / "config.json", train={**train, "initial": initial})
         assert cli.main([*args, "--resume"]) == 130
