@@ -21,10 +21,10 @@ from gsjax.train.step import TrainState
 
 # Room beyond what is wanted now, so that it lasts for a while.
 _SLOT_MARGIN = 1.3
-# For pairs: of a scene that does not grow, and from less to more of one that does, or
-# that begins.
+# For pairs: of a scene that does not grow, and from less to more of one that does.
 _PAIR_MARGIN, _GROWING_MARGINS = 1.5, (2.5, 4.0)
 _PER_GROWTH = 1.2  # pairs grow with Gaussians, and views not probed may want more
+_WIDENING = 1.5  # and Gaussians begin narrow, half as wide as they are apart
 # A program takes as long to compile as so many empty pairs take in one view: 22 s at
 # 0.12 µs each, on two cores.
 _PAIRS_OF_PROGRAM = 1.8e8
@@ -125,8 +125,7 @@ def roomy_pairs(wanted: int, state: TrainState, config: TrainConfig) -> int:
         worth = _PAIRS_OF_PROGRAM / views
         growing = float(np.clip(1 + worth / wanted, *_GROWING_MARGINS))
         growth = config.max_gaussians / max(1, int(num_active(state.gaussians)))
-        # At the start they are as wide as they are told to be, and not as they will.
-        likely = _PER_GROWTH * growth if step else np.inf
+        likely = _PER_GROWTH * growth * (1 if step else _WIDENING)
         margin = max(margin, min(likely, growing))
     return min(capacity_bucket(int(margin * wanted)), 2**30 - 1)
 
