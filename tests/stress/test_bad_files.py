@@ -254,7 +254,7 @@ def test_the_command_line_tells_in_one_line(datasets, name, capfd, monkeypatch):
     *before, told = [line for line in said.err.splitlines() if line]
     assert told.startswith("gsjax: error: ")
     late = file in (*PHOTOS, "mask.png")  # looked at when all else is known
-    assert len(before) == 3 * late, before  # random points, views, memory
+    assert len(before) == 2 * late, before  # views, memory
     assert re.search(wanted, told), told
     assert not (datasets / "out.ply").exists()
     assert not (datasets / "run").exists()
