@@ -12,6 +12,7 @@ import gsjax
 import gsjax.train.fit as fit_module
 from gsjax.errors import InputError
 from gsjax.scene import dense
+from gsjax.scene import sweep as sweep_module
 from gsjax.scene.caster import cast, demo_cameras, surface_points
 from gsjax.scene.dense import find_points
 from gsjax.scene.sweep import make_shot, pinhole, project, sweep, unproject
@@ -80,6 +81,18 @@ def test_a_sweep_finds_the_depth():
     off = np.abs(found.inverse[there] * depths[0][there] - 1)
     assert np.mean(off < 0.05) > 0.8
     assert np.median(off) < 0.0125
+
+
+def test_what_is_behind_a_neighbour_is_not_seen_by_it():
+    """Nor upside down: of a plane between the view and one that stands ahead of it."""
+    _, photos, _ = taken()
+    camera = pinhole(np.eye(4), photos[0].K, (WIDTH, HEIGHT), WIDTH)
+    ahead = np.eye(4)
+    ahead[2, 3] = -5.0
+    other = make_shot(camera._replace(viewmat=ahead), photos[0].pixels)
+    warp = sweep_module._Warp(camera, other)
+    assert (warp.image(1 / 3) == sweep_module._OUTSIDE).all()
+    assert (warp.image(1 / 20) >= 0).mean() > 0.5
 
 
 def test_points_are_there_and_back_again():

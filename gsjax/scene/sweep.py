@@ -152,9 +152,9 @@ def sweep(
             square = image * image
             new = sum(window.likeness(image, square) for window in windows)
             for held in best:  # the best of them, then the next
-                better = np.maximum(held, new)
-                new = np.minimum(held, new)
-                held[:] = better
+                less = np.minimum(held, new)
+                np.maximum(held, new, out=held)
+                new = less
         np.sum(best, axis=0, out=scores[depth])
     scores /= counted * len(windows)
     return _chosen(scores, inverses, windows[-1].usable)
@@ -201,10 +201,12 @@ class _Warp:
         image = cv2.warpPerspective(
             self.grey, matrix, self.size, flags=flags, borderValue=_OUTSIDE
         )
-        across, down = (np.arange(side) + 0.5 for side in self.size)
-        z = plane[2, 0] * across + plane[2, 1] * down[:, None] + plane[2, 2]
-        if z.min() <= 0:  # behind the neighbour, which would see it upside down
-            image[z <= 0] = _OUTSIDE
+        # What is behind the neighbour would be seen upside down. z is linear.
+        width, height = self.size
+        by_x, by_y, constant = plane[2]
+        if constant + min(0, by_x * width) + min(0, by_y * height) <= 0:
+            across, down = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
+            image[by_x * across + by_y * down + constant <= 0] = _OUTSIDE
         return image
 
 
