@@ -2,10 +2,29 @@
 it, as a container does."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor
 from pathlib import Path
+from typing import TypeVar
 
 ROOT = Path("/")
+
+
+Given = TypeVar("Given")
+Made = TypeVar("Made")
+
+
+def all_of(
+    pool: Executor, work: Callable[[Given], Made], inputs: Iterable[Given]
+) -> list[Made]:
+    """What ``work`` makes of each, side by side; what has not begun is given up where
+    one fails, or on Ctrl-C."""
+    tasks = [pool.submit(work, one) for one in inputs]
+    try:
+        return [task.result() for task in tasks]
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
 
 
 def usable_cores(root: Path = ROOT) -> int:

@@ -255,7 +255,7 @@ def test_photographs_of_odd_sizes(size):
 
 
 def test_photographs_are_made_smaller(monkeypatch):
-    """Cameras, masks and transparency with them."""
+    """Cameras and masks with them."""
     scene, photos, _ = taken()
     monkeypatch.setattr(dense, "_LONGEST", 80)
     found = find_points(scene, photos, ALL)

@@ -20,7 +20,8 @@ from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import InputError
 from gsjax.files import alone_in
 from gsjax.raster.types import RasterConfig
-from gsjax.train.config import TrainConfig, from_json, to_json
+from gsjax.train.config import TrainConfig
+from gsjax.train.config_json import from_json, to_json
 from gsjax.train.folder import (
     RunSettings,
     load_data,

@@ -7,15 +7,20 @@ of a few hundred points, and knows from the start how far away things are.
 Axis legend: V views, M points.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.machine import usable_cores
-from gsjax.scene.initialise import has_points, points_in_ball, scene_extent
+from gsjax.machine import all_of, usable_cores
+from gsjax.scene.initialise import (
+    finite_points,
+    has_points,
+    points_in_ball,
+    scene_extent,
+)
 from gsjax.scene.sweep import (
     DepthMap,
     Pinhole,
@@ -84,16 +89,14 @@ def find_points(
     around = _Surroundings(scene, photos, rng)
     pairing = _paired(around)
     needed = sorted({*pairing, *(view for some in pairing.values() for view in some)})
-    shots = {
-        view: make_shot(around.cameras[view], photo.pixels, _counts(photo))
-        for view, photo in ((view, photos[view]) for view in needed)
-    }
+    shots = {view: _shot(around.cameras[view], photos[view]) for view in needed}
 
     def swept(view: int) -> DepthMap:
         others = [shots[other] for other in pairing[view]]
         return sweep(shots[view], others, *around.depths(view))
 
-    maps = dict(zip(pairing, _threaded(swept, pairing)))
+    with ThreadPoolExecutor(min(_MOST_THREADS, usable_cores())) as pool:
+        maps = dict(zip(pairing, all_of(pool, swept, pairing)))
     found = [_agreed(view, shots, maps, pairing[view]) for view in pairing]
     points = np.concatenate([np.zeros((0, 3)), *(some.points for some in found)])
     none = np.zeros((0, 3), np.uint8)
@@ -104,23 +107,13 @@ def find_points(
     return Found(points, colors)
 
 
-def _counts(photo: Photo) -> np.ndarray | None:
-    """[H, W] bool, which pixels of a photograph count; None for all."""
-    if photo.alpha is None:
-        return photo.valid
-    opaque = photo.alpha == 255
-    return opaque if photo.valid is None else photo.valid & opaque
-
-
-def _threaded(work, inputs: Iterable[int]) -> list:
-    """What it makes of each, on all cores; given up at once on Ctrl-C."""
-    with ThreadPoolExecutor(min(_MOST_THREADS, usable_cores())) as pool:
-        tasks = [pool.submit(work, one) for one in inputs]
-        try:
-            return [task.result() for task in tasks]
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+def _shot(camera: Pinhole, photo: Photo) -> Shot:
+    """What of a photograph counts: what is neither masked nor transparent."""
+    valid = photo.valid
+    if photo.alpha is not None:
+        opaque = photo.alpha == 255
+        valid = opaque if valid is None else valid & opaque
+    return make_shot(camera, photo.pixels, valid)
 
 
 class _Surroundings:
@@ -139,7 +132,7 @@ class _Surroundings:
         ]
         self.centres = np.stack([camera.centre for camera in self.cameras])
         if has_points(scene):
-            points = scene.points[np.isfinite(scene.points).all(1)]
+            points = scene.points[finite_points(scene)]
             self._farthest = 0.0
         else:
             points = points_in_ball(scene, _SAMPLED, rng)

@@ -37,14 +37,14 @@ def near_plane(centres: np.ndarray) -> float:
     return NEAR * min(1.0, extent / USUAL_EXTENT)
 
 
-def _finite(scene: Scene) -> np.ndarray:
-    """[M] bool, of its points."""
+def finite_points(scene: Scene) -> np.ndarray:
+    """[M] bool, which of its points are."""
     return np.asarray(np.isfinite(scene.points).all(1))
 
 
 def has_points(scene: Scene) -> bool:
     """Whether there are any to start from."""
-    return bool(_finite(scene).any())
+    return bool(finite_points(scene).any())
 
 
 def require_points(scene: Scene) -> None:
@@ -89,7 +89,7 @@ def init_gaussians(
         colors = rng.uniform(size=(random_count, 3))
     else:
         require_points(scene)
-        finite = _finite(scene)
+        finite = finite_points(scene)
         points, colors = scene.points[finite], scene.colors[finite] / 255.0
     if len(points) > max_count:
         chosen = np.sort(rng.choice(len(points), max_count, replace=False))

@@ -15,7 +15,7 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.images import opencv
-from gsjax.machine import usable_cores
+from gsjax.machine import all_of, usable_cores
 from gsjax.scene.decode import decode, telling_of_damage
 from gsjax.scene.types import Lens, Photo, View
 from gsjax.scene.undistort import undistortion_maps
@@ -66,7 +66,7 @@ def _load(view: View, max_size: int | None) -> Photo:
     stored = decode(view.image, as_stored, partial(_ratio, view))
     pixels, alpha = _to_rgb(view.image, stored)
     height, width = pixels.shape[:2]
-    K = _scaled(view.K, *_ratio(view, width, height))
+    K = scaled_intrinsics(view.K, *_ratio(view, width, height))
     invalid = None if view.mask is None else _masked(view.mask, width, height)
     if view.lens is not None:
         if max(width, height) > _MAX_REMAP:
@@ -77,13 +77,12 @@ def _load(view: View, max_size: int | None) -> Photo:
         given = (pixels, alpha, invalid)
         pixels, alpha, invalid = _undistorted(view.image, view.lens, K, *given)
     if max_size is not None and max(width, height) > max_size:
-        scale = max_size / max(width, height)
-        size = max(1, round(width * scale)), max(1, round(height * scale))
+        size = size_within(width, height, max_size)
         shrink = partial(opencv().resize, dsize=size, interpolation=opencv().INTER_AREA)
         pixels, alpha = _filtered(shrink, pixels, alpha)
         if invalid is not None:
             invalid = shrink(invalid.astype(np.float32)) > 0
-        K = _scaled(K, size[0] / width, size[1] / height)
+        K = scaled_intrinsics(K, size[0] / width, size[1] / height)
     valid = None if invalid is None or not invalid.any() else ~invalid
     return Photo(pixels, alpha, valid, K)
 
@@ -109,12 +108,7 @@ def load_photos(
         for start in range(0, len(views), _BATCH * workers):
             batch = views[start : start + _BATCH * workers]
             with telling_of_damage(_files(batch)):
-                tasks = [pool.submit(_load, view, max_size) for view in batch]
-                try:
-                    photos += [task.result() for task in tasks]
-                except BaseException:
-                    pool.shutdown(wait=False, cancel_futures=True)
-                    raise
+                photos += all_of(pool, lambda view: _load(view, max_size), batch)
             if progress is not None:
                 for done in range(start, len(photos)):
                     progress(done + 1, len(views))
@@ -165,7 +159,14 @@ def _ratio(view: View, width: int, height: int) -> tuple[float, float]:
     return sx, sy
 
 
-def _scaled(K: np.ndarray, sx: float, sy: float) -> np.ndarray:
+def size_within(width: int, height: int, longest: int | None) -> tuple[int, int]:
+    """Width and height, px, of a photograph whose longest side is made that long, if
+    it is longer; None for as it is."""
+    ratio = 1.0 if longest is None else min(1.0, longest / max(width, height))
+    return max(1, round(width * ratio)), max(1, round(height * ratio))
+
+
+def scaled_intrinsics(K: np.ndarray, sx: float, sy: float) -> np.ndarray:
     """Intrinsics of an image whose sides are ``sx`` and ``sy`` times as long."""
     return np.asarray(K, np.float64) * np.asarray([[sx], [sy], [1.0]])
 

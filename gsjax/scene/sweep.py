@@ -13,12 +13,16 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.images import opencv
+from gsjax.scene.photos import scaled_intrinsics, size_within
 
 # px, a side: small ones keep edges, large ones find what has little texture.
 _WINDOWS = (3, 7)
 _LEAST_DEPTHS, _MOST_DEPTHS = 16, 128
 # Variance of a window that is told from noise: of 1.5 of 255 grey levels.
 _LEAST_VARIANCE = (1.5 / 255) ** 2
+# From a pixel as OpenCV counts, from its centre, to ours, and back.
+_TO_OURS = np.asarray([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+_TO_THEIRS = np.asarray([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 _OUTSIDE = -1e3  # grey level of what is not there
 
 
@@ -79,10 +83,8 @@ def pinhole(
       size: its width and height, px.
       longest: side, px, that it is scaled down to.
     """
-    scale = min(1.0, longest / max(size))
-    width, height = (max(1, round(side * scale)) for side in size)
-    ratios = [[width / size[0]], [height / size[1]], [1]]
-    scaled = np.asarray(K, float) * ratios
+    width, height = size_within(*size, longest)
+    scaled = scaled_intrinsics(K, width / size[0], height / size[1])
     return Pinhole(np.asarray(viewmat, float), scaled, (width, height))
 
 
@@ -194,9 +196,8 @@ class _Warp:
     def image(self, inverse: float) -> np.ndarray:
         """[H, W] the neighbour warped into the view."""
         cv2 = opencv()
-        centred = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
         plane = self.turn + inverse * self.move
-        matrix = np.linalg.inv(centred) @ plane @ centred
+        matrix = _TO_THEIRS @ plane @ _TO_OURS
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         image = cv2.warpPerspective(
             self.grey, matrix, self.size, flags=flags, borderValue=_OUTSIDE

@@ -31,7 +31,8 @@ from gsjax.io import load, save
 from gsjax.scene.dataset import is_dataset, load_dataset
 from gsjax.scene.splits import split_views
 from gsjax.scene.types import Scene
-from gsjax.train.config import TrainConfig, check_kinds, from_json, to_json
+from gsjax.train.config import TrainConfig
+from gsjax.train.config_json import check_kinds, from_json, to_json
 from gsjax.train.history import read_metrics
 from gsjax.train.refined import with_cameras
 

@@ -14,6 +14,7 @@ from gsjax.gaussians import capacity_bucket
 from gsjax.memory import Estimate, available, require, size_text
 from gsjax.raster.render import render_estimate
 from gsjax.raster.types import RasterConfig
+from gsjax.scene.photos import size_within
 from gsjax.scene.types import Scene
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
@@ -87,7 +88,7 @@ def run_estimate(
       count: Gaussians, and ``slots`` for them.
       begins: whether they are those that it begins with.
     """
-    sizes = [_scaled(view.width, view.height, config.max_size) for view in scene.views]
+    sizes = [size_within(v.width, v.height, config.max_size) for v in scene.views]
     size = max(w for w, _ in sizes), max(h for _, h in sizes)
     photos = 3 * sum(w * h for w, h in sizes)
     frames = 3 * size[0] * size[1] * len(sizes)
@@ -122,10 +123,12 @@ def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) ->
     """
     if state is None:
         given = len(scene.points)
-        if config.initial == "dense":
-            given = given + config.dense_count if given else _most_without(config)
-        elif config.initial == "random":
+        if config.initial == "random":
             given = config.initial_count
+        elif config.initial == "dense":  # random ones, where there are none
+            given = max(
+                given + config.dense_count, 0 if given else config.initial_count
+            )
         count = max(1, min(given, config.max_initial, config.max_gaussians))
         slots = first_slots(count, config)
     else:
@@ -147,15 +150,5 @@ def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) ->
         )
 
 
-def _most_without(config: TrainConfig) -> int:
-    """Points that "dense" may begin with where the dataset has none."""
-    return max(config.dense_count, config.initial_count)
-
-
 def _gaussians(count: int) -> str:
     return "1 Gaussian" if count == 1 else f"{count:,} Gaussians"
-
-
-def _scaled(width: int, height: int, longest: int | None) -> tuple[int, int]:
-    ratio = 1.0 if longest is None else min(1.0, longest / max(width, height))
-    return max(1, round(width * ratio)), max(1, round(height * ratio))
