@@ -45,7 +45,14 @@ from gsjax.train.fit import (
     with_initial,
 )
 from gsjax.train.frames import make_frames
-from gsjax.train.room import expected_pairs, grow_state, roomy_pairs, round_ones
+from gsjax.train.room import (
+    expected_pairs,
+    grow_state,
+    roomy_pairs,
+    round_ones,
+    slots_for,
+    with_slots,
+)
 from gsjax.train.step import init_state
 from gsjax.train.unseen import without_unseen
 
@@ -220,7 +227,9 @@ def test_too_few_pairs_and_slots_are_grown():
     assert ["7 pairs" in phase for phase in log.phases] == [True, False]
     pairs = small.pair_capacity
     assert 7 < pairs < large.pair_capacity
-    result, log = run(limited, Log(stop_at=7), state=small.state, pair_capacity=pairs)
+    assert small.gaussians.capacity == 1024  # a program was due anyway
+    cramped, _ = run(config, Log(stop_at=6), state=state, pair_capacity=pairs)
+    result, log = run(limited, Log(stop_at=7), state=cramped.state, pair_capacity=pairs)
     (record,) = log.records
     assert record["wanted"] > 70
     assert record["gaussians"] == record["capacity"] == 64
@@ -418,11 +427,50 @@ def test_more_room_while_gaussians_are_added():
     assert between == pytest.approx(3, rel=0.2)
     # What is empty costs something in each view of a step.
     assert margin(30_000, 0, many, 1500, batch=2) == pytest.approx(3, rel=0.2)
-    assert margin(300_000, 99, many, 100) == roomy
+    assert margin(300_000, 20, many, 100) > 2
     settled = margin(300_000, 60, many, 100, stop=60)
     assert settled == margin(300_000, 1, many // 100, 100) < 2
+    assert settled == margin(300_000, 99, many, 100)  # nothing comes any more
     # Before the first step they are narrower than they will be.
     assert 1.1 * settled < margin(300_000, 0, many // 100, 100) < roomy
+
+
+@pytest.mark.parametrize("steps", [1000, 4000, 30_000])
+def test_slots_cost_least(steps):
+    """Of all lots in which a growing run could add slots, no other costs a tenth less:
+    a program is 10⁷ empty slots in a step."""
+    first, last = 20_000, 200_000
+    mcmc = McmcSettings(start=0, stop=steps, every=1, growth=2, max_gaussians=last)
+    config = CONFIG.replace(strategy="mcmc", mcmc=mcmc, steps=steps)
+    config = config.replace(levels=(Level(0.0, 1),))
+
+    def cost(lot):
+        programs = (last - first) / lot
+        return programs * 1e7 + steps * lot / 2
+
+    chosen = slots_for(first, 0, config) - first
+    assert cost(chosen) < 1.1 * min(map(cost, range(1000, last - first, 1000)))
+
+
+def test_slots_are_no_more_than_will_be_used():
+    few = CONFIG.replace(adaptive=replace(CONFIG.adaptive, max_gaussians=50_000))
+    known = replace(CONFIG.mcmc, max_gaussians=50_000, growth=1.05)
+    grows = CONFIG.replace(strategy="mcmc", mcmc=known)
+    assert slots_for(40_000, 0, few) == 53_248  # 50,000, in eighths of 32,768
+    assert slots_for(40_000, 60, few) == 40_960  # none come any more
+    # As many as four edits make, after which pictures become finer.
+    assert slots_for(20_000, 0, grows) == 24_576
+    assert slots_for(24_310, FINER, grows) == 28_672
+    assert slots_for(60_000, 0, few) == 61_440  # those that there are fit
+
+
+@pytest.mark.parametrize(("step", "slots"), [(7, 1024), (49, 64), (50, 64), (60, 64)])
+def test_slots_are_grown_for_edits_to_come(step, slots):
+    config = CONFIGS["adaptive"].replace(levels=(Level(0.0, 1),))
+    state = init_state(rough_start(1, 64), config, EXTENT, VIEWS)
+    state = state.replace(step=jnp.int32(step))
+    assert with_slots(state, 70, config).gaussians.capacity == slots
+    assert with_slots(state, 50, config).gaussians.capacity == 64
 
 
 @pytest.mark.parametrize("initial", ["points", "random"])

@@ -203,11 +203,20 @@ def test_growth(count, growth, cap, wanted, got):
     gaussians = scene_with(0.5, first(count))
     edit = planned(config, jax.random.key(1), gaussians)
     assert edit.wanted == wanted
+    assert config.likely(count, 3, 4) == max(count, wanted)
     assert edit.active.sum() == got
     assert edit.active[:count].all()
     born = np.flatnonzero(np.asarray(edit.active) & ~first(count))
     assert np.asarray(edit.cleared)[born].all()
     assert all(p < count for p in children_of(edit, gaussians, born))
+
+
+def test_what_is_likely_is_edit_after_edit():
+    config = McmcSettings(start=3, stop=9, every=2, growth=1.5, max_gaussians=100)
+    steps = [(0, 3), (0, 4), (4, 5), (4, 8), (4, 9), (4, 99), (8, 99)]
+    assert [config.likely(10, *some) for some in steps] == [10, 15, 10, 22, 22, 22, 10]
+    assert config.likely(40, 0, 99) == 100
+    assert config.likely(400, 0, 99) == 400
 
 
 def test_where_all_are_dead_they_stay():

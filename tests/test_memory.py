@@ -21,7 +21,8 @@ from gsjax.memory import Estimate, require, size_text, system_available, unlimit
 from gsjax.raster.render import render_estimate
 from gsjax.raster.types import Demand
 from gsjax.train.config import preset
-from gsjax.train.footprint import check_memory, first_slots, run_estimate
+from gsjax.train.footprint import check_memory, run_estimate
+from gsjax.train.room import slots_for
 
 GB = 10**9
 
@@ -213,7 +214,7 @@ def test_the_estimate_of_a_run_is_what_runs_took(name, changes, measured, report
     made = scene_of_views(21, points=20_000)
     views = tuple(replace(view, width=800, height=600) for view in made.views)
     count = config.initial_count if config.initial == "random" else 20_000
-    slots = first_slots(count, config)
+    slots = slots_for(count, 0, config)
     if name == "quality":  # it was run with --max-gaussians 100000
         slots = 131_072
     found = run_estimate(replace(made, views=views), config, count, slots, begins=True)

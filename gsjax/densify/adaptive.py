@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from gsjax.densify.penalties import mean_penalty
-from gsjax.densify.schedule import is_due
+from gsjax.densify.schedule import edits_between, grown, is_due
 from gsjax.densify.slots import assign, copy_into, where_slots
 from gsjax.densify.types import Densifier, Observation, SlotEdit
 from gsjax.errors import InputError
@@ -25,6 +25,9 @@ from gsjax.numerics import exp_log_scale, logit
 from gsjax.rotations import quaternion_to_matrix
 
 Array = jax.Array
+
+# Of an edit while a scene grows; what is known before is only the most there may be.
+_LIKELY_GROWTH = 1.1
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,11 @@ class AdaptiveSettings:
                     f"AdaptiveSettings.{name} = {getattr(self, name)!r} is out of "
                     "range; see its documentation"
                 )
+
+    def likely(self, count: int, since: int, until: int) -> int:
+        """How many ``count`` Gaussians may be by step ``until``, from ``since`` on."""
+        edits = edits_between(since, until, self.start, self.stop, self.every)
+        return grown(count, edits, _LIKELY_GROWTH, self.max_gaussians)
 
 
 class AdaptiveStats(NamedTuple):

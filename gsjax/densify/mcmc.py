@@ -17,7 +17,7 @@ from jax import lax
 
 from gsjax.cameras import USUAL_EXTENT
 from gsjax.densify.penalties import mean_penalty
-from gsjax.densify.schedule import is_due
+from gsjax.densify.schedule import edits_between, grown, is_due
 from gsjax.densify.slots import copy_into
 from gsjax.densify.types import Densifier, SlotEdit
 from gsjax.errors import InputError
@@ -80,6 +80,11 @@ class McmcSettings:
                     f"McmcSettings.{name} = {getattr(self, name)!r} is out of range; "
                     "see its documentation"
                 )
+
+    def likely(self, count: int, since: int, until: int) -> int:
+        """How many ``count`` Gaussians will be by step ``until``, from ``since`` on."""
+        edits = edits_between(since, until, self.start, self.stop, self.every)
+        return grown(count, edits, self.growth, self.max_gaussians)
 
 
 def mcmc(settings: McmcSettings, extent: float = USUAL_EXTENT) -> Densifier:

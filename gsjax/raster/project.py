@@ -99,12 +99,12 @@ def project(
     rows = jax.tree.map(lambda a: a[order], gaussians.params)
     colour_rows = rows.sh if features is None else features[order]
     components = _Components(
-        means=tuple(rows.means.T),
-        quats=tuple(rows.quats.T),
-        log_scales=tuple(rows.log_scales.T),
+        means=_columns(rows.means),
+        quats=_columns(rows.quats),
+        log_scales=_columns(rows.log_scales),
         logit_opacities=rows.logit_opacities,
-        colors=tuple(colour_rows.reshape(room, -1).T),
-        shift=None if probe is None else tuple(probe[order].T),
+        colors=_columns(colour_rows.reshape(room, -1)),
+        shift=None if probe is None else _columns(probe[order]),
     )
 
     def some(size: int, components: _Components, camera, count) -> Projected:
@@ -135,6 +135,17 @@ def project(
     # Two sizes: every one more costs seconds of compiling.
     out = on_ladder(count, room, min(config.rungs, 2), run, step=16)
     return out if abs_probe is None else out._replace(probe=abs_probe[order].T)
+
+
+def _columns(rows: Array) -> tuple[Array, ...]:
+    """The columns of [R, M], [R] each.
+
+    By `lax.split`, whose transpose puts M derivatives side by side. That of M slices is
+    the sum of M arrays of zeros with one column each, which XLA's CPU backend (jax
+    0.10.2) forms number by number: M² operations a row.
+    """
+    parts = lax.split(rows.T, (1,) * rows.shape[1], axis=0)
+    return tuple(part[0] for part in parts)
 
 
 class _Components(NamedTuple):

@@ -21,10 +21,16 @@ from gsjax.scene.initialise import has_points, init_gaussians, scene_extent
 from gsjax.scene.types import Photo, Scene
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
-from gsjax.train.footprint import first_slots, step_estimate
+from gsjax.train.footprint import step_estimate
 from gsjax.train.frames import Frames, draw, make_frames
 from gsjax.train.health import Health, check_photos, check_points
-from gsjax.train.room import pairs_for, roomy_pairs, with_slots
+from gsjax.train.room import (
+    pairs_for,
+    roomy_pairs,
+    slots_for,
+    with_slots,
+    with_slots_ahead,
+)
 from gsjax.train.step import Metrics, TrainState, init_state, make_train_step
 from gsjax.train.unseen import without_unseen
 
@@ -170,7 +176,7 @@ def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
         random_count=config.initial_count if drawn else None,
         seed=config.seed,
     )
-    gaussians = grow(gaussians, first_slots(gaussians.capacity, config))
+    gaussians = grow(gaussians, slots_for(gaussians.capacity, 0, config))
     return init_state(gaussians, config, extent_of(scene), len(scene.views))
 
 
@@ -258,6 +264,8 @@ class _Run:
             try:
                 if pair_capacity is None or finer:
                     begun = time.perf_counter()
+                    if finer:
+                        state = with_slots_ahead(state, config)
                     pair_capacity = pairs_for(state, frames, config)
                     self.compile_seconds += time.perf_counter() - begun
                 # No limit of what is visible: only the pairs are regrown.
@@ -268,6 +276,7 @@ class _Run:
                 state, metrics = program(state, frames)
                 metrics = jax.device_get(metrics)
                 if metrics.overflowed:
+                    state = with_slots_ahead(state, config)
                     wanted = int(metrics.pair_capacity)
                     pair_capacity = roomy_pairs(wanted, state, config)
                     continue
@@ -281,7 +290,12 @@ class _Run:
             health.look(metrics)
             hooks.step(progress)
             hooks.state(state, progress)
+            slots = state.gaussians.capacity
             state = with_slots(state, int(metrics.wanted), config)
+            if state.gaussians.capacity > slots:  # a new program: with more pairs too
+                wanted = int(metrics.pair_capacity)
+                roomy = roomy_pairs(wanted, state, config)
+                pair_capacity = max(pair_capacity, roomy)
             # The last is measured and saved by the caller, with what else ends a run.
             every = config.every_eval
             if every and step % every == 0 and step < config.steps:

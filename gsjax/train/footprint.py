@@ -18,10 +18,9 @@ from gsjax.scene.photos import size_within
 from gsjax.scene.types import Scene
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
+from gsjax.train.room import slots_for
 from gsjax.train.step import TrainState
 
-# Empty slots cost next to nothing; growing costs a compilation.
-_LEAST_SLOTS = 32_768
 # Compiling a step for two CPU devices, most of which stays with the process; and each
 # further size of the pictures.
 _COMPILING, _COMPILING_MORE = 900_000_000, 150_000_000
@@ -30,12 +29,6 @@ _COMPILING, _COMPILING_MORE = 900_000_000, 150_000_000
 _PAIRS = 7.5
 # And of one of 10⁵ random ones, a pixel of the photographs, as two runs began.
 _PAIRS_RANDOM = 3.3e-4
-
-
-def first_slots(count: int, config: TrainConfig) -> int:
-    """Slots that a run which starts with ``count`` Gaussians starts with."""
-    wanted = min(config.max_gaussians, max(4 * count, _LEAST_SLOTS))
-    return max(count, capacity_bucket(wanted))
 
 
 def state_bytes(slots: int, config: TrainConfig) -> int:
@@ -130,7 +123,7 @@ def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) ->
                 given + config.dense_count, 0 if given else config.initial_count
             )
         count = max(1, min(given, config.max_initial, config.max_gaussians))
-        slots = first_slots(count, config)
+        slots = slots_for(count, 0, config)
     else:
         count, slots = int(np.sum(state.gaussians.active)), state.gaussians.capacity
     now = run_estimate(scene, config, count, slots, begins=state is None)

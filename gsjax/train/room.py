@@ -1,9 +1,10 @@
 """How many slots and pairs a run has room for, and how that grows.
 
-Each growth is a new program, which takes longer to compile than a little room beyond
-what is wanted costs in all its steps.
+Each growth is a new program. To compile it takes longer than all its steps take for a
+little room beyond what is wanted, and less than for a lot.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -19,8 +20,12 @@ from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Frames
 from gsjax.train.step import TrainState
 
-# Room beyond what is wanted now, so that it lasts for a while.
-_SLOT_MARGIN = 1.3
+# Slots grow before an edit may run short of them.
+_SLOT_MARGIN = 1.1
+# A program takes as long to compile as so many empty slots take in one step: 13 s at
+# 1.3 µs each (harmonics of degree 2), on two cores.
+_SLOTS_OF_PROGRAM = 1e7
+_FEWEST_SLOTS = 1024
 # For pairs: of a scene that does not grow, and from less to more of one that does.
 _PAIR_MARGIN, _GROWING_MARGINS = 1.5, (2.5, 4.0)
 _PER_GROWTH = 1.2  # pairs grow with Gaussians, and views not probed may want more
@@ -124,7 +129,10 @@ def roomy_pairs(wanted: int, state: TrainState, config: TrainConfig) -> int:
         views = config.batch * _steps_of_program(step, config)
         worth = _PAIRS_OF_PROGRAM / views
         growing = float(np.clip(1 + worth / wanted, *_GROWING_MARGINS))
-        growth = config.max_gaussians / max(1, int(num_active(state.gaussians)))
+        count = max(1, int(num_active(state.gaussians)))
+        until = step + _steps_of_program(step, config)
+        room = min(config.chosen.likely(count, step, until), state.gaussians.capacity)
+        growth = max(1, room / count)
         likely = _PER_GROWTH * growth * (1 if step else _WIDENING)
         margin = max(margin, min(likely, growing))
     return min(capacity_bucket(int(margin * wanted)), 2**30 - 1)
@@ -136,15 +144,44 @@ def _steps_of_program(step: int, config: TrainConfig) -> int:
     return max(1, int(min((s for s in finer if s > step), default=config.steps)) - step)
 
 
+def slots_for(count: int, step: int, config: TrainConfig) -> int:
+    """Slots for ``count`` Gaussians at ``step``, and for some of those to come.
+
+    If r come with every step, room for m lasts m / r steps, in which half of it is
+    empty on average. Compiling and what is empty cost least together at m = √(2 r p),
+    p being `_SLOTS_OF_PROGRAM` (the lot size of Harris 1913). But no more than come
+    until a program is due anyway.
+    """
+    ahead = _steps_of_program(step, config)
+    to_come = config.chosen.likely(count, step, step + ahead) - count
+    growing = max(1, min(ahead, config.chosen.stop - step))
+    room = min(to_come, math.sqrt(2 * _SLOTS_OF_PROGRAM * to_come / growing))
+    wanted = max(_FEWEST_SLOTS, math.ceil(count + room))
+    unit = 2 ** max(0, wanted.bit_length() - 4)  # an eighth or less of it
+    return -(-wanted // unit) * unit
+
+
 def with_slots(state: TrainState, wanted: int, config: TrainConfig) -> TrainState:
     """``state``, with more slots if it will soon have too few for ``wanted``, as far
-    as there may be so many."""
-    capacity, wanted = state.gaussians.capacity, min(wanted, config.max_gaussians)
-    if _SLOT_MARGIN * wanted <= capacity:
+    as there may be so many, and some are still to come."""
+    wanted = min(wanted, config.max_gaussians)
+    if _SLOT_MARGIN * wanted <= state.gaussians.capacity:
         return state
-    most = capacity_bucket(config.max_gaussians)
-    larger = min(capacity_bucket(2 * wanted), most)
-    return grow_state(state, larger) if larger > capacity else state
+    step, count = int(state.step), int(num_active(state.gaussians))
+    until = step + _steps_of_program(step, config)
+    if config.chosen.likely(count, step, until) == count:
+        return state
+    return _grown(state, slots_for(wanted, step, config))
+
+
+def with_slots_ahead(state: TrainState, config: TrainConfig) -> TrainState:
+    """``state``, with slots for the steps ahead where a program is due anyway."""
+    count = int(num_active(state.gaussians))
+    return _grown(state, slots_for(count, int(state.step), config))
+
+
+def _grown(state: TrainState, slots: int) -> TrainState:
+    return grow_state(state, slots) if slots > state.gaussians.capacity else state
 
 
 def grow_state(state: TrainState, capacity: int) -> TrainState:
