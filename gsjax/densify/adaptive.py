@@ -27,7 +27,7 @@ from gsjax.rotations import quaternion_to_matrix
 Array = jax.Array
 
 # Of an edit while a scene grows; what is known before is only the most there may be.
-_LIKELY_GROWTH = 1.1
+_LIKELY_GROWTH = 1.3
 
 
 @dataclass(frozen=True)
