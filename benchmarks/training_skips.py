@@ -32,10 +32,11 @@ import numpy as np  # noqa: E402
 
 from gsjax.scene.photos import load_photos  # noqa: E402
 from gsjax.train.config import Level, TrainConfig, preset  # noqa: E402
-from gsjax.train.fit import FitResult, extent_of, fit, subset  # noqa: E402
+from gsjax.train.fit import FitResult, fit, subset  # noqa: E402
 from gsjax.train.frames import draw, make_frames  # noqa: E402
 from gsjax.train.held_out import results_of  # noqa: E402
 from gsjax.train.room import pairs_for  # noqa: E402
+from gsjax.train.start import extent_of  # noqa: E402
 from gsjax.train.step import make_train_step  # noqa: E402
 from gsjax.train.unseen import without_unseen  # noqa: E402
 

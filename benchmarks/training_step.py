@@ -24,10 +24,11 @@ from gsjax.losses import photometric_spread  # noqa: E402
 from gsjax.raster.render import device_count  # noqa: E402
 from gsjax.scene.photos import load_photos  # noqa: E402
 from gsjax.train.checkpoint import load_latest, restore  # noqa: E402
-from gsjax.train.fit import empty_state, extent_of, subset  # noqa: E402
+from gsjax.train.fit import subset  # noqa: E402
 from gsjax.train.folder import load_data, load_settings, run_files  # noqa: E402
 from gsjax.train.frames import draw, make_frames  # noqa: E402
 from gsjax.train.room import pairs_for  # noqa: E402
+from gsjax.train.start import empty_state, extent_of  # noqa: E402
 from gsjax.train.step import _optimise, make_train_step, targets  # noqa: E402
 
 

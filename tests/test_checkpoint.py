@@ -21,7 +21,7 @@ from gsjax.train.checkpoint import (
     save_checkpoint,
 )
 from gsjax.train.config import TrainConfig
-from gsjax.train.fit import empty_state
+from gsjax.train.start import empty_state
 from gsjax.train.step import init_state
 
 CONFIG = TrainConfig(sh_degree=1, refine_poses=True, exposure=True, seed=5)

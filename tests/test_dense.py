@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gsjax
-import gsjax.train.fit as fit_module
+import gsjax.train.start as start_module
 from gsjax.errors import InputError
 from gsjax.scene import dense
 from gsjax.scene import sweep as sweep_module
@@ -17,7 +17,7 @@ from gsjax.scene.caster import cast, demo_cameras, surface_points
 from gsjax.scene.dense import find_points
 from gsjax.scene.sweep import make_shot, pinhole, project, sweep, unproject
 from gsjax.scene.types import Photo, Scene, View
-from gsjax.train.fit import initial_state, with_dense
+from gsjax.train.start import initial_state, with_dense
 
 WIDTH, HEIGHT, VIEWS = 160, 120, 6
 ALL = 10**9
@@ -387,5 +387,5 @@ def test_where_nothing_is_found_it_starts_as_without(monkeypatch):
     assert int(initial_state(random, config).gaussians.active.sum()) == 77
     some = with_dense(bare, taken()[1], config.replace(dense_count=5))
     assert int(initial_state(some, config).gaussians.active.sum()) == 5
-    monkeypatch.setattr(fit_module, "_LEAST_FOUND", ALL)
+    monkeypatch.setattr(start_module, "_LEAST_FOUND", ALL)
     assert with_dense(bare, taken()[1], config) is bare

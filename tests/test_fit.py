@@ -36,14 +36,7 @@ from gsjax.gaussians import num_active
 from gsjax.raster.render import count_demand
 from gsjax.train.checkpoint import load_latest, restore, save_checkpoint
 from gsjax.train.config import Level, TrainConfig
-from gsjax.train.fit import (
-    Hooks,
-    empty_state,
-    fit,
-    initial_state,
-    subset,
-    with_initial,
-)
+from gsjax.train.fit import Hooks, fit, subset
 from gsjax.train.frames import make_frames
 from gsjax.train.room import (
     expected_pairs,
@@ -53,6 +46,7 @@ from gsjax.train.room import (
     slots_for,
     with_slots,
 )
+from gsjax.train.start import empty_state, initial_state, with_initial
 from gsjax.train.step import init_state
 from gsjax.train.unseen import without_unseen
 

@@ -14,7 +14,7 @@ from gsjax import RasterConfig
 from gsjax.images import to_8_bit
 from gsjax.scene.initialise import init_gaussians
 from gsjax.scene.types import Photo, Scene, View
-from gsjax.train.fit import extent_of
+from gsjax.train.start import extent_of
 
 VIEWS, POINTS, WIDTH, HEIGHT = 4, 60, 32, 24
 # Small programs: they take longest in these tests.

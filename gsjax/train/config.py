@@ -45,7 +45,7 @@ class TrainConfig:
         transparent, which tells what is nothing, else black. But for "white", views
         and files have it black.
       initial: "points" of the dataset; "dense": those, and more on which the
-        photographs agree (`gsjax.train.fit.with_dense`); or "random" ones in view.
+        photographs agree (`gsjax.train.start.with_dense`); or "random" ones in view.
         "auto" is points where there are any, else random; so is "dense" where next to
         nothing is found.
       initial_count: how many random ones.
@@ -199,7 +199,7 @@ def preset(name: str) -> TrainConfig:
     return _PRESETS[name]()
 
 
-_HALF = (0.8e-4, 0.8e-6)  # of the papers' rates of means
+_HALF = (Rates().means[0] / 2, Rates().means[1] / 2)  # the papers'
 
 
 def _fast() -> TrainConfig:

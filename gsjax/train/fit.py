@@ -13,28 +13,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import CapacityError
-from gsjax.gaussians import Gaussians, grow, make_gaussians
+from gsjax.gaussians import Gaussians
 from gsjax.memory import require
 from gsjax.raster.types import RasterConfig
-from gsjax.scene.dense import find_points
-from gsjax.scene.initialise import has_points, init_gaussians, scene_extent
 from gsjax.scene.types import Photo, Scene
-from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
 from gsjax.train.footprint import step_estimate
 from gsjax.train.frames import Frames, draw, make_frames
-from gsjax.train.health import Health, check_photos, check_points
+from gsjax.train.health import Health, check_photos
 from gsjax.train.room import (
     pairs_for,
     roomy_pairs,
-    slots_for,
     with_slots,
     with_slots_ahead,
 )
-from gsjax.train.step import Metrics, TrainState, init_state, make_train_step
+from gsjax.train.start import extent_of, initial_state, with_dense
+from gsjax.train.step import Metrics, TrainState, make_train_step
 from gsjax.train.unseen import without_unseen
-
-_LEAST_FOUND = 1000
 
 
 class Progress(NamedTuple):
@@ -110,87 +105,6 @@ class FitResult:
     def gaussians(self) -> Gaussians:
         """The scene."""
         return self.state.gaussians
-
-
-def extent_of(scene: Scene) -> float:
-    """Of the scene's cameras; see `scene_extent`."""
-    return scene_extent(np.stack([view.centre for view in scene.views]))
-
-
-def with_initial(scene: Scene, config: TrainConfig) -> TrainConfig:
-    """The same settings, with "auto" of `TrainConfig.initial` decided for this scene.
-
-    Raises:
-      InputError: if it is to start from its points, and has none, or none before any
-        camera.
-    """
-    if config.initial == "auto":
-        config = config.replace(initial="points" if has_points(scene) else "random")
-    dense = config.initial == "dense" and has_points(scene)
-    if config.initial == "points" or dense:
-        check_points(scene)
-    return config
-
-
-def with_dense(scene: Scene, photos: Sequence[Photo], config: TrainConfig) -> Scene:
-    """The scene with more points, where `TrainConfig.initial` is "dense".
-
-    Fewer than a thousand, where so many are wanted, are left out if the scene has none
-    of its own: random ones are the better start then.
-
-    Raises:
-      InputError: if there is not one photo for each view.
-      MissingExtraError: if OpenCV is absent.
-    """
-    if config.initial != "dense" or config.dense_count == 0:
-        return scene
-    found = find_points(scene, photos, config.dense_count, seed=config.seed)
-    too_few = len(found.points) < min(_LEAST_FOUND, config.dense_count)
-    if too_few and not has_points(scene):
-        return scene
-    return replace(
-        scene,
-        points=np.concatenate([scene.points, found.points]),
-        colors=np.concatenate([scene.colors, found.colors]),
-    )
-
-
-def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
-    """A run on this scene before its first step.
-
-    Args:
-      scene: from `with_dense`, if more points than the dataset's are wanted.
-      config: the settings.
-
-    Raises:
-      InputError: as `with_initial`.
-    """
-    config = with_initial(scene, config)
-    drawn = config.initial == "random" or not has_points(scene)
-    gaussians = init_gaussians(
-        scene,
-        sh_degree=config.sh_degree,
-        opacity=config.chosen.initial_opacity,
-        scale=config.chosen.initial_scale,
-        max_count=min(config.max_initial, config.max_gaussians),
-        random_count=config.initial_count if drawn else None,
-        seed=config.seed,
-    )
-    gaussians = grow(gaussians, slots_for(gaussians.capacity, 0, config))
-    return init_state(gaussians, config, extent_of(scene), len(scene.views))
-
-
-def empty_state(
-    config: TrainConfig, extent: float, views: int, capacity: int
-) -> TrainState:
-    """The shapes of a run with this many slots, for reading a checkpoint into."""
-    numbers = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1}
-    gaussians = make_gaussians(
-        **{name: np.zeros((0, count)) for name, count in numbers.items()},
-        sh=np.zeros((0, num_bases(config.sh_degree), 3)),
-        capacity=capacity,
-    )
-    return init_state(gaussians, config, extent, views)
 
 
 def fit(

@@ -130,8 +130,7 @@ def roomy_pairs(wanted: int, state: TrainState, config: TrainConfig) -> int:
         worth = _PAIRS_OF_PROGRAM / views
         growing = float(np.clip(1 + worth / wanted, *_GROWING_MARGINS))
         count = max(1, int(num_active(state.gaussians)))
-        until = step + _steps_of_program(step, config)
-        room = min(config.chosen.likely(count, step, until), state.gaussians.capacity)
+        room = min(_likely(count, step, config), state.gaussians.capacity)
         growth = max(1, room / count)
         likely = _PER_GROWTH * growth * (1 if step else _WIDENING)
         margin = max(margin, min(likely, growing))
@@ -144,6 +143,12 @@ def _steps_of_program(step: int, config: TrainConfig) -> int:
     return max(1, int(min((s for s in finer if s > step), default=config.steps)) - step)
 
 
+def _likely(count: int, step: int, config: TrainConfig) -> int:
+    """How many ``count`` Gaussians may be when a program is due anyway."""
+    until = step + _steps_of_program(step, config)
+    return config.chosen.likely(count, step, until)
+
+
 def slots_for(count: int, step: int, config: TrainConfig) -> int:
     """Slots for ``count`` Gaussians at ``step``, and for some of those to come.
 
@@ -152,10 +157,9 @@ def slots_for(count: int, step: int, config: TrainConfig) -> int:
     p being `_SLOTS_OF_PROGRAM` (the lot size of Harris 1913). But no more than come
     until a program is due anyway.
     """
-    ahead = _steps_of_program(step, config)
-    to_come = config.chosen.likely(count, step, step + ahead) - count
-    growing = max(1, min(ahead, config.chosen.stop - step))
-    room = min(to_come, math.sqrt(2 * _SLOTS_OF_PROGRAM * to_come / growing))
+    to_come = _likely(count, step, config) - count
+    growing = min(_steps_of_program(step, config), config.chosen.stop - step)
+    room = min(to_come, math.sqrt(2 * _SLOTS_OF_PROGRAM * to_come / max(1, growing)))
     wanted = max(_FEWEST_SLOTS, math.ceil(count + room))
     unit = 2 ** max(0, wanted.bit_length() - 4)  # an eighth or less of it
     return -(-wanted // unit) * unit
@@ -168,8 +172,7 @@ def with_slots(state: TrainState, wanted: int, config: TrainConfig) -> TrainStat
     if _SLOT_MARGIN * wanted <= state.gaussians.capacity:
         return state
     step, count = int(state.step), int(num_active(state.gaussians))
-    until = step + _steps_of_program(step, config)
-    if config.chosen.likely(count, step, until) == count:
+    if _likely(count, step, config) == count:
         return state
     return _grown(state, slots_for(wanted, step, config))
 

@@ -20,16 +20,7 @@ from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.checkpoint import latest_step, load_latest, restore
 from gsjax.train.config import TrainConfig
-from gsjax.train.fit import (
-    Progress,
-    empty_state,
-    extent_of,
-    fit,
-    initial_state,
-    subset,
-    with_dense,
-    with_initial,
-)
+from gsjax.train.fit import Progress, fit, subset
 from gsjax.train.folder import (
     Data,
     RunFiles,
@@ -49,6 +40,13 @@ from gsjax.train.sitting import (
     hooks_of,
     save_result,
     saved_text,
+)
+from gsjax.train.start import (
+    empty_state,
+    extent_of,
+    initial_state,
+    with_dense,
+    with_initial,
 )
 from gsjax.train.step import TrainState
 

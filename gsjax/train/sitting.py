@@ -15,13 +15,14 @@ from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.checkpoint import latest_step, save_checkpoint
 from gsjax.train.config import TrainConfig
-from gsjax.train.fit import FitResult, Hooks, Progress, extent_of, subset
+from gsjax.train.fit import FitResult, Hooks, Progress, subset
 from gsjax.train.folder import Data, RunFiles, save_scene
 from gsjax.train.health import is_seen
 from gsjax.train.held_out import results_of, write_evaluation, write_preview
 from gsjax.train.history import Journal
 from gsjax.train.refined import refined_photos, refined_scene, save_cameras
 from gsjax.train.report import Reporter
+from gsjax.train.start import extent_of
 from gsjax.train.step import TrainState
 
 
