@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from gsjax.machine import usable_cores
 from gsjax.programs import drop_oldest, drop_torn
@@ -112,6 +112,18 @@ def spread(work: Callable[..., Any], count: int, *inputs: Any) -> Any:
         check_vma=False,
     )
     return shared(jnp.arange(count, dtype=jnp.int32), *inputs)
+
+
+def on_all_devices(tree: Any) -> Any:
+    """``tree`` with its arrays on every local device.
+
+    A render that is shared by devices needs its inputs on each. Where they lie on one,
+    they are copied to the others at every call.
+    """
+    if jax.local_device_count() == 1:
+        return tree
+    mesh = Mesh(np.array(jax.local_devices()), ("devices",))
+    return jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
 
 
 def keep_memory() -> bool:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.cameras import make_camera
+from gsjax.devices import on_all_devices
 from gsjax.gaussians import Gaussians
 from gsjax.metrics import psnr, ssim
 from gsjax.raster.render import render_exact
@@ -89,6 +90,7 @@ def evaluate(
     """
     config = (config or RasterConfig()).replace(outputs=("rgb", "depth"))
     behind = np.asarray(background, np.float32)
+    gaussians = on_all_devices(gaussians)
     for view, photo in zip(views, photos, strict=True):
         height, width = photo.pixels.shape[:2]
         camera = make_camera(

@@ -10,6 +10,7 @@ import numpy as np
 from gsjax import images
 from gsjax.cameras import Camera
 from gsjax.console import note, progress, say
+from gsjax.devices import on_all_devices
 from gsjax.errors import InputError
 from gsjax.files import make_folder, refuse_existing, write_file
 from gsjax.gaussians import Gaussians, capacity_bucket
@@ -115,6 +116,7 @@ def rendered(
     that few programs are compiled.
     """
     behind = jnp.asarray(background, jnp.result_type(float))
+    gaussians = on_all_devices(gaussians)
     for index, camera in enumerate(cameras):
         if index == 0 and config.pair_capacity is None:
             fitted = exact_config(gaussians, camera, config).pair_capacity or 1
