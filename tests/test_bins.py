@@ -25,11 +25,13 @@ def projected_of(gaussians, camera):
     return project(gaussians, camera, CONFIG, order, count)
 
 
-@partial(jax.jit, static_argnames=("grid", "capacity", "block"))
-def make_lists(projected, device, grid, capacity, block):
+@partial(jax.jit, static_argnames=("grid", "capacity", "block", "platform"))
+def make_lists(projected, device, grid, capacity, block, platform):
     with mock.patch.object(blocks, "BLOCK", block):
         spans = bins.row_spans(projected, grid, device)
-        return bins.make_lists(projected, spans, grid, device, capacity)
+        return bins.make_lists(
+            projected, spans, grid, device, capacity, platform=platform
+        )
 
 
 def lists_of(
@@ -39,10 +41,11 @@ def lists_of(
     device: int = 0,
     capacity: int = CAPACITY,
     block: int = blocks.BLOCK,
+    platform: str | None = None,
 ):
     grid = bins.make_grid(WIDTH, HEIGHT, tile, stride)
     projected = projected_of(*scene_of(kind))
-    lists = make_lists(projected, jnp.int32(device), grid, capacity, block)
+    lists = make_lists(projected, jnp.int32(device), grid, capacity, block, platform)
     return grid, jax.tree.map(np.asarray, projected), jax.tree.map(np.asarray, lists)
 
 
@@ -153,13 +156,28 @@ def test_blocks_of_any_size_make_the_same_lists(kind, block):
     np.testing.assert_array_equal(lists.ranks[:count], whole.ranks[:count])
 
 
+@pytest.mark.parametrize("platform", ["cpu", "gpu"])
+@pytest.mark.parametrize("kind", ["random", "huge", "tiny"])
+def test_dealt_or_sorted_the_lists_are_the_same(kind, platform):
+    _, _, whole = lists_of(kind, 8)
+    _, _, lists = lists_of(kind, 8, block=32, platform=platform)
+    count = int(whole.pairs)
+    assert lists.pairs == count > 100
+    np.testing.assert_array_equal(lists.start, whole.start)
+    np.testing.assert_array_equal(lists.length, whole.length)
+    np.testing.assert_array_equal(lists.ranks[:count], whole.ranks[:count])
+
+
+@pytest.mark.parametrize("platform", ["cpu", "gpu"])
 @pytest.mark.parametrize("block", [7, 8192])
-def test_room_changes_no_count(block):
+def test_room_changes_no_count(block, platform):
     """What is wanted is told whatever the room; with room for it, so are the lists."""
     _, _, whole = lists_of("random", 8)
     count = int(whole.pairs)
     for capacity in (1, count - 1, count):
-        _, _, lists = lists_of("random", 8, capacity=capacity, block=block)
+        _, _, lists = lists_of(
+            "random", 8, capacity=capacity, block=block, platform=platform
+        )
         assert lists.pairs == count
         np.testing.assert_array_equal(lists.length, whole.length)
         assert lists.fit == (capacity >= count)
@@ -194,9 +212,10 @@ def test_steps_and_pairs_that_have_room_for_one_another(group, chunk):
             assert schedules.step_capacity(fewer, grid, group, chunk) < wanted
 
 
-def test_schedule_covers_every_chunk_once():
+@pytest.mark.parametrize("chunk", [8, 16])
+def test_schedule_covers_every_chunk_once(chunk):
     """Steps hold each pair exactly once, blocks in order, front to back."""
-    chunk, group = 8, 4
+    group = 4
     grid, _, lists = lists_of("random", 8)
     room = schedules.step_capacity(CAPACITY, grid, group, chunk)
     lists = jax.tree.map(jnp.asarray, lists)
@@ -206,6 +225,13 @@ def test_schedule_covers_every_chunk_once():
     ranks, block = np.asarray(work.ranks), np.asarray(work.block)
     live, first = np.asarray(work.live), np.asarray(work.first)
     assert live.sum() == int(schedule.steps)
+    # No block holds both tiles of few Gaussians and tiles of more.
+    lengths = np.append(lists.length, 0)[np.asarray(schedule.tiles)]
+    few = lengths <= (schedules.FEW if chunk > schedules.FEW else 0)
+    np.testing.assert_array_equal(
+        few.all(1) | (lengths == 0).all(1), np.arange(len(few)) >= schedule.few
+    )
+    assert not (~few & (np.arange(len(few)) >= schedule.few)[:, None]).any()
     assert (ranks[~live] == COUNT).all()
     rebuilt = np.zeros((grid.tiles, COUNT), int)
     last = np.full(grid.tiles + 1, -1)

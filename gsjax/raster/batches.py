@@ -6,6 +6,7 @@ runs the one branch that will do for all.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
@@ -28,11 +29,11 @@ def _as_one(decide: Callable[[Array], Array]) -> Callable[[Array], Array]:
     return same
 
 
-_any, _least = _as_one(jnp.any), _as_one(jnp.min)
+_any, _least = (_as_one(partial(f, axis=0)) for f in (jnp.any, jnp.min))
 
 
 def any_of_batch(flag: Array) -> Array:
-    """Whether any of the batch has it [] bool."""
+    """Whether any of the batch has it, of each flag of a bool array."""
     return _any(flag)
 
 

@@ -1,9 +1,9 @@
 """Which Gaussian meets which tile, and in which order.
 
 The way of the counts: Gaussians → (Gaussian, row of tiles) items, whose span of tiles
-along the row follows exactly from the ellipse → (tile, rank) pairs → sorted lists,
-one a tile; what follows from those is in `gsjax.raster.schedules`. No derivative is
-taken here.
+along the row follows exactly from the ellipse → sorted lists, one a tile
+(`gsjax.raster.listing`); what follows from those is in `gsjax.raster.schedules`. No
+derivative is taken here.
 
 Axis legend: R ranks (front to back), T tiles, P pairs.
 """
@@ -11,14 +11,14 @@ Axis legend: R ranks (front to back), T tiles, P pairs.
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 
 from gsjax.numerics import safe_sqrt
 from gsjax.raster.blocks import block_size, over_blocks
 from gsjax.raster.counts import owners, running_total, take, total_count
-from gsjax.raster.ladder import on_ladder
-from gsjax.raster.sorting import pair_keys, sort_pairs
+from gsjax.raster.listing import way_for
 from gsjax.raster.types import Array, Projected
 
 
@@ -217,8 +217,9 @@ def make_lists(
     capacity: int,
     rungs: int = 1,
     wanted: Array | None = None,
+    platform: str | None = None,
 ) -> Lists:
-    """Expand ranks to items, items to pairs, and sort; room for ``capacity`` pairs.
+    """Expand ranks to items, and those to sorted lists; room for ``capacity`` pairs.
 
     By blocks within blocks, and only as many as there are: what is paid goes with what
     a view holds, and not with the capacity. Without room the rest is counted alone.
@@ -231,18 +232,20 @@ def make_lists(
       capacity: of pairs.
       rungs: 2 · rungs − 1 sizes at which to sort, at most.
       wanted: [T] bool, or None for all: other tiles have no list. (What meets wanted
-        ones of their row on both sides is sorted all the same.)
+        ones of their row on both sides is listed all the same.)
+      platform: that the lists are made for; None means that of JAX.
     """
+    platform = platform or jax.default_backend()
     ranks = projected.u.shape[0]
     # Nor do the sums over a block wrap.
     in_ranks = min(block_size(ranks), 2**30 // grid.rows)
     items = min(ranks * grid.rows, max(ranks, capacity))
     in_items = min(block_size(items, 2), 2**30 // grid.cols)
-    in_pairs = block_size(capacity, 4)
     _, countable = total_count(spans.rows)
     past = jnp.where(spans.rows > 0, lax.iota(jnp.int32, ranks) + 1, 0)
     past = jnp.where(countable, jnp.max(past), 0)
     trim = None if wanted is None else _trimming(wanted)
+    way = way_for(platform, capacity, ranks, grid.tiles, rungs)
 
     def add_ranks(start, state):
         rank = start + lax.iota(jnp.int32, in_ranks)
@@ -253,7 +256,7 @@ def make_lists(
         return over_blocks(add, ends[-1], in_items, state)
 
     def add_items(first_rank, first_row, ends, start, state):
-        written, change, keys = state
+        change, listed = state
         place = owners(ends, in_items, start)
         rank = first_rank + place
         row = _at(first_row, place) + start + lax.iota(jnp.int32, in_items)
@@ -267,44 +270,18 @@ def make_lists(
         some = (count > 0).astype(jnp.int32)
         change = change.at[first].add(some, mode="drop")
         change = change.at[first + count].add(-some, mode="drop")
-        ends = running_total(count)
-        left = capacity - written
-        add = partial(add_pairs, rank, first - (ends - count), ends, written)
-        keys = over_blocks(add, jnp.minimum(ends[-1], left), in_pairs, keys)
-        return written + jnp.minimum(ends[-1], left), change, keys
+        return change, way.add(listed, rank, first, count)
 
-    def add_pairs(rank, first, ends, written, start, keys):
-        item = owners(ends, in_pairs, start)
-        live = item < in_items
-        tile = _at(first, item) + start + lax.iota(jnp.int32, in_pairs)
-        more = pair_keys(
-            jnp.where(live, tile, grid.tiles),
-            jnp.where(live, _at(rank, item), ranks),
-            grid.tiles + 1,
-            ranks + 1,
-        )
-        at = (written + start,)
-        return tuple(map(lambda k, m: lax.dynamic_update_slice(k, m, at), keys, more))
-
-    # The last block may reach beyond the capacity by what is not live of it.
-    room = jnp.full(capacity + in_pairs, grid.tiles, jnp.int32)
-    keys = pair_keys(room, jnp.full_like(room, ranks), grid.tiles + 1, ranks + 1)
-    init = (jnp.int32(0), jnp.zeros(grid.tiles, jnp.int32), keys)
-    _, change, keys = over_blocks(add_ranks, past, in_ranks, init)
+    init = (jnp.zeros(grid.tiles, jnp.int32), way.nothing)
+    change, listed = over_blocks(add_ranks, past, in_ranks, init)
     length = running_total(change)
     pairs, _ = total_count(length)
     pairs = jnp.where(countable, pairs, 2**31 - 1)
-
-    def sort(size):
-        low = sort_pairs([key[:size] for key in keys], ranks + 1)
-        return jnp.pad(low, (0, capacity - size))
-
     start = running_total(length) - length
     if wanted is not None:
         length = jnp.where(wanted, length, 0)
     return Lists(
-        # Sizes lie close together: to sort is quick to compile, and slow to do.
-        ranks=on_ladder(pairs, capacity, 2 * rungs - 1, sort, step=2),
+        ranks=way.ranks(listed, start, pairs),
         start=start,
         length=length,
         pairs=pairs,

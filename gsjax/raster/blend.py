@@ -12,7 +12,7 @@ running product.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple
 
 import jax
@@ -24,6 +24,8 @@ from gsjax.raster.alpha import alphas, collect_absolute
 from gsjax.raster.types import Array, Projected, RasterConfig
 
 _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
+
+_FEW = 8  # Gaussians, of which sums in plain sight are quicker than products
 
 
 def running_product(alpha: Array) -> tuple[Array, Array]:
@@ -177,6 +179,9 @@ def channel_sums(weight: Array, channels: Array) -> Array:
     the rows of the left operand are what is summed over, here channels [G, C, K], and
     [G, K, C] in the transpose.
     """
+    if weight.shape[1] <= _FEW:
+        columns = (jnp.unstack(a, axis=1) for a in (weight, channels))
+        return reduce(jnp.add, (w[:, None] * c[..., None] for w, c in zip(*columns)))
     columns = lax.optimization_barrier(jnp.swapaxes(channels, 1, 2))
     return _einsum("gck,gkp->gcp", columns, weight)
 

@@ -8,6 +8,7 @@ Accelerators, where a loop waits for its launches, take everything as one block.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import jax
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from gsjax.raster.batches import any_of_batch
+from gsjax.raster.counts import squeeze
 from gsjax.raster.types import Array
 
 T = TypeVar("T")
@@ -56,14 +58,20 @@ def by_blocks(
     """
     size = needed.shape[0]
     block = block_size(size)
-    blocks = -(-size // block)
+    if block == size:
+        return lax.cond(any_of_batch(jnp.any(needed)), run, skip, needed, inputs)
+    blocks = jnp.pad(needed, (0, -size % block)).reshape(-1, block)
+    which, count = squeeze(any_of_batch(jnp.any(blocks, axis=1)), blocks.shape[0])
 
-    def split(a: Array) -> Array:
-        fill = [(0, blocks * block - size)] + [(0, 0)] * (a.ndim - 1)
-        return jnp.pad(a, fill).reshape(blocks, block, *a.shape[1:])
+    def add(i: Array, out: T) -> T:
+        # The last block begins earlier instead of ending later.
+        at = jnp.minimum(which[i] * block, size - block)
+        part = partial(lax.dynamic_slice_in_dim, start_index=at, slice_size=block)
+        some = jax.tree.map(part, (needed, inputs))
+        # A branch of its own, else XLA's CPU backend (jax 0.10.2) would cut the block
+        # out anew for each use of it.
+        update = lax.cond(any_of_batch(jnp.any(some[0])), run, skip, *some)
+        put = partial(lax.dynamic_update_slice_in_dim, start_index=at, axis=0)
+        return jax.tree.map(lambda all_, more: put(all_, more), out, update)
 
-    def one(part):
-        return lax.cond(any_of_batch(jnp.any(part[0])), run, skip, *part)
-
-    out = lax.map(one, jax.tree.map(split, (needed, inputs)))
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:size], out)
+    return lax.fori_loop(0, count, add, skip(needed, inputs))

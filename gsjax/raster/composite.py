@@ -35,6 +35,7 @@ from gsjax.raster.blend import (
 )
 from gsjax.raster.ladder import on_ladder
 from gsjax.raster.schedules import (
+    FEW,
     Schedule,
     Work,
     make_steps,
@@ -44,6 +45,8 @@ from gsjax.raster.schedules import (
 from gsjax.raster.types import Array, Projected, RasterConfig
 
 T = TypeVar("T")
+
+_SEVERAL = 4  # blocks of tiles with few Gaussians are composited so many at once
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6))
@@ -117,7 +120,7 @@ def _by_blocks(
         return Parts(**dict(zip(columns, parts)))
 
     pixels = pixel_centres(grid.tile, rows.dtype)
-    blocks, group = schedule.tiles.shape
+    group = schedule.tiles.shape[1]
     nothing = _nothing(jax.eval_shape(parts_of, rows), group, pixels.shape[1])
     none = projected.u.shape[0]
 
@@ -147,9 +150,32 @@ def _by_blocks(
         *_, image = lax.while_loop(more, advance, start)
         return jax.tree.map(lambda all_, one: all_.at[block].set(one), images, image)
 
+    # Past the last block there are tiles with no list.
+    tiles = jnp.pad(schedule.tiles, ((0, _SEVERAL), (0, 0)), constant_values=grid.tiles)
+
+    def of_several(i, images):
+        block = many + i * _SEVERAL
+        tile = lax.dynamic_slice_in_dim(tiles, block, _SEVERAL).ravel()
+        ranks = ranks_at(lists, tile, jnp.int32(0), FEW, none)
+        corner = corners(tile, grid, device, rows.dtype)
+        some = Chunk(parts_of(take_rows(rows, ranks)), corner)
+        whole = jnp.ones((tile.shape[0], pixels.shape[1]), rows.dtype)
+        _, image = blend_chunk(whole, some, pixels, config)
+
+        def put(all_, more):
+            more = more.reshape(_SEVERAL, *all_.shape[1:])
+            return lax.dynamic_update_slice_in_dim(all_, more, block, 0)
+
+        return jax.tree.map(put, images, image)
+
     used = jnp.sum(schedule.levels > 0, dtype=jnp.int32)
-    images = {k: jnp.zeros((blocks, *v.shape), v.dtype) for k, v in nothing.items()}
-    images = lax.fori_loop(0, used, of_block, images)
+    many = jnp.minimum(schedule.few, used)
+    images = {
+        name: jnp.zeros((tiles.shape[0], *v.shape), v.dtype)
+        for name, v in nothing.items()
+    }
+    images = lax.fori_loop(0, many, of_block, images)
+    images = lax.fori_loop(0, -((many - used) // _SEVERAL), of_several, images)
     return _in_grid_order(images, schedule, grid)
 
 

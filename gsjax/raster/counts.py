@@ -2,9 +2,11 @@
 derivative is taken here.
 """
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 
+from gsjax.raster import loops
 from gsjax.raster.types import Array
 
 # A total above this is reported as 2^31 - 1: int32 sums must not wrap.
@@ -69,6 +71,12 @@ def squeeze(chosen: Array, room: int) -> tuple[Array, Array]:
       count: [] int32 of what is chosen, not limited to ``room``.
     """
     size = chosen.shape[0]
+    if jax.default_backend() == "cpu":
+        whole = jnp.pad(chosen, (0, -size % loops.STRETCH))
+        some = jnp.any(whole.reshape(-1, loops.STRETCH), axis=1)
+        past = jnp.full(room + 1, size, jnp.int32)
+        index, count = loops.places(chosen, some, past)
+        return index[:room], count
     place = running_total(chosen)
     target = jnp.where(chosen, place - 1, room)
     index = jnp.full(room, size, jnp.int32)

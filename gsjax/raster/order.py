@@ -3,6 +3,9 @@
 No derivative is taken here; `project.project` then works on what was found alone.
 """
 
+from functools import partial
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -10,10 +13,14 @@ from jax import lax
 from gsjax.cameras import Camera
 from gsjax.gaussians import Gaussians
 from gsjax.numerics import exp_log_scale
+from gsjax.raster import occlude
+from gsjax.raster.batches import any_of_batch
 from gsjax.raster.blocks import by_blocks
 from gsjax.raster.counts import squeeze
 from gsjax.raster.ladder import on_ladder
+from gsjax.raster.occlude import Box
 from gsjax.raster.project import (
+    ellipses,
     ewa_jacobian,
     in_depth_range,
     reach_of,
@@ -24,58 +31,109 @@ from gsjax.raster.sorting import argsort_float
 from gsjax.raster.types import Array, RasterConfig
 
 
+class _InView(NamedTuple):
+    """What one look at a slot tells, [K] each.
+
+    Attributes:
+      z: camera z; infinity for what cannot be visible.
+      box: u, v and half the width and height, px, of a box that holds it.
+      wide: whether it may close squares of the view, see `occlude`.
+    """
+
+    z: Array
+    box: Box
+    wide: Array
+
+
 def depth_order(
     gaussians: Gaussians, camera: Camera, config: RasterConfig
 ) -> tuple[Array, Array]:
     """Slots front to back, and how many there are that may be visible.
 
-    Conservative: what is left out has no pixel with α at or above the cut.
+    Conservative: what is left out has no pixel with α at or above the cut, or, with
+    ``config.occlusion``, lies behind what has stopped every such pixel.
 
     Returns:
       order: [R] int32 slots, R the visible capacity; equal depths by slot; N past the
         last. If more than R are visible, those of the lowest slots are kept.
       count: [] int32, not limited to R.
     """
-    params, camera = lax.stop_gradient((gaussians.params, camera))
+    gaussians, camera = lax.stop_gradient((gaussians, camera))
+    params, active = gaussians.params, gaussians.active
 
-    def look(active: Array, inputs) -> Array:
-        means, log_scales, logits = inputs
-        return _depths_in_view(active, means, log_scales, logits, camera, config)
+    def look(active: Array, inputs) -> _InView:
+        return _look(active, inputs, camera, config)
 
-    def none(active: Array, inputs) -> Array:
-        shape = jax.eval_shape(look, active, inputs)
-        return jnp.full(shape.shape, jnp.inf, shape.dtype)
+    def none(active: Array, inputs) -> _InView:
+        shapes = jax.eval_shape(look, active, inputs)
+        nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+        return nothing._replace(z=jnp.full_like(nothing.z, jnp.inf))
 
     inputs = (params.means, params.log_scales, params.logit_opacities)
-    z = by_blocks(look, none, gaussians.active, inputs)
+    seen = by_blocks(look, none, active, inputs)
+    z = seen.z
+    if config.occlusion and config.stop > 0:
+        some = any_of_batch(jnp.any(seen.wide))
+        search = partial(_unhidden, gaussians, camera, config)
+        z = lax.cond(some, search, lambda seen: seen.z, seen)
     return _compact_and_sort(z < jnp.inf, z, config)
 
 
-def _depths_in_view(
+def _unhidden(
+    gaussians: Gaussians, camera: Camera, config: RasterConfig, seen: _InView
+) -> Array:
+    """``seen.z`` [N], infinity for what lies behind pixels that have all stopped."""
+    slots, count = _front_most(seen.wide, seen.z)
+    front = ellipses(gaussians, camera, config, slots, count)
+    size = camera.width, camera.height
+    closed = occlude.closed_from(front, _z_of(seen.z, slots), count, *size, config)
+
+    def left(seen: _InView) -> Array:
+        hidden = occlude.behind(closed, seen.box, seen.z, *size)
+        return jnp.where(hidden, jnp.inf, seen.z)
+
+    some = any_of_batch(jnp.any(closed < jnp.inf))
+    return lax.cond(some, left, lambda seen: seen.z, seen)
+
+
+def _front_most(wide: Array, z: Array) -> tuple[Array, Array]:
+    """Slots of the front-most wide ones, front to back, and their number.
+
+    Of more than four times `occlude.CANDIDATES` the rest are not looked at.
+    """
+    slots, count = squeeze(wide, min(4 * occlude.CANDIDATES, wide.shape[0]))
+    order = argsort_float(_z_of(z, slots))[: occlude.CANDIDATES]
+    return slots[order], jnp.minimum(count, order.shape[0])
+
+
+def _look(
     active: Array,
-    means: Array,
-    log_scales: Array,
-    logits: Array,
+    inputs: tuple[Array, Array, Array],
     camera: Camera,
     config: RasterConfig,
-) -> Array:
-    """Camera z [K] of the slots that may be visible, infinity of others."""
-    means, log_scales = means.T, log_scales.T
+) -> _InView:
+    """One look at slots [K]: means, log scales and logits of opacities."""
+    means, log_scales, logits = inputs[0].T, inputs[1].T, inputs[2]
     x, y, z = transform_point(camera.viewmat, means)
     live = active & in_depth_range(camera, z) & jnp.isfinite(logits)
     live &= usable(camera)
     for value in (*means, *log_scales):
         live &= jnp.isfinite(value)
     point = (jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1))
-    u, v = camera.model.project_point(camera.K, point)
+    centres = camera.model.project_point(camera.K, point)
     # A view matrix that scales, as one being optimised may, enlarges what it shows.
     rotation = camera.viewmat[:3, :3]
     gram = jnp.sum(rotation[:, None] * rotation[None], axis=-1)
     stretch = jnp.maximum(jnp.max(jnp.sum(jnp.abs(gram), axis=1)), 1)
-    largest = exp_log_scale(jnp.max(jnp.where(live, log_scales, 0), axis=0))
-    reach = reach_of(jax.nn.sigmoid(logits), config)
+    a, b, c = (jnp.where(live, s, 0) for s in log_scales)
+    low, high = jnp.minimum(a, b), jnp.maximum(a, b)
+    largest = exp_log_scale(jnp.maximum(high, c))
+    middle = exp_log_scale(jnp.maximum(low, jnp.minimum(high, c)))
+    opacity = jax.nn.sigmoid(logits)
+    reach = reach_of(opacity, config)
+    extents, wide = [], jnp.zeros_like(live)
     for centre, row, size in zip(
-        (u, v), ewa_jacobian(camera, point), (camera.width, camera.height)
+        centres, ewa_jacobian(camera, point), (camera.width, camera.height)
     ):
         gain = stretch * sum(j * j for j in row)
         square = largest * largest * gain
@@ -84,7 +142,10 @@ def _depths_in_view(
         # Phrased so that neither an overflow nor a NaN gets through.
         live &= (square < jnp.inf) & (jnp.abs(centre) < jnp.inf)
         live &= (centre + extent >= 0.5) & (centre - extent <= size - 0.5)
-    return jnp.where(live & (reach > 0), z, jnp.inf)
+        extents.append(extent)
+        wide |= occlude.is_wide(middle * middle * gain, opacity)
+    live &= reach > 0
+    return _InView(jnp.where(live, z, jnp.inf), Box(*centres, *extents), live & wide)
 
 
 def _compact_and_sort(
@@ -97,8 +158,12 @@ def _compact_and_sort(
 
     def sort(size: int) -> Array:
         some = packed[:size]
-        depth = z.at[some].get(mode="fill", fill_value=jnp.inf)
-        order = some[argsort_float(depth)]
+        order = some[argsort_float(_z_of(z, some))]
         return jnp.pad(order, (0, room - size), constant_values=slots)
 
     return on_ladder(count, room, config.rungs, sort), count
+
+
+def _z_of(z: Array, slots: Array) -> Array:
+    """``z`` of the slots; infinity past the last."""
+    return z.at[slots].get(mode="fill", fill_value=jnp.inf)

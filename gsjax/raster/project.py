@@ -137,6 +137,34 @@ def project(
     return out if abs_probe is None else out._replace(probe=abs_probe[order].T)
 
 
+def ellipses(
+    gaussians: Gaussians, camera: Camera, config: RasterConfig, slots: Array, count
+) -> Array:
+    """u, v, inv_sx, slope, inv_sy, opacity [6, R] of slots, of which the first
+    ``count`` are there; see `Projected`.
+
+    Without colours, and quick to compile: for a few. No derivative is taken here.
+    """
+    params = gaussians.params
+    rows = jax.tree.map(
+        lambda a: a.at[slots].get(mode="clip").T,
+        (params.means, params.quats, params.log_scales, params.logit_opacities),
+    )
+    # Else XLA would take them apart anew for each use.
+    means, quats, log_scales, logits = lax.optimization_barrier(rows)
+    components = _Components(
+        means=tuple(means),
+        quats=tuple(quats),
+        log_scales=tuple(log_scales),
+        logit_opacities=logits,
+        colors=(jnp.zeros_like(logits),),
+        shift=None,
+    )
+    live = lax.iota(jnp.int32, slots.shape[0]) < count
+    p = _project_components(components, camera, config, live, harmonic=False)
+    return jnp.stack([p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity])
+
+
 def _columns(rows: Array) -> tuple[Array, ...]:
     """The columns of [R, M], [R] each.
 

@@ -17,7 +17,6 @@ from gsjax.gaussians import capacity_bucket
 from gsjax.raster import bins, schedules
 from gsjax.raster.composite import composite
 from gsjax.raster.counts import COUNT_LIMIT
-from gsjax.raster.occlude import hidden
 from gsjax.raster.types import Array, Demand, Projected, RasterConfig
 
 
@@ -50,9 +49,8 @@ def rasterise(
     ranks = projected.u.shape[0]
     capacity = config.pair_capacity or default_pair_capacity(ranks, grid)
     share = -(-capacity // devices)
-    seen = _unhidden(lax.stop_gradient(projected), width, height, config)
     local = partial(_rasterise_local, grid=grid, config=config, capacity=share)
-    images, pairs, wanted = spread(local, devices, projected, seen, mask)
+    images, pairs, wanted = spread(local, devices, projected, mask)
     images = {name: _untile(image, grid) for name, image in images.items()}
     overflowed = jnp.any(wanted > share)
     wanted = jnp.max(wanted)
@@ -82,34 +80,20 @@ def device_count(config: RasterConfig) -> int:
     return config.devices or there
 
 
-def _unhidden(
-    projected: Projected, width: int, height: int, config: RasterConfig
-) -> Projected:
-    """``projected`` with no reach for what is hidden."""
-    if config.stop <= 0 or not config.occlusion:
-        return projected
-    behind = hidden(projected, width, height, config)
-    return projected._replace(reach=jnp.where(behind, 0, projected.reach))
-
-
 def _rasterise_local(
     device: Array,
     projected: Projected,
-    geometry: Projected,
     mask: Array | None,
     *,
     grid: bins.Grid,
     config: RasterConfig,
     capacity: int,
 ):
-    """One device's tiles; ``device`` is [1]. Results gain a leading device axis.
-
-    ``geometry`` is what to bin: ``projected`` without derivatives and without what
-    is hidden; ``mask`` says for which pixels.
-    """
+    """One device's tiles; ``device`` is [1]. Results gain a leading device axis."""
     device = device[0]
     chunk = config.chunk_size
     group = schedules.tiles_per_step(config, grid, jax.default_backend())
+    geometry = lax.stop_gradient(projected)
     spans = bins.row_spans(geometry, grid, device)
     tiles = None if mask is None else bins.wanted_tiles(mask, grid, device)
     lists = bins.make_lists(

@@ -49,13 +49,14 @@ class RasterConfig:
         time, most of all in a gradient: fit it with `exact_config`.
       visible_capacity: room for Gaussians in view (of each camera); None means all
         slots. Reported and regrown like ``pair_capacity``.
-      occlusion: leave out, before binning, what lies behind pixels that have all
-        stopped. Bit-equal; pays where something opaque fills part of the view.
+      occlusion: leave out, before sorting, what lies behind pixels that have all
+        stopped. Pays where something opaque fills part of the view.
       rungs: how many sizes, each a quarter of the one before, sorting by depth is
-        compiled for; the smallest that fits is run. Sorting pairs has sizes between
-        them; from 2 on there is a small size of projecting, and from 4 on the gradient
-        of compositing has sizes too, two fewer. Each takes seconds to compile, and
-        saves time where a view needs a quarter of its capacity or less.
+        compiled for; the smallest that fits is run. Sorting pairs, on accelerators,
+        has sizes between them; from 2 on there is a small size of projecting, and from
+        4 on the gradient of compositing has sizes too, two fewer. Each takes seconds
+        to compile, and saves time where a view needs a quarter of its capacity or
+        less.
       devices: how many devices share the tiles; None means all local ones. Within a
         `jax.shard_map` of your own: 1, and ``check_vma=False`` there.
 
@@ -199,7 +200,7 @@ class Render(NamedTuple):
       median_depth: [H, W] z of the Gaussian at which T falls through 1/2; 0 where
         it never does. Or None.
       radii: [N] half the longer side, in px, of the box that the Gaussian covers;
-        0 where it is out of the view.
+        0 where it is out of the view, or left out by ``config.occlusion``.
       demand: the counts wanted.
       overflowed: [] bool; True if the capacity was too small, and the image
         therefore is not exact.
@@ -215,5 +216,5 @@ class Render(NamedTuple):
 
     @property
     def visible(self) -> Array:
-        """[N] bool: which Gaussians are in the view."""
+        """[N] bool: which Gaussians are in the view; see ``radii``."""
         return self.radii > 0

@@ -239,7 +239,9 @@ def beside_bad(full: bool) -> Measured:
             field = fields[FIELDS[place % len(FIELDS)]]
             field.reshape(SLOTS, -1)[slot, place % field[slot].size] = values[place]
         # Pairs may not fit, with so many over every tile; what is in view still shows.
-        out, slopes = usual_gradients(changed(scene, **fields), camera)
+        # What is hidden has no radius, and is not lost.
+        config = COMPAT.replace(occlusion=False)
+        out, slopes = usual_gradients(changed(scene, **fields), camera, config=config)
         lost = visible & ~bad & (out.radii == 0)
         wrong += int(lost.sum() + (out.radii[bad] > 0).sum())
         wrong += not_finite((out.rgb, out.alpha, out.depth, slopes))
