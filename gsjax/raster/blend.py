@@ -25,7 +25,7 @@ from gsjax.raster.types import Array, Projected, RasterConfig
 
 _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
-_FEW = 8  # Gaussians, of which sums in plain sight are quicker than products
+FEW = 8  # Gaussians, of which sums in plain sight are quicker than products
 
 
 def running_product(alpha: Array) -> tuple[Array, Array]:
@@ -179,9 +179,12 @@ def channel_sums(weight: Array, channels: Array) -> Array:
     the rows of the left operand are what is summed over, here channels [G, C, K], and
     [G, K, C] in the transpose.
     """
-    if weight.shape[1] <= _FEW:
+    if weight.shape[1] <= FEW:
         columns = (jnp.unstack(a, axis=1) for a in (weight, channels))
-        return reduce(jnp.add, (w[:, None] * c[..., None] for w, c in zip(*columns)))
+        terms = (w[:, None] * c[..., None] for w, c in zip(*columns))
+        # In this order a + b c is rounded once at each term, as within the product: so
+        # the bits are the same.
+        return reduce(lambda total, term: term + total, terms)
     columns = lax.optimization_barrier(jnp.swapaxes(channels, 1, 2))
     return _einsum("gck,gkp->gcp", columns, weight)
 

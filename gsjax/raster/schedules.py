@@ -13,11 +13,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from gsjax.raster.bins import Grid, Lists
+from gsjax.raster.blend import FEW
 from gsjax.raster.counts import COUNT_LIMIT, owners, running_total, take, total_count
 from gsjax.raster.sorting import argsort_descending
 from gsjax.raster.types import Array, RasterConfig
-
-FEW = 8  # Gaussians, which go through a chunk that is as small
 
 
 class Schedule(NamedTuple):
@@ -27,7 +26,8 @@ class Schedule(NamedTuple):
       tiles: [blocks, G]; places past the last tile hold T, whose list is empty.
       levels: [blocks] steps of each block, falling; all 0 if there is no room.
       steps: [] how many are wanted, saturating.
-      few: [] the first block of tiles with no more than `FEW` Gaussians.
+      few: [] the first block of tiles with no more than `FEW` Gaussians, which
+        a chunk of as many holds.
     """
 
     tiles: Array

@@ -50,7 +50,7 @@ class RasterConfig:
       visible_capacity: room for Gaussians in view (of each camera); None means all
         slots. Reported and regrown like ``pair_capacity``.
       occlusion: leave out, before sorting, what lies behind pixels that have all
-        stopped. Pays where something opaque fills part of the view.
+        stopped. Bit-equal; pays where something opaque fills part of the view.
       rungs: how many sizes, each a quarter of the one before, sorting by depth is
         compiled for; the smallest that fits is run. Sorting pairs, on accelerators,
         has sizes between them; from 2 on there is a small size of projecting, and from
