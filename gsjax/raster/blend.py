@@ -12,7 +12,7 @@ running product.
 """
 
 from collections.abc import Callable
-from functools import partial, reduce
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -24,8 +24,6 @@ from gsjax.raster.alpha import alphas, collect_absolute
 from gsjax.raster.types import Array, Projected, RasterConfig
 
 _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
-
-FEW = 8  # Gaussians, of which sums in plain sight are quicker than products
 
 
 def running_product(alpha: Array) -> tuple[Array, Array]:
@@ -179,12 +177,6 @@ def channel_sums(weight: Array, channels: Array) -> Array:
     the rows of the left operand are what is summed over, here channels [G, C, K], and
     [G, K, C] in the transpose.
     """
-    if weight.shape[1] <= FEW:
-        columns = (jnp.unstack(a, axis=1) for a in (weight, channels))
-        terms = (w[:, None] * c[..., None] for w, c in zip(*columns))
-        # In this order a + b c is rounded once at each term, as within the product: so
-        # the bits are the same.
-        return reduce(lambda total, term: term + total, terms)
     columns = lax.optimization_barrier(jnp.swapaxes(channels, 1, 2))
     return _einsum("gck,gkp->gcp", columns, weight)
 
@@ -219,7 +211,12 @@ def blend_chunk(
     behind = reached * (1 - alpha)
     blended = (behind if config.stop_rule == "before" else reached) > config.stop
     # What is carried stands outside: its derivative then needs no sum over Gaussians.
-    sums = channel_sums(jnp.where(blended, alpha * before, 0), parts.channels)
+    weight, channels = jnp.where(blended, alpha * before, 0), parts.channels
+    if weight.shape[1] < config.chunk_size:
+        # Summed as a whole chunk is, so that the bits are the same.
+        rest = ((0, 0), (0, config.chunk_size - weight.shape[1]), (0, 0))
+        weight, channels = jnp.pad(weight, rest), jnp.pad(channels, rest)
+    sums = channel_sums(weight, channels)
     out = {"sums": carried[:, None] * sums}
     if parts.depth is not None:
         # The last that more than half reaches, if less is left behind all. By their

@@ -26,7 +26,6 @@ from gsjax.raster.alpha import pixel_centres
 from gsjax.raster.batches import any_of_batch
 from gsjax.raster.bins import Grid, Lists, tile_origins
 from gsjax.raster.blend import (
-    FEW,
     Chunk,
     Parts,
     blend_chunk,
@@ -36,6 +35,7 @@ from gsjax.raster.blend import (
 )
 from gsjax.raster.ladder import on_ladder
 from gsjax.raster.schedules import (
+    FEW,
     Schedule,
     Work,
     make_steps,

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 from jax import lax
 
 from gsjax.raster.bins import Grid, Lists
-from gsjax.raster.blend import FEW
 from gsjax.raster.counts import COUNT_LIMIT, owners, running_total, take, total_count
 from gsjax.raster.sorting import argsort_descending
 from gsjax.raster.types import Array, RasterConfig
+
+FEW = 8  # Gaussians, which go through a chunk that is as small
 
 
 class Schedule(NamedTuple):
