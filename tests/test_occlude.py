@@ -124,7 +124,7 @@ def test_a_square_stays_open_without_candidates():
     config, camera = PRESETS["compat"], camera_of()
     *_, p = front_to_back(scene_behind(40, 0.5), camera, config)
     search = jax.jit(closed_from, static_argnums=(3, 4, 5))
-    splats = jax.numpy.stack([p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity])
+    splats = p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity
     for count, some in ((0, False), (40, True)):
         closed = search(splats, p.depth, np.int32(count), WIDTH, HEIGHT, config)
         assert (np.asarray(closed) < np.inf).any() == some

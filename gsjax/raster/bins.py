@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from gsjax.numerics import safe_sqrt
-from gsjax.raster.blocks import block_size, over_blocks
-from gsjax.raster.counts import owners, running_total, take, total_count
+from gsjax.raster.blocks import block_size
+from gsjax.raster.counts import owners, running_total, total_count
 from gsjax.raster.listing import way_for
 from gsjax.raster.types import Array, Projected
 
@@ -237,43 +237,47 @@ def make_lists(
     """
     platform = platform or jax.default_backend()
     ranks = projected.u.shape[0]
-    # Nor do the sums over a block wrap.
-    in_ranks = min(block_size(ranks), 2**30 // grid.rows)
-    items = min(ranks * grid.rows, max(ranks, capacity))
-    in_items = min(block_size(items, 2), 2**30 // grid.cols)
-    _, countable = total_count(spans.rows)
-    past = jnp.where(spans.rows > 0, lax.iota(jnp.int32, ranks) + 1, 0)
-    past = jnp.where(countable, jnp.max(past), 0)
+    items, countable = total_count(spans.rows)
+    rows = jnp.where(countable, spans.rows, 0)
+    items = jnp.where(countable, items, 0)
+    ends = running_total(rows)
+    begins = spans.first - (ends - rows)
+    most = min(ranks * grid.rows, max(ranks, capacity))
+    # The sums over a block do not wrap.
+    block = min(block_size(most, 2), 2**30 // grid.cols)
+    # As many ranks as items are looked at for a block.
+    ends = jnp.pad(ends, (0, block), mode="edge")
+    begins = jnp.pad(begins, (0, block))
     trim = None if wanted is None else _trimming(wanted)
     way = way_for(platform, capacity, ranks, grid.tiles, rungs)
 
-    def add_ranks(start, state):
-        rank = start + lax.iota(jnp.int32, in_ranks)
-        rows = take(spans.rows, rank)
-        ends = running_total(rows)
-        first_row = _at(spans.first, rank) - (ends - rows)
-        add = partial(add_items, start, first_row, ends)
-        return over_blocks(add, ends[-1], in_items, state)
-
-    def add_items(first_rank, first_row, ends, start, state):
-        change, listed = state
-        place = owners(ends, in_items, start)
+    def add_items(state):
+        start, first_rank, change, listed = state
+        some = lax.dynamic_slice_in_dim(ends, first_rank, block)
+        # Those of these ranks alone, where many of them have none.
+        end = jnp.minimum(start + block, some[-1])
+        place = owners(some, block, start)
+        item = start + lax.iota(jnp.int32, block)
         rank = first_rank + place
-        row = _at(first_row, place) + start + lax.iota(jnp.int32, in_items)
-        first, count = _tiles_in_row(projected, rank, row, grid, device)
-        count = jnp.where(place < in_ranks, count, 0)
+        first, count = _tiles_in_row(
+            projected, rank, _at(begins, rank) + item, grid, device
+        )
+        count = jnp.where(item < end, count, 0)
         if trim is not None:
             first, count = trim(first, count)
         # Else computed by each of those who use them.
         first, count = lax.optimization_barrier((first, count))
         # 1 where its tiles begin, off again where they end.
-        some = (count > 0).astype(jnp.int32)
-        change = change.at[first].add(some, mode="drop")
-        change = change.at[first + count].add(-some, mode="drop")
-        return change, way.add(listed, rank, first, count)
+        more = (count > 0).astype(jnp.int32)
+        change = change.at[first].add(more, mode="drop")
+        change = change.at[first + count].add(-more, mode="drop")
+        passed = jnp.sum(some <= end, dtype=jnp.int32)
+        return end, first_rank + passed, change, way.add(listed, rank, first, count)
 
-    init = (jnp.zeros(grid.tiles, jnp.int32), way.nothing)
-    change, listed = over_blocks(add_ranks, past, in_ranks, init)
+    none = jnp.int32(0)
+    init = none, none, jnp.zeros(grid.tiles, jnp.int32), way.nothing
+    state = lax.while_loop(lambda state: state[0] < items, add_items, init)
+    *_, change, listed = state
     length = running_total(change)
     pairs, _ = total_count(length)
     pairs = jnp.where(countable, pairs, 2**31 - 1)

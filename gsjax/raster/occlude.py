@@ -51,7 +51,7 @@ def is_wide(variance: Array, opacity: Array) -> Array:
 
 
 def closed_from(
-    front: Array,
+    front: tuple[Array, ...],
     depth: Array,
     count: Array,
     width: int,
@@ -61,49 +61,63 @@ def closed_from(
     """Depth [Y, X] behind which nothing shows in a square; infinity if there is none.
 
     Args:
-      front: [6, C] candidates, front to back; see `project.ellipses`.
+      front: of candidates, front to back, [C] each; see `project.ellipses`.
       depth: [C] what they are sorted by.
       count: [] how many there are.
       width, height: image size.
       config: its cap, its cut and its stop.
     """
     rows, cols = -(-height // SQUARE), -(-width // SQUARE)
-    dtype = front.dtype
+    dtype, candidates = depth.dtype, depth.shape[0]
     xs = jnp.arange(cols + 1, dtype=dtype) * SQUARE
     ys = jnp.arange(rows + 1, dtype=dtype)[:, None] * SQUARE
+    several = min(PER_STEP, candidates)
 
-    # Past the last there are some that are not there: opacity 0.
-    table = jnp.pad(jnp.concatenate([front, depth[None]]), ((0, 0), (0, PER_STEP)))
+    def cut(column, start):
+        return lax.dynamic_slice_in_dim(column, start, several)
+
+    def at_corners(start):
+        """α [M, Y + 1, X + 1], the smallest that it may be."""
+        # The last begin earlier instead of ending later.
+        start = jnp.minimum(start, candidates - several)
+        u, v, inv_sx, slope, inv_sy, opacity = (
+            cut(column, start)[:, None, None] for column in front
+        )
+        dx, dy = xs - u, ys - v
+        y1, y2 = inv_sx * dx, inv_sy * (dy - slope * dx)
+        alpha = opacity * jnp.exp(-0.5 * (y1 * y1 + y2 * y2)) * ALPHA_MARGIN
+        alpha = jnp.minimum(alpha, config.alpha_cap)
+        return jnp.where(alpha > config.alpha_cut, alpha, 0)
 
     def go_on(state):
-        start, through, _ = state
+        start, _, through, _ = state
         return (start < count) & jnp.any(through > 0)
 
     def step(state):
-        start, through, closed = state
-        some = lax.dynamic_slice_in_dim(table, start, PER_STEP, axis=1)
-        u, v, inv_sx, slope, inv_sy, opacity, far = some[..., None, None]
-        dx, dy = xs - u, ys - v
-        y1, y2 = inv_sx * dx, inv_sy * (dy - slope * dx)
-        q = y1 * y1 + y2 * y2
-        # Not as maxima of slices: XLA would take the exponential of each number alone.
-        window = ((1, 2, 2), (1, 1, 1), "VALID")
-        q = lax.reduce_window(q, -jnp.inf, lax.max, *window)
-        alpha = opacity * jnp.exp(-0.5 * q) * ALPHA_MARGIN
-        alpha = jnp.minimum(alpha, config.alpha_cap)
-        alpha = jnp.where(alpha > config.alpha_cut, alpha, 0)
-        after = through * jnp.cumprod(1 - alpha, axis=0)
-        done = after <= config.stop * STOP_MARGIN
-        behind = jnp.min(jnp.where(done, far, jnp.inf), axis=0)
-        through = jnp.where(done[-1], 0, after[-1])
-        return start + PER_STEP, through, jnp.minimum(closed, behind)
+        start, alpha, through, closed = state
+        at = jnp.minimum(start, candidates - several)
+        far = cut(depth, at)
+        alpha = jnp.minimum(alpha[:, :-1], alpha[:, 1:])
+        alpha = jnp.minimum(alpha[:, :, :-1], alpha[:, :, 1:])
+        fresh = at + lax.iota(jnp.int32, several) >= start
+        alpha = jnp.where(fresh[:, None, None], alpha, 0)
+        for k in range(several):
+            through = through * (1 - alpha[k])
+            done = through <= config.stop * STOP_MARGIN
+            closed = jnp.minimum(closed, jnp.where(done, far[k], jnp.inf))
+        through = jnp.where(through <= config.stop * STOP_MARGIN, 0, through)
+        # From one turn to the next: within one, XLA would take the exponentials again
+        # for each of the four squares at a corner.
+        start = start + several
+        return start, at_corners(start), through, closed
 
     init = (
         jnp.int32(0),
+        at_corners(jnp.int32(0)),
         jnp.ones((rows, cols), dtype),
         jnp.full((rows, cols), jnp.inf, dtype),
     )
-    return lax.while_loop(go_on, step, init)[2]
+    return lax.while_loop(go_on, step, init)[3]
 
 
 def behind(closed: Array, box: Box, depth: Array, width: int, height: int) -> Array:

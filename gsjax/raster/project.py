@@ -139,9 +139,9 @@ def project(
 
 def ellipses(
     gaussians: Gaussians, camera: Camera, config: RasterConfig, slots: Array, count
-) -> Array:
-    """u, v, inv_sx, slope, inv_sy, opacity [6, R] of slots, of which the first
-    ``count`` are there; see `Projected`.
+) -> tuple[Array, ...]:
+    """u, v, inv_sx, slope, inv_sy, opacity [R] of slots, of which the first ``count``
+    are there; see `Projected`.
 
     Without colours, and quick to compile: for a few. No derivative is taken here.
     """
@@ -162,7 +162,7 @@ def ellipses(
     )
     live = lax.iota(jnp.int32, slots.shape[0]) < count
     p = _project_components(components, camera, config, live, harmonic=False)
-    return jnp.stack([p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity])
+    return p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity
 
 
 def _columns(rows: Array) -> tuple[Array, ...]:
