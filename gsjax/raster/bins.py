@@ -8,7 +8,6 @@ derivative is taken here.
 Axis legend: R ranks (front to back), T tiles, P pairs.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -237,46 +236,49 @@ def make_lists(
     """
     platform = platform or jax.default_backend()
     ranks = projected.u.shape[0]
-    items, countable = total_count(spans.rows)
-    rows = jnp.where(countable, spans.rows, 0)
-    items = jnp.where(countable, items, 0)
-    ends = running_total(rows)
-    begins = spans.first - (ends - rows)
+    _, countable = total_count(spans.rows)
+    past = jnp.where(spans.rows > 0, lax.iota(jnp.int32, ranks) + 1, 0)
+    past = jnp.where(countable, jnp.max(past), 0)
+    # Nor do the sums over a block wrap.
+    window = min(block_size(ranks, 2), 2**30 // grid.rows)
     most = min(ranks * grid.rows, max(ranks, capacity))
-    # The sums over a block do not wrap.
     block = min(block_size(most, 2), 2**30 // grid.cols)
-    # As many ranks as items are looked at for a block.
-    ends = jnp.pad(ends, (0, block), mode="edge")
-    begins = jnp.pad(begins, (0, block))
+    place = lax.iota(jnp.int32, block)
     trim = None if wanted is None else _trimming(wanted)
     way = way_for(platform, capacity, ranks, grid.tiles, rungs)
 
     def add_items(state):
-        start, first_rank, change, listed = state
-        some = lax.dynamic_slice_in_dim(ends, first_rank, block)
-        # Those of these ranks alone, where many of them have none.
-        end = jnp.minimum(start + block, some[-1])
-        place = owners(some, block, start)
-        item = start + lax.iota(jnp.int32, block)
-        rank = first_rank + place
-        first, count = _tiles_in_row(
-            projected, rank, _at(begins, rank) + item, grid, device
-        )
-        count = jnp.where(item < end, count, 0)
+        """As many as a block holds, or the ranks of a window have."""
+        following, done, change, listed = state
+        start = jnp.minimum(following, ranks - window)
+        first, rows = (lax.dynamic_slice_in_dim(a, start, window) for a in spans)
+        behind = start + lax.iota(jnp.int32, window) - following
+        # Of the first that follows ``done`` were in the block before.
+        before = jnp.where(behind < 0, rows, jnp.where(behind == 0, done, 0))
+        first, rows = first + before, rows - before
+        ends = running_total(rows)
+        count = jnp.minimum(ends[-1], block)
+        owner = owners(ends, block)
+        rank, row = start + owner, _at(first - (ends - rows), owner) + place
+        tile, tiles = _tiles_in_row(projected, rank, row, grid, device)
+        tiles = jnp.where(place < count, tiles, 0)
         if trim is not None:
-            first, count = trim(first, count)
+            tile, tiles = trim(tile, tiles)
         # Else computed by each of those who use them.
-        first, count = lax.optimization_barrier((first, count))
+        tile, tiles = lax.optimization_barrier((tile, tiles))
         # 1 where its tiles begin, off again where they end.
-        more = (count > 0).astype(jnp.int32)
-        change = change.at[first].add(more, mode="drop")
-        change = change.at[first + count].add(-more, mode="drop")
-        passed = jnp.sum(some <= end, dtype=jnp.int32)
-        return end, first_rank + passed, change, way.add(listed, rank, first, count)
+        some = (tiles > 0).astype(jnp.int32)
+        change = change.at[tile].add(some, mode="drop")
+        change = change.at[tile + tiles].add(-some, mode="drop")
+        through = ends <= count
+        after = start + jnp.sum(through, dtype=jnp.int32)
+        done = jnp.where(after == following, done, 0)
+        done += count - jnp.max(jnp.where(through, ends, 0))
+        return after, done, change, way.add(listed, rank, tile, tiles)
 
     none = jnp.int32(0)
     init = none, none, jnp.zeros(grid.tiles, jnp.int32), way.nothing
-    state = lax.while_loop(lambda state: state[0] < items, add_items, init)
+    state = lax.while_loop(lambda state: state[0] < past, add_items, init)
     *_, change, listed = state
     length = running_total(change)
     pairs, _ = total_count(length)

@@ -151,13 +151,19 @@ def _look(
 def _compact_and_sort(
     live: Array, z: Array, config: RasterConfig
 ) -> tuple[Array, Array]:
-    """Live slots by depth: squeezed together first, then sorted at their number."""
+    """Live slots by depth, and how many there are.
+
+    Where there is no room for all, or few are live, they are squeezed together first.
+    """
     slots = live.shape[0]
     room = min(config.visible_capacity or slots, slots)
-    packed, count = squeeze(live, room)
+    count = jnp.sum(live, dtype=jnp.int32)
 
     def sort(size: int) -> Array:
-        some = packed[:size]
+        if size == slots:
+            order = argsort_float(z)
+            return jnp.where(lax.iota(jnp.int32, slots) < count, order, slots)
+        some, _ = squeeze(live, size)
         order = some[argsort_float(_z_of(z, some))]
         return jnp.pad(order, (0, room - size), constant_values=slots)
 
