@@ -11,6 +11,7 @@ matrix products both ways, each with its operands as XLA wants them. What is lef
 running product.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -189,6 +190,26 @@ def _channel_sums_jvp(primals, tangents):
     return channel_sums(weight, channels), by_weight + by_channels
 
 
+def _sums_as_of(size: int, weight: Array, channels: Array) -> Array:
+    """`channel_sums` by products over ``size`` Gaussians, whatever K is: the bits are
+    those of a whole chunk.
+
+    Several tiles share a product where K is smaller. Each has columns of its own, in
+    which the Gaussians of the others are 0.
+    """
+    groups, few, pixels = weight.shape
+    if few == size:
+        return channel_sums(weight, channels)
+    tiles = math.gcd(size // few, groups)
+    own = np.eye(tiles, dtype=bool)[:, None, :, None]
+    apart = channels.reshape(-1, tiles, few, 1, channels.shape[2])
+    apart = jnp.where(own, apart, 0).reshape(groups // tiles, tiles * few, -1)
+    weight = weight.reshape(groups // tiles, tiles * few, pixels)
+    rest = ((0, 0), (0, size - tiles * few), (0, 0))
+    sums = channel_sums(jnp.pad(weight, rest), jnp.pad(apart, rest))
+    return sums.reshape(groups, channels.shape[2], pixels)
+
+
 def blend_chunk(
     carried: Array, chunk: Chunk, pixels: np.ndarray, config: RasterConfig
 ) -> tuple[Array, dict[str, Array]]:
@@ -199,11 +220,23 @@ def blend_chunk(
       the limit never rises again, so it still tells who has stopped), and the sums
       to add: "sums" [G, C, P], "median" [G, P] where asked for.
     """
-    parts = chunk.parts
-    splats = splats_of(parts.splats, chunk.corner)
+    alpha = alphas_of(chunk, pixels, config)
+    return blend_alphas(carried, alpha, chunk.parts, config)
+
+
+def alphas_of(chunk: Chunk, pixels: np.ndarray, config: RasterConfig) -> Array:
+    """α [G, K, P] of a chunk; see `alphas`."""
+    splats = splats_of(chunk.parts.splats, chunk.corner)
     alpha = alphas(splats, pixels, config)
-    if parts.probe is not None:
-        alpha = collect_absolute(alpha, splats, pixels, parts.probe, config)
+    if chunk.parts.probe is not None:
+        alpha = collect_absolute(alpha, splats, pixels, chunk.parts.probe, config)
+    return alpha
+
+
+def blend_alphas(
+    carried: Array, alpha: Array, parts: Parts, config: RasterConfig
+) -> tuple[Array, dict[str, Array]]:
+    """`blend_chunk` of Gaussians whose ``alpha`` [G, K, P] is known."""
     # A cap of 1 needs the rule that does not divide.
     product = transmittance if config.alpha_cap < 1 else running_product
     total, before = product(alpha)
@@ -211,12 +244,8 @@ def blend_chunk(
     behind = reached * (1 - alpha)
     blended = (behind if config.stop_rule == "before" else reached) > config.stop
     # What is carried stands outside: its derivative then needs no sum over Gaussians.
-    weight, channels = jnp.where(blended, alpha * before, 0), parts.channels
-    if weight.shape[1] < config.chunk_size:
-        # Summed as a whole chunk is, so that the bits are the same.
-        rest = ((0, 0), (0, config.chunk_size - weight.shape[1]), (0, 0))
-        weight, channels = jnp.pad(weight, rest), jnp.pad(channels, rest)
-    sums = channel_sums(weight, channels)
+    weight = jnp.where(blended, alpha * before, 0)
+    sums = _sums_as_of(config.chunk_size, weight, parts.channels)
     out = {"sums": carried[:, None] * sums}
     if parts.depth is not None:
         # The last that more than half reaches, if less is left behind all. By their

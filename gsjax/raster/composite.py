@@ -28,6 +28,8 @@ from gsjax.raster.bins import Grid, Lists, tile_origins
 from gsjax.raster.blend import (
     Chunk,
     Parts,
+    alphas_of,
+    blend_alphas,
     blend_chunk,
     columns_of,
     table_of,
@@ -151,22 +153,30 @@ def _by_blocks(
         return jax.tree.map(lambda all_, one: all_.at[block].set(one), images, image)
 
     # Past the last block there are tiles with no list.
-    tiles = jnp.pad(schedule.tiles, ((0, _SEVERAL), (0, 0)), constant_values=grid.tiles)
+    tiles = jnp.pad(
+        schedule.tiles, ((0, 2 * _SEVERAL), (0, 0)), constant_values=grid.tiles
+    )
 
-    def of_several(i, images):
+    def several(i):
+        """Rows of the table, and α."""
         block = many + i * _SEVERAL
         tile = lax.dynamic_slice_in_dim(tiles, block, _SEVERAL).ravel()
-        ranks = ranks_at(lists, tile, jnp.int32(0), FEW, none)
-        corner = corners(tile, grid, device, rows.dtype)
-        some = Chunk(parts_of(take_rows(rows, ranks)), corner)
-        whole = jnp.ones((tile.shape[0], pixels.shape[1]), rows.dtype)
-        _, image = blend_chunk(whole, some, pixels, config)
+        mine = take_rows(rows, ranks_at(lists, tile, jnp.int32(0), FEW, none))
+        chunk = Chunk(parts_of(mine), corners(tile, grid, device, rows.dtype))
+        return mine, alphas_of(chunk, pixels, config)
+
+    def of_several(i, state):
+        (mine, alpha), images = state
+        whole = jnp.ones_like(alpha[:, 0])
+        _, image = blend_alphas(whole, alpha, parts_of(mine), config)
 
         def put(all_, more):
             more = more.reshape(_SEVERAL, *all_.shape[1:])
-            return lax.dynamic_update_slice_in_dim(all_, more, block, 0)
+            return lax.dynamic_update_slice_in_dim(all_, more, many + i * _SEVERAL, 0)
 
-        return jax.tree.map(put, images, image)
+        # From one turn to the next: within one, XLA would evaluate α again for each
+        # place of the running product that it goes into.
+        return several(i + 1), jax.tree.map(put, images, image)
 
     used = jnp.sum(schedule.levels > 0, dtype=jnp.int32)
     many = jnp.minimum(schedule.few, used)
@@ -175,7 +185,8 @@ def _by_blocks(
         for name, v in nothing.items()
     }
     images = lax.fori_loop(0, many, of_block, images)
-    images = lax.fori_loop(0, -((many - used) // _SEVERAL), of_several, images)
+    turns = -((many - used) // _SEVERAL)
+    _, images = lax.fori_loop(0, turns, of_several, (several(jnp.int32(0)), images))
     return _in_grid_order(images, schedule, grid)
 
 
