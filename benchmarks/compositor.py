@@ -102,7 +102,10 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
             if config.stop_rule == "before":
                 reached = reached * (1 - alpha)
             blended = (alpha > 0) & (reached > config.stop)
-            return carried * total, (go * alpha.size, go * jnp.sum(blended))
+            # Lists of few go through a shorter chunk.
+            length = jnp.where(block < schedule.few, chunk, min(schedules.FEW, chunk))
+            made = go * length * (alpha.size // chunk)
+            return carried * total, (made, go * jnp.sum(blended))
 
         open_ = jnp.ones((group, pixels.shape[1]), projected.u.dtype)
         inputs = (work.first, work.live, work.block, work.ranks)
