@@ -18,7 +18,13 @@ from conftest import (
 )
 
 from gsjax import RasterConfig
-from gsjax.raster.occlude import _halve, closed_from
+from gsjax.raster.occlude import (
+    ALPHA_MARGIN,
+    SQUARE,
+    STOP_MARGIN,
+    _halve,
+    closed_from,
+)
 from gsjax.raster.order import depth_order
 from gsjax.raster.project import project
 
@@ -128,6 +134,32 @@ def test_a_square_stays_open_without_candidates():
     for count, some in ((0, False), (40, True)):
         closed = search(splats, p.depth, np.int32(count), WIDTH, HEIGHT, config)
         assert (np.asarray(closed) < np.inf).any() == some
+
+
+@pytest.mark.parametrize("count", [7, 33, 40])
+def test_squares_close_where_the_corners_are_opaque(count):
+    """Against a loop over Gaussians, of which a step takes 16, and the last fewer."""
+    config, camera = PRESETS["compat"], camera_of()
+    *_, p = front_to_back(scene_behind(40, 0.5), camera, config)
+    splats = [p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity]
+    splats, depth = [np.asarray(a)[:40] for a in splats], np.asarray(p.depth)[:40]
+    splats[-1] = np.where(np.arange(40) < count, splats[-1], 0)
+    search = jax.jit(closed_from, static_argnums=(3, 4, 5))
+    closed = search(tuple(splats), depth, np.int32(count), WIDTH, HEIGHT, config)
+    rows, cols = closed.shape
+    x, y = np.meshgrid(np.arange(cols + 1) * SQUARE, np.arange(rows + 1) * SQUARE)
+    through, wanted = np.ones((rows, cols)), np.full((rows, cols), np.inf)
+    for u, v, inv_sx, slope, inv_sy, opacity, far in zip(*splats, depth):
+        y1, y2 = inv_sx * (x - u), inv_sy * (y - v - slope * (x - u))
+        alpha = opacity * np.exp(-0.5 * (y1 * y1 + y2 * y2)) * ALPHA_MARGIN
+        alpha = np.where(alpha > config.alpha_cut, alpha, 0).clip(max=config.alpha_cap)
+        four = alpha[:-1, :-1], alpha[:-1, 1:], alpha[1:, :-1], alpha[1:, 1:]
+        through *= 1 - np.min(four, axis=0)
+        shut = (through <= config.stop * STOP_MARGIN) & (wanted == np.inf)
+        wanted[shut] = far
+    assert (wanted < np.inf).any() == (count > 7)
+    assert (wanted == np.inf).any()
+    np.testing.assert_array_equal(closed, wanted)
 
 
 def test_halve_takes_maxima_of_what_exists():

@@ -191,7 +191,7 @@ def _channel_sums_jvp(primals, tangents):
 
 
 def _sums_as_of(size: int, weight: Array, channels: Array) -> Array:
-    """`channel_sums` by products over ``size`` Gaussians, whatever K is: the bits are
+    """`channel_sums` of K ≤ ``size`` Gaussians by products over ``size``: the bits are
     those of a whole chunk.
 
     Several tiles share a product where K is smaller. Each has columns of its own, in
@@ -201,9 +201,11 @@ def _sums_as_of(size: int, weight: Array, channels: Array) -> Array:
     if few == size:
         return channel_sums(weight, channels)
     tiles = math.gcd(size // few, groups)
-    own = np.eye(tiles, dtype=bool)[:, None, :, None]
     apart = channels.reshape(-1, tiles, few, 1, channels.shape[2])
-    apart = jnp.where(own, apart, 0).reshape(groups // tiles, tiles * few, -1)
+    shape = groups // tiles, tiles, few, tiles, channels.shape[2]
+    mine, column = (lax.broadcasted_iota(jnp.int32, shape, axis) for axis in (1, 3))
+    apart = jnp.where(mine == column, apart, 0)
+    apart = apart.reshape(groups // tiles, tiles * few, -1)
     weight = weight.reshape(groups // tiles, tiles * few, pixels)
     rest = ((0, 0), (0, size - tiles * few), (0, 0))
     sums = channel_sums(jnp.pad(weight, rest), jnp.pad(apart, rest))

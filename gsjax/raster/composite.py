@@ -169,13 +169,15 @@ def _by_blocks(
         (mine, alpha), images = state
         whole = jnp.ones_like(alpha[:, 0])
         _, image = blend_alphas(whole, alpha, parts_of(mine), config)
+        at = jnp.where(i < 0, tiles.shape[0] - _SEVERAL, many + i * _SEVERAL)
 
         def put(all_, more):
             more = more.reshape(_SEVERAL, *all_.shape[1:])
-            return lax.dynamic_update_slice_in_dim(all_, more, many + i * _SEVERAL, 0)
+            return lax.dynamic_update_slice_in_dim(all_, more, at, 0)
 
         # From one turn to the next: within one, XLA would evaluate α again for each
-        # place of the running product that it goes into.
+        # place of the running product that it goes into. So the first has none yet,
+        # and its image goes where none is looked for.
         return several(i + 1), jax.tree.map(put, images, image)
 
     used = jnp.sum(schedule.levels > 0, dtype=jnp.int32)
@@ -185,8 +187,13 @@ def _by_blocks(
         for name, v in nothing.items()
     }
     images = lax.fori_loop(0, many, of_block, images)
-    turns = -((many - used) // _SEVERAL)
-    _, images = lax.fori_loop(0, turns, of_several, (several(jnp.int32(0)), images))
+    if config.chunk_size > FEW:
+        turns = -((many - used) // _SEVERAL)
+        none_yet = jax.tree.map(
+            lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(several, many)
+        )
+        first = -jnp.minimum(turns, 1)
+        _, images = lax.fori_loop(first, turns, of_several, (none_yet, images))
     return _in_grid_order(images, schedule, grid)
 
 
