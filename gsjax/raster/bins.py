@@ -220,7 +220,7 @@ def make_lists(
 ) -> Lists:
     """Expand ranks to items, and those to sorted lists; room for ``capacity`` pairs.
 
-    By blocks within blocks, and only as many as there are: what is paid goes with what
+    By blocks of items, and only as many as there are: what is paid goes with what
     a view holds, and not with the capacity. Without room the rest is counted alone.
 
     Args:

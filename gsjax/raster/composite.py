@@ -189,9 +189,7 @@ def _by_blocks(
     images = lax.fori_loop(0, many, of_block, images)
     if config.chunk_size > FEW:
         turns = -((many - used) // _SEVERAL)
-        none_yet = jax.tree.map(
-            lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(several, many)
-        )
+        none_yet = jax.tree.map(jnp.zeros_like, jax.eval_shape(several, many))
         first = -jnp.minimum(turns, 1)
         _, images = lax.fori_loop(first, turns, of_several, (none_yet, images))
     return _in_grid_order(images, schedule, grid)

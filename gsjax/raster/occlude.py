@@ -63,7 +63,7 @@ def closed_from(
     Args:
       front: of candidates, front to back, [C] each; see `project.ellipses`.
       depth: [C] what they are sorted by.
-      count: [] how many there are.
+      count: [] how many there are; those behind have opacity 0.
       width, height: image size.
       config: its cap, its cut and its stop.
     """
@@ -71,15 +71,14 @@ def closed_from(
     dtype, candidates = depth.dtype, depth.shape[0]
     xs = jnp.arange(cols + 1, dtype=dtype) * SQUARE
     ys = jnp.arange(rows + 1, dtype=dtype)[:, None] * SQUARE
-    several = min(PER_STEP, candidates)
+    several, limit = min(PER_STEP, candidates), config.stop * STOP_MARGIN
 
     def cut(column, start):
+        """From ``start``; the last begin earlier instead of ending later."""
         return lax.dynamic_slice_in_dim(column, start, several)
 
     def at_corners(start):
         """α [M, Y + 1, X + 1], the smallest that it may be."""
-        # The last begin earlier instead of ending later.
-        start = jnp.minimum(start, candidates - several)
         u, v, inv_sx, slope, inv_sy, opacity = (
             cut(column, start)[:, None, None] for column in front
         )
@@ -95,17 +94,16 @@ def closed_from(
 
     def step(state):
         start, alpha, through, closed = state
-        at = jnp.minimum(start, candidates - several)
-        far = cut(depth, at)
+        far = cut(depth, start)
         alpha = jnp.minimum(alpha[:, :-1], alpha[:, 1:])
         alpha = jnp.minimum(alpha[:, :, :-1], alpha[:, :, 1:])
-        fresh = at + lax.iota(jnp.int32, several) >= start
+        place = jnp.minimum(start, candidates - several) + lax.iota(jnp.int32, several)
+        fresh = place >= start
         alpha = jnp.where(fresh[:, None, None], alpha, 0)
         for k in range(several):
             through = through * (1 - alpha[k])
-            done = through <= config.stop * STOP_MARGIN
-            closed = jnp.minimum(closed, jnp.where(done, far[k], jnp.inf))
-        through = jnp.where(through <= config.stop * STOP_MARGIN, 0, through)
+            closed = jnp.minimum(closed, jnp.where(through <= limit, far[k], jnp.inf))
+        through = jnp.where(through <= limit, 0, through)
         # From one turn to the next: within one, XLA would take the exponentials again
         # for each of the four squares at a corner.
         start = start + several

@@ -66,7 +66,7 @@ def depth_order(
 
     def none(active: Array, inputs) -> _InView:
         shapes = jax.eval_shape(look, active, inputs)
-        nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+        nothing = jax.tree.map(jnp.zeros_like, shapes)
         return nothing._replace(z=jnp.full_like(nothing.z, jnp.inf))
 
     inputs = (params.means, params.log_scales, params.logit_opacities)

@@ -150,8 +150,7 @@ def ellipses(
         lambda a: a.at[slots].get(mode="clip").T,
         (params.means, params.quats, params.log_scales, params.logit_opacities),
     )
-    # Else XLA would take them apart anew for each use.
-    means, quats, log_scales, logits = lax.optimization_barrier(rows)
+    means, quats, log_scales, logits = rows
     components = _Components(
         means=tuple(means),
         quats=tuple(quats),
