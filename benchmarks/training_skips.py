@@ -119,7 +119,7 @@ def of_masks(name: str, trained: Trained, result: FitResult, share: float) -> di
     y, x = np.mgrid[:height, :width]
     apart = ((x + 0.5) / width - 0.5) ** 2 + ((y + 0.5) / height - 0.5) ** 2
     disc = apart <= np.quantile(apart, share)
-    batch = draw(frames, state.key, jnp.int32(0), 1)
+    batch = draw(frames, jnp.zeros(1, jnp.int32))
     batch = batch._replace(valid=jnp.asarray(disc)[None])
     pairs = pairs_for(state, frames, config)
     raster = config.raster.replace(pair_capacity=pairs)

@@ -26,7 +26,7 @@ from gsjax.scene.photos import load_photos  # noqa: E402
 from gsjax.train.checkpoint import load_latest, restore  # noqa: E402
 from gsjax.train.fit import subset  # noqa: E402
 from gsjax.train.folder import load_data, load_settings, run_files  # noqa: E402
-from gsjax.train.frames import draw, make_frames  # noqa: E402
+from gsjax.train.frames import draw, make_frames, views_of_step  # noqa: E402
 from gsjax.train.room import pairs_for  # noqa: E402
 from gsjax.train.start import empty_state, extent_of  # noqa: E402
 from gsjax.train.step import _optimise, make_train_step, targets  # noqa: E402
@@ -45,14 +45,15 @@ def parts(folder: Path) -> tuple[dict, dict]:
     densifier = config.densifier(extent)
     raster = raster.replace(outputs=("rgb",), absgrad=densifier.absgrad)
     train_step = make_train_step(config, extent, raster)
-    batch = jax.jit(draw, static_argnums=3)(frames, state.key, state.step, config.batch)
+    view = views_of_step(config.seed, int(state.step), config.batch, frames.count)
+    batch = draw(frames, view)
     target, weight = targets(batch, jnp.zeros(3), jnp.float32)
     probe = jnp.zeros((config.batch, slots, 2))
     name = "abs_probe" if densifier.absgrad else "probe"
 
     @jax.jit
     def step(state, frames):
-        return train_step(state, draw(frames, state.key, state.step, config.batch))
+        return train_step(state, draw(frames, view))
 
     @jax.jit
     @jax.value_and_grad

@@ -38,7 +38,7 @@ from gsjax.losses import photometric
 from gsjax.optim import Rates
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
-from gsjax.train.frames import Batch, draw, make_frames
+from gsjax.train.frames import Batch, draw, make_frames, views_of_step
 from gsjax.train.step import background_of, init_state, make_train_step, targets
 from gsjax.train.tuning import tuned_camera
 
@@ -78,7 +78,7 @@ def plain_frames():
 
 
 def plain_batch(step=0):
-    return draw(plain_frames(), jax.random.key(0), jnp.int32(step), 1)
+    return draw(plain_frames(), views_of_step(0, step, 1, VIEWS))
 
 
 def plain_state(seed=0):
@@ -506,7 +506,7 @@ def test_every_view_once_an_epoch():
     for batch in (1, 3):
         order = []
         for step in range(8):
-            drawn = draw(frames, jax.random.key(5), jnp.int32(step), batch)
+            drawn = draw(frames, views_of_step(5, step, batch, VIEWS))
             order += drawn.view.tolist()
             np.testing.assert_array_equal(drawn.pixels, frames.pixels[drawn.view])
             np.testing.assert_array_equal(

@@ -19,7 +19,7 @@ from gsjax.raster.types import RasterConfig
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.config import TrainConfig
 from gsjax.train.footprint import step_estimate
-from gsjax.train.frames import Frames, draw, make_frames
+from gsjax.train.frames import Frames, draw, make_frames, views_of_step
 from gsjax.train.health import Health, check_photos
 from gsjax.train.room import (
     pairs_for,
@@ -187,7 +187,8 @@ class _Run:
                     pair_capacity=pair_capacity, visible_capacity=None
                 )
                 program = self.program(state, frames, raster)
-                state, metrics = program(state, frames)
+                view = views_of_step(config.seed, step, config.batch, frames.count)
+                state, metrics = program(state, frames, view)
                 metrics = jax.device_get(metrics)
                 if metrics.overflowed:
                     state = with_slots_ahead(state, config)
@@ -258,12 +259,12 @@ class _Run:
             begun = time.perf_counter()
             train_step = make_train_step(self.config, extent_of(self.scene), raster)
 
-            def advance(state: TrainState, frames: Frames):
-                batch = draw(frames, state.key, state.step, self.config.batch)
-                return train_step(state, batch)
+            def advance(state: TrainState, frames: Frames, view: jax.Array):
+                return train_step(state, draw(frames, view))
 
             jitted = jax.jit(advance, donate_argnums=0)
-            self.programs[shapes] = jitted.lower(state, frames).compile()
+            view = jax.ShapeDtypeStruct((self.config.batch,), jnp.int32)
+            self.programs[shapes] = jitted.lower(state, frames, view).compile()
             self.compile_seconds += time.perf_counter() - begun
         return self.programs[shapes]
 

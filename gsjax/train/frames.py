@@ -18,9 +18,6 @@ from gsjax.scene.types import Photo, View
 
 Array = jax.Array
 
-# Steps derive keys of their own from the run's, by their number; none has this one.
-_ORDER = 2**32 - 1
-
 
 @partial(
     jax.tree_util.register_dataclass,
@@ -127,20 +124,22 @@ def _shrunk(photo: Photo, divisor: int) -> Photo:
     return Photo(pixels, np.rint(alpha).astype(np.uint8), valid, scale @ photo.K)
 
 
-def draw(frames: Frames, key: Array, step: Array, batch: int) -> Batch:
-    """The views of one step: each once an epoch, in an order of its own.
+def views_of_step(seed: int, step: int, batch: int, views: int) -> np.ndarray:
+    """Which views [B] a step looks at: each once an epoch, in an order of its own.
 
     Depends on nothing but its arguments, so that a run that is resumed sees what it
-    would have seen.
+    would have seen. On the host: a permutation takes XLA half a second to compile.
     """
-    count = frames.count
-    key = jax.random.fold_in(key, _ORDER)
-    number = step * batch + jnp.arange(batch, dtype=jnp.int32)
 
-    def one(number):
-        order = jax.random.permutation(jax.random.fold_in(key, number // count), count)
-        return order[number % count]
+    def one(number: int) -> int:
+        epoch, place = divmod(number, views)
+        return np.random.default_rng((seed, epoch)).permutation(views)[place]
 
-    index = jax.vmap(one)(number).astype(jnp.int32)
-    drawn = jax.tree.map(lambda a: a[index], frames)
-    return Batch(drawn.pixels, drawn.valid, drawn.camera, index, drawn.size)
+    first = int(step) * batch  # `TrainState.step` is an array
+    return np.asarray([one(first + i) for i in range(batch)], np.int32)
+
+
+def draw(frames: Frames, view: Array) -> Batch:
+    """The views [B] of one step."""
+    drawn = jax.tree.map(lambda a: a[view], frames)
+    return Batch(drawn.pixels, drawn.valid, drawn.camera, view, drawn.size)
