@@ -95,7 +95,7 @@ class TrainConfig:
     drop_unseen: bool = True
     every_eval: int = 0
     every_checkpoint: int = 1000
-    # What compiles faster: one size of the work, as the run grows its capacities itself;
+    # What compiles faster: one size of the work, as a run grows its capacities itself;
     # no search for what is hidden, of which views of photographs hold next to nothing.
     raster: RasterConfig = field(
         default_factory=lambda: RasterConfig(rungs=1, occlusion=False)
