@@ -10,6 +10,10 @@ with its switch on and off:
 - ``skip_masked``: a step with a disc of each photograph left over by a mask, and by how
   much the gradients differ, relative to the largest.
 
+And what training leaves out because it is worth nothing there: the search for what is
+hidden (``RasterConfig.occlusion``), by the compiling and the time of a step, and by how
+many pairs of all views are hidden. ("with" is with the skip, that is without search.)
+
 What is not skipped: the optimiser's updates of Gaussians without a gradient. The whole
 optimiser is a twentieth of a step (``benchmarks/training_step.py``).
 """
@@ -30,6 +34,7 @@ import jax.numpy as jnp  # noqa: E402
 import measure  # noqa: E402
 import numpy as np  # noqa: E402
 
+from gsjax.raster.render import count_demand  # noqa: E402
 from gsjax.scene.photos import load_photos  # noqa: E402
 from gsjax.train.config import Level, TrainConfig, preset  # noqa: E402
 from gsjax.train.fit import FitResult, fit, subset  # noqa: E402
@@ -150,6 +155,42 @@ def of_masks(name: str, trained: Trained, result: FitResult, share: float) -> di
     }  # fmt: skip
 
 
+def of_occlusion(name: str, trained: Trained, result: FitResult) -> list[dict]:
+    """A step, and its compiling, without the search for what is hidden."""
+    config, frames, state = trained.config, trained.frames, result.state
+    raster = config.raster.replace(pair_capacity=pairs_for(state, frames, config))
+    batch = draw(frames, jnp.zeros(config.batch, jnp.int32))
+    jax.clear_caches()
+    steps, seconds, pairs = {}, {}, {}
+    for occlusion in (False, True):
+        searching = raster.replace(occlusion=occlusion)
+        begun = time.perf_counter()
+        step = make_train_step(config, trained.extent, searching)
+        steps[occlusion] = jax.jit(step).lower(state, batch).compile()
+        seconds[occlusion] = time.perf_counter() - begun
+        pairs[occlusion] = sum(
+            count_demand(
+                result.gaussians,
+                jax.tree.map(lambda a, i=index: a[i], frames.camera),
+                searching,
+            ).pairs.item()
+            for index in range(frames.count)
+        )
+    ms = measure.interleaved(
+        {kind: lambda s=step: s(state, batch) for kind, step in steps.items()}
+    )
+    hidden = pairs[False] - pairs[True]
+    changes = f"{hidden} of {pairs[False]} pairs of {frames.count} views are hidden"
+    return [
+        {
+            "dataset": name, "skip": "search for what is hidden", "unit": unit,
+            "with": found[False], "without": found[True],
+            "ratio": found[False] / found[True], "changes": changes,
+        }
+        for unit, found in (("s of compiling", seconds), ("ms a step", ms))
+    ]  # fmt: skip
+
+
 def main() -> None:
     """Measure and save."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -161,6 +202,7 @@ def main() -> None:
         result, seconds = trained.fit(config)
         rows.append(of_unseen(folder.name, trained, result))
         rows += [of_masks(folder.name, trained, result, share) for share in SHARES]
+        rows += of_occlusion(folder.name, trained, result)
         rows.append(of_levels(folder.name, trained, result, seconds))
         measure.save("training_skips", rows, claim=__doc__)
 

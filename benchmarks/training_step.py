@@ -29,7 +29,12 @@ from gsjax.train.folder import load_data, load_settings, run_files  # noqa: E402
 from gsjax.train.frames import draw, make_frames, views_of_step  # noqa: E402
 from gsjax.train.room import pairs_for  # noqa: E402
 from gsjax.train.start import empty_state, extent_of  # noqa: E402
-from gsjax.train.step import _optimise, make_train_step, targets  # noqa: E402
+from gsjax.train.step import (  # noqa: E402
+    _optimise,
+    gradients_like,
+    make_train_step,
+    targets,
+)
 
 
 def parts(folder: Path) -> tuple[dict, dict]:
@@ -52,7 +57,7 @@ def parts(folder: Path) -> tuple[dict, dict]:
     name = "abs_probe" if densifier.absgrad else "probe"
 
     @jax.jit
-    def step(state, frames):
+    def step(state, frames, view):
         return train_step(state, draw(frames, view))
 
     @jax.jit
@@ -83,7 +88,9 @@ def parts(folder: Path) -> tuple[dict, dict]:
     image = 0.9 * target
     _, cotangent = loss(image)
     _, (slopes, _) = picture(differentiated, batch.camera, cotangent)
-    grads = slopes, jax.tree.map(jnp.zeros_like, state.tuning), probe
+    grads = jax.tree.map(
+        lambda a: jnp.zeros(a.shape, a.dtype), gradients_like(state, config.batch)
+    )._replace(by_params=slopes)
     about = {
         "run": folder.name,
         "strategy": config.strategy,
@@ -93,7 +100,7 @@ def parts(folder: Path) -> tuple[dict, dict]:
         "pair capacity": raster.pair_capacity,
     }
     return about, {
-        "step": lambda: step(state, frames),
+        "step": lambda: step(state, frames, view),
         "picture v+g": lambda: picture(differentiated, batch.camera, cotangent),
         "loss v+g": lambda: loss(image),
         "optimiser": lambda: optimise(state, grads),

@@ -18,6 +18,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from gsjax.errors import InputError
+from gsjax.numerics import host_array
 
 # What is nearer to the camera is not drawn, where nothing else is said; world units.
 NEAR = 0.01
@@ -156,9 +157,7 @@ def make_camera(
             )
         model = CAMERA_MODELS[model]
     _check_size(width, height)
-    dtype = jnp.result_type(float)
-    viewmat, K = jnp.asarray(viewmat, dtype), jnp.asarray(K, dtype)
-    near, far = jnp.asarray(near, dtype), jnp.asarray(far, dtype)
+    viewmat, K, near, far = map(_as_float, (viewmat, K, near, far))
     if viewmat.ndim not in (2, 3) or viewmat.shape[-2:] != (4, 4):
         raise InputError(f"viewmat has shape {viewmat.shape}; [4, 4] or [B, 4, 4]")
     if not viewmat.size:
@@ -173,14 +172,24 @@ def make_camera(
             raise InputError(f"{name} has shape {value.shape}; () or {batch} is wanted")
     _check_values(viewmat, K, near, far)
     return Camera(
-        viewmat=viewmat,
-        K=jnp.broadcast_to(K, (*batch, 3, 3)),
-        near=jnp.broadcast_to(near, batch),
-        far=jnp.broadcast_to(far, batch),
+        viewmat=jnp.asarray(viewmat),
+        K=_spread(K, (*batch, 3, 3)),
+        near=_spread(near, batch),
+        far=_spread(far, batch),
         width=int(width),
         height=int(height),
         model=model,
     )
+
+
+def _as_float(value) -> Array | np.ndarray:
+    return host_array(value).astype(jnp.result_type(float))
+
+
+def _spread(value: Array | np.ndarray, shape: tuple[int, ...]) -> Array:
+    if isinstance(value, np.ndarray):
+        return jnp.asarray(np.broadcast_to(value, shape))
+    return jnp.broadcast_to(value, shape)
 
 
 def _check_size(width, height) -> None:

@@ -102,11 +102,10 @@ def spread(work: Callable[..., Any], count: int, *inputs: Any) -> Any:
     """
     if count == 1:
         return work(jnp.zeros(1, jnp.int32), *inputs)
-    mesh = Mesh(np.array(jax.local_devices()[:count]), ("devices",))
     by_device, whole = PartitionSpec("devices"), PartitionSpec()
     shared = jax.shard_map(
         work,
-        mesh=mesh,
+        mesh=_mesh(count),
         in_specs=(by_device, *(whole for _ in inputs)),
         out_specs=by_device,
         check_vma=False,
@@ -120,10 +119,20 @@ def on_all_devices(tree: Any) -> Any:
     A render that is shared by devices needs its inputs on each. Where they lie on one,
     they are copied to the others at every call.
     """
-    if jax.local_device_count() == 1:
-        return tree
-    mesh = Mesh(np.array(jax.local_devices()), ("devices",))
-    return jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
+    whole = whole_on(jax.local_device_count())
+    return tree if whole is None else jax.device_put(tree, whole)
+
+
+def whole_on(count: int) -> NamedSharding | None:
+    """How an array lies that is whole on each of the first ``count`` local devices;
+    None for one device, where there is nothing to say."""
+    if count == 1:
+        return None
+    return NamedSharding(_mesh(count), PartitionSpec())
+
+
+def _mesh(count: int) -> Mesh:
+    return Mesh(np.array(jax.local_devices()[:count]), ("devices",))
 
 
 def keep_memory() -> bool:

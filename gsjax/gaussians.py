@@ -15,7 +15,7 @@ from jax.core import Tracer
 
 from gsjax import sh as sh_lib
 from gsjax.errors import InputError
-from gsjax.numerics import exp_log_scale
+from gsjax.numerics import exp_log_scale, host_array
 
 Array = jax.Array
 
@@ -110,23 +110,35 @@ def make_gaussians(
                 "axis of means sets the number of Gaussians)"
             )
     sh_lib.degree_of(arrays["sh"].shape[1])
-    params = GaussianParams(**arrays)
-    active = jnp.ones(count, bool)
-    gaussians = Gaussians(params=params, active=active)  # pyright: ignore
     capacity = max(count, 1) if capacity is None else capacity
     if capacity < max(count, 1):
         raise InputError(
             f"capacity {capacity} cannot hold {count} Gaussians; pass at least "
             f"{max(count, 1)}, or None"
         )
-    return grow(gaussians, capacity)
+    padded = {
+        name: _padded(array, capacity - count, _EMPTY.get(name, 0.0))
+        for name, array in arrays.items()
+    }
+    active = np.arange(capacity) < count
+    gaussians = Gaussians(params=GaussianParams(**padded), active=active)  # pyright: ignore
+    return jax.tree.map(jnp.asarray, gaussians)
 
 
-def _as_float(name: str, value) -> Array:
-    array = jnp.asarray(value)
+def _as_float(name: str, value) -> Array | np.ndarray:
+    array = host_array(value)
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
         raise InputError(f"{name} is complex; pass real numbers")
     return array.astype(jnp.result_type(float))
+
+
+def _padded(array: Array | np.ndarray, extra: int, value) -> Array | np.ndarray:
+    """With ``extra`` more rows of ``value``."""
+    if extra == 0:
+        return array
+    rows = np.broadcast_to(np.asarray(value, array.dtype), (extra, *array.shape[1:]))
+    join = np.concatenate if isinstance(array, np.ndarray) else jnp.concatenate
+    return join([array, rows])
 
 
 def capacity_bucket(count: int, minimum: int = 1024) -> int:

@@ -27,6 +27,17 @@ def in_float64(tree):
     return jax.tree.map(one, tree)
 
 
+def host_array(value) -> Array | np.ndarray:
+    """What is JAX's, or has a part that is, in JAX; all else in NumPy.
+
+    There nothing is compiled: in a new process each kind of operation, by shape and
+    dtype, takes JAX some 20 ms, on however few numbers.
+    """
+    if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value)):
+        return jnp.asarray(value)
+    return np.asarray(value)
+
+
 def safe_divide(numerator: Array, denominator: Array, where: Array) -> Array:
     """``numerator / denominator`` where ``where``, else 0, with finite derivatives."""
     return jnp.where(where, numerator / jnp.where(where, denominator, 1), 0)

@@ -69,8 +69,8 @@ def open_subject(
       path: a .ply file, or the folder of a run.
       origin: [3] what is subtracted from the file's coordinates, as it is from those
         of the cameras that `load_dataset` or `load_near_transforms` gives.
-      preset: name of the constants to render with; None takes those of the run, for a
-        file "compat".
+      preset: name of the constants to render with; None takes those of the run, with
+        the search for what is hidden that training leaves out, for a file "compat".
       background: RGB; None takes that of the run, for a file black.
 
     Raises:
@@ -79,7 +79,9 @@ def open_subject(
     config, behind = RasterConfig.compat(), (0.0, 0.0, 0.0)
     if is_run(path):
         trained = load_settings(path).config
-        config, behind = trained.raster, background_of(trained)
+        # Unlike a photograph, a view may be filled by what stands before the camera.
+        config = trained.raster.replace(occlusion=RasterConfig.occlusion)
+        behind = background_of(trained)
     if preset is not None:
         # Opacities were learnt with or without it: no matter of taste.
         config = PRESETS[preset](antialias=config.antialias)

@@ -163,7 +163,9 @@ def shared_programs():
     def program(self, state, frames, raster):
         extent = np.float32(fit_module.extent_of(self.scene))
         key = (Programs.kind, self.config, extent, frames.valid is None)
-        self.programs = compiled.setdefault(key, {})
+        steps = self.steps
+        shared = compiled.setdefault(key, ({}, {}))
+        steps.differentiating, steps.advancing = shared
         return compile_one(self, state, frames, raster)
 
     fit_module._Run.program = program

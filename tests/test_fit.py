@@ -201,7 +201,7 @@ def test_killed_and_taken_up_from_the_last_checkpoint(whole, tmp_path):
 
 @pytest.mark.new_emitters
 @on_cpu
-def test_too_few_pairs_and_slots_are_grown():
+def test_too_few_pairs_and_slots_are_grown(shared_programs):
     """Until the first edit no size matters; it tells how many slots it wants.
 
     From then on slots do: draws are made for all of them at once.
@@ -230,6 +230,9 @@ def test_too_few_pairs_and_slots_are_grown():
     assert result.gaussians.capacity == 1024
     assert int(result.gaussians.active.sum()) == 64
     assert bits(state) == before  # the caller's is still there
+    # What does not look at the pairs is compiled once for all of them.
+    (compiled,) = [v for k, v in shared_programs.items() if limited in k]
+    assert [len(programs) for programs in compiled] == [3, 2]
 
 
 @on_cpu

@@ -20,6 +20,7 @@ from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import InputError
 from gsjax.files import alone_in
 from gsjax.raster.types import RasterConfig
+from gsjax.subjects import open_subject
 from gsjax.train.config import TrainConfig
 from gsjax.train.config_json import from_json, to_json
 from gsjax.train.folder import (
@@ -447,6 +448,13 @@ def test_a_run_that_stopped_early_is_told_as_one(made, capsys):
     change(made / "run" / "config.json", train={**config["train"], "steps": 8})
     assert cli.main(["eval", str(made / "run"), "--views", "train"]) == 0
     assert "not at its end: step 3 of 8 is" in capsys.readouterr().err
+
+
+def test_pictures_of_a_run_are_of_its_settings_and_search_for_what_is_hidden(whole):
+    """Training leaves the search out: a view from anywhere may be filled."""
+    subject = open_subject(whole / "run")
+    assert CONFIG.raster != subject.config
+    assert CONFIG.raster.replace(occlusion=True) == subject.config
 
 
 def test_settings_of_before_there_was_a_cooling():

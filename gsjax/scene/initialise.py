@@ -1,5 +1,7 @@
 """Gaussians to start from: at the points of a scene, or anywhere in view of it."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from gsjax.cameras import NEAR, USUAL_EXTENT
@@ -64,7 +66,7 @@ def init_gaussians(
     scale: float = 1.0,
     max_count: int = 1_000_000,
     random_count: int | None = None,
-    capacity: int | None = None,
+    capacity: int | Callable[[int], int] | None = None,
     seed: int = 0,
 ) -> Gaussians:
     """Isotropic Gaussians, as wide as their neighbours are far.
@@ -77,7 +79,8 @@ def init_gaussians(
       max_count: of more points than that, that many are drawn.
       random_count: that many, drawn evenly from the ball of the scene's extent around
         the point that the cameras look at, instead of its points.
-      capacity: number of slots; default the number of Gaussians.
+      capacity: number of slots, or what says it of the number of Gaussians; default
+        that number.
       seed: of what is drawn.
 
     Raises:
@@ -105,7 +108,7 @@ def init_gaussians(
         log_scales=np.repeat(np.log(spacing)[:, None], 3, 1),
         logit_opacities=np.full(count, np.log(opacity / (1 - opacity))),
         sh=sh,
-        capacity=capacity,
+        capacity=capacity(count) if callable(capacity) else capacity,
     )
 
 

@@ -6,7 +6,7 @@ Runs on the host and in memory; files are the business of `gsjax.train.run`.
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +14,11 @@ import numpy as np
 
 from gsjax.errors import CapacityError
 from gsjax.gaussians import Gaussians
-from gsjax.memory import require
 from gsjax.raster.types import RasterConfig
 from gsjax.scene.types import Photo, Scene
+from gsjax.train.compiled import CompiledSteps, Step
 from gsjax.train.config import TrainConfig
-from gsjax.train.footprint import step_estimate
-from gsjax.train.frames import Frames, draw, make_frames, views_of_step
+from gsjax.train.frames import Frames, make_frames, views_of_step
 from gsjax.train.health import Health, check_photos
 from gsjax.train.room import (
     pairs_for,
@@ -28,7 +27,7 @@ from gsjax.train.room import (
     with_slots_ahead,
 )
 from gsjax.train.start import extent_of, initial_state, with_dense
-from gsjax.train.step import Metrics, TrainState, make_train_step
+from gsjax.train.step import Metrics, TrainState
 from gsjax.train.unseen import without_unseen
 
 
@@ -148,9 +147,18 @@ def fit(
         if config.initial == "dense":
             run.hooks.phase("looking for points on which the photographs agree")
         state = initial_state(with_dense(scene, photos, config), config)
-    # The step takes the state's memory over: not the caller's, and none twice.
-    own: TrainState = jax.tree.map(jnp.copy, state)
-    return run.loop(own, pair_capacity)
+    else:  # a step takes the state's memory over: not the caller's
+        state = _copied(state)
+    own: TrainState = run.steps.place(state)
+    try:
+        return run.loop(own, pair_capacity)
+    finally:
+        run.steps.close()
+
+
+@jax.jit
+def _copied(state: TrainState) -> TrainState:
+    return jax.tree.map(jnp.copy, state)
 
 
 @dataclass
@@ -163,7 +171,10 @@ class _Run:
     hooks: Hooks
     start: float = field(default_factory=time.perf_counter)
     compile_seconds: float = 0.0
-    programs: dict[Any, Any] = field(default_factory=dict)
+
+    def __post_init__(self):
+        extent, phase = extent_of(self.scene), self.hooks.phase
+        self.steps = CompiledSteps(self.config, extent, phase)
 
     def loop(self, state: TrainState, pair_capacity: int | None) -> FitResult:
         config, hooks = self.config, self.hooks
@@ -175,6 +186,7 @@ class _Run:
             if frames is None or finer:
                 divisor = config.divisor(step)
                 frames = make_frames(self.scene.views, self.photos, divisor)
+                frames = self.steps.place(frames)
             try:
                 if pair_capacity is None or finer:
                     begun = time.perf_counter()
@@ -189,7 +201,6 @@ class _Run:
                 program = self.program(state, frames, raster)
                 view = views_of_step(config.seed, step, config.batch, frames.count)
                 state, metrics = program(state, frames, view)
-                metrics = jax.device_get(metrics)
                 if metrics.overflowed:
                     state = with_slots_ahead(state, config)
                     wanted = int(metrics.pair_capacity)
@@ -235,38 +246,17 @@ class _Run:
             metrics=metrics,
             seconds=time.perf_counter() - self.start,
             compile_seconds=self.compile_seconds,
-            compilations=len(self.programs),
+            compilations=len(self.steps.differentiating),
             divisor=divisor,
             capacity=state.gaussians.capacity,
         )
 
-    def program(self, state: TrainState, frames: Frames, raster: RasterConfig):
+    def program(self, state: TrainState, frames: Frames, raster: RasterConfig) -> Step:
         """The compiled step for these sizes."""
-        kind = (frames.pixels.shape, jax.tree.structure(frames))  # what it lacks, too
-        shapes = (kind, state.gaussians.capacity, raster)
-        if shapes not in self.programs:
-            height, width = frames.pixels.shape[1:3]
-            slots, pairs = state.gaussians.capacity, raster.pair_capacity
-            told = f"{width} × {height} px, {slots:,} slots, {pairs:,} pairs"
-            self.hooks.phase(f"compiling, half a minute or so, for {told}")
-            nbytes = frames.pixels.nbytes
-            require(
-                step_estimate(slots, (width, height), self.config, raster, nbytes),
-                f"a step for {told},",
-                "train with smaller photographs (--max-size) or fewer Gaussians "
-                "(--max-gaussians)",
-            )
-            begun = time.perf_counter()
-            train_step = make_train_step(self.config, extent_of(self.scene), raster)
-
-            def advance(state: TrainState, frames: Frames, view: jax.Array):
-                return train_step(state, draw(frames, view))
-
-            jitted = jax.jit(advance, donate_argnums=0)
-            view = jax.ShapeDtypeStruct((self.config.batch,), jnp.int32)
-            self.programs[shapes] = jitted.lower(state, frames, view).compile()
-            self.compile_seconds += time.perf_counter() - begun
-        return self.programs[shapes]
+        begun = time.perf_counter()
+        step = self.steps.step(state, frames, raster)
+        self.compile_seconds += time.perf_counter() - begun
+        return step
 
 
 def subset(scene: Scene, indices: Sequence[int]) -> Scene:

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsjax.cameras import Camera
 from gsjax.errors import CapacityError
-from gsjax.gaussians import Gaussians, capacity_bucket, grow, num_active
+from gsjax.gaussians import Gaussians, capacity_bucket, grow
 from gsjax.raster.render import count_demand
 from gsjax.raster.types import RasterConfig
 from gsjax.train.config import TrainConfig
@@ -53,8 +53,9 @@ def pairs_for(state: TrainState, frames: Frames, config: TrainConfig) -> int:
         tile = config.raster.tile_size
         tiles = np.prod([-(-side // tile) for side in frames.pixels.shape[1:3]])
         most = _PAIRS_OF_TILE * int(tiles)
+    cameras = jax.device_get(frames.camera)  # to take one of them compiles nothing
     for index in np.unique(probed.astype(int)):
-        camera = jax.tree.map(lambda a, i=index: a[i], frames.camera)
+        camera = jax.tree.map(lambda a, i=index: a[i], cameras)
         if scene is not None:
             wanted = expected_pairs(scene, camera, config.raster)
         else:  # the same settings for each: one program
@@ -129,12 +130,17 @@ def roomy_pairs(wanted: int, state: TrainState, config: TrainConfig) -> int:
         views = config.batch * _steps_of_program(step, config)
         worth = _PAIRS_OF_PROGRAM / views
         growing = float(np.clip(1 + worth / wanted, *_GROWING_MARGINS))
-        count = max(1, int(num_active(state.gaussians)))
+        count = max(1, _count(state))
         room = min(_likely(count, step, config), state.gaussians.capacity)
         growth = max(1, room / count)
         likely = _PER_GROWTH * growth * (1 if step else _WIDENING)
         margin = max(margin, min(likely, growing))
     return min(capacity_bucket(int(margin * wanted)), 2**30 - 1)
+
+
+def _count(state: TrainState) -> int:
+    """Gaussians, counted on the host: nothing is compiled for it."""
+    return int(np.asarray(state.gaussians.active).sum())
 
 
 def _steps_of_program(step: int, config: TrainConfig) -> int:
@@ -171,7 +177,7 @@ def with_slots(state: TrainState, wanted: int, config: TrainConfig) -> TrainStat
     wanted = min(wanted, config.max_gaussians)
     if _SLOT_MARGIN * wanted <= state.gaussians.capacity:
         return state
-    step, count = int(state.step), int(num_active(state.gaussians))
+    step, count = int(state.step), _count(state)
     if _likely(count, step, config) == count:
         return state
     return _grown(state, slots_for(wanted, step, config))
@@ -179,7 +185,7 @@ def with_slots(state: TrainState, wanted: int, config: TrainConfig) -> TrainStat
 
 def with_slots_ahead(state: TrainState, config: TrainConfig) -> TrainState:
     """``state``, with slots for the steps ahead where a program is due anyway."""
-    count = int(num_active(state.gaussians))
+    count = _count(state)
     return _grown(state, slots_for(count, int(state.step), config))
 
 

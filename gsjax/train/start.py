@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+import jax
 import numpy as np
 
-from gsjax.gaussians import grow, make_gaussians
+from gsjax.gaussians import make_gaussians
 from gsjax.scene.dense import find_points
 from gsjax.scene.initialise import has_points, init_gaussians, scene_extent
 from gsjax.scene.types import Photo, Scene
@@ -80,10 +81,14 @@ def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
         scale=config.chosen.initial_scale,
         max_count=min(config.max_initial, config.max_gaussians),
         random_count=config.initial_count if drawn else None,
+        capacity=lambda count: slots_for(count, 0, config),
         seed=config.seed,
     )
-    gaussians = grow(gaussians, slots_for(gaussians.capacity, 0, config))
-    return init_state(gaussians, config, extent_of(scene), len(scene.views))
+    return _init_state(gaussians, config, extent_of(scene), len(scene.views))
+
+
+# One program instead of one for each array.
+_init_state = jax.jit(init_state, static_argnums=(1, 2, 3))
 
 
 def empty_state(
@@ -96,4 +101,4 @@ def empty_state(
         sh=np.zeros((0, num_bases(config.sh_degree), 3)),
         capacity=capacity,
     )
-    return init_state(gaussians, config, extent, views)
+    return _init_state(gaussians, config, extent, views)

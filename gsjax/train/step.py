@@ -1,5 +1,8 @@
 """One step of training: a pure function (state, batch) → (state, metrics).
 
+Its stages, which a run compiles one by one (`gsjax.train.compiled`): differentiate what
+the views show, advance by it, and edit the slots where that is due.
+
 Axis legend: N Gaussians (capacity), V views, B views of a step, H W image.
 """
 
@@ -13,7 +16,7 @@ import optax
 from jax import lax
 
 from gsjax.densify.types import Densifier, Observation, apply_edit
-from gsjax.gaussians import Gaussians, num_active
+from gsjax.gaussians import GaussianParams, Gaussians, num_active
 from gsjax.losses import photometric_spread
 from gsjax.metrics import psnr
 from gsjax.numerics import all_within
@@ -41,11 +44,13 @@ _STEEPEST = 1e18
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrainState:
-    """All that a run goes on from; what it does next depends on nothing else.
+    """All that a run goes on from, with its settings and its photographs.
 
     Attributes:
       step: [] int32, steps done.
       key: random key of the run; steps derive theirs from it and never change it.
+        (Which views a step looks at follows from `TrainConfig.seed`: it is drawn on
+        the host, see `gsjax.train.frames.views_of_step`.)
       gaussians: the scene.
       moments: Adam's, slot by slot.
       stats: what the strategy has gathered.
@@ -93,6 +98,46 @@ class Metrics(NamedTuple):
     finite: Array
 
 
+class Gradients(NamedTuple):
+    """What a step learns from its views.
+
+    Attributes:
+      loss, psnr: [] as in `Metrics`.
+      by_params: of the loss, by the parameters.
+      by_tuning: by the corrections.
+      by_probe: [B, N, 2] by the projected means, px; see `Observation`.
+      radii: [B, N] px.
+      size: [B, 2] int32, width and height of the photographs.
+      pairs, pair_capacity, overflowed: [] as in `Metrics`.
+    """
+
+    loss: Array
+    psnr: Array
+    by_params: GaussianParams
+    by_tuning: Tuning
+    by_probe: Array
+    radii: Array
+    size: Array
+    pairs: Array
+    pair_capacity: Array
+    overflowed: Array
+
+
+class Stages(NamedTuple):
+    """The parts of a step, as pure functions.
+
+    Attributes:
+      differentiate: of the state, looks at scene, corrections, step and key.
+      advance: optimiser and what the strategy does at each step; the last result is []
+        bool, whether an edit is due then.
+      edit: the edit of the strategy, behind a step that it is due at.
+    """
+
+    differentiate: Callable[[TrainState, Batch], Gradients]
+    advance: Callable[[TrainState, Gradients], tuple[TrainState, Metrics, Array]]
+    edit: Callable[[TrainState, Metrics], tuple[TrainState, Metrics]]
+
+
 TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
 
 
@@ -134,6 +179,24 @@ def make_train_step(
       (`TrainState`, `Batch` of B views) → (`TrainState`, `Metrics`). Look at
       ``overflowed``; if True, nothing was done.
     """
+    stages = make_stages(config, extent, raster)
+
+    def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
+        gradients = stages.differentiate(state, batch)
+        state, metrics, due = stages.advance(state, gradients)
+        return lax.cond(due, stages.edit, lambda *same: same, state, metrics)
+
+    return train_step
+
+
+def make_stages(
+    config: TrainConfig, extent: float, raster: RasterConfig | None = None
+) -> Stages:
+    """The parts of `make_train_step`, each a pure function to be compiled by itself.
+
+    Args:
+      config, extent, raster: as for `make_train_step`.
+    """
     densifier = config.densifier(extent)
     raster = (raster or config.raster).replace(
         outputs=("rgb",), absgrad=densifier.absgrad
@@ -160,57 +223,95 @@ def make_train_step(
                 lax.stop_gradient(image), target, weight
             )
         )
-        return total, (quality, view.radii, view.demand, view.overflowed)
+        return total, (quality, view)
 
-    differentiate = jax.value_and_grad(objective, argnums=(0, 1, 2), has_aux=True)
+    slopes = jax.value_and_grad(objective, argnums=(0, 1, 2), has_aux=True)
 
-    def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
-        key = jax.random.fold_in(state.key, state.step)
-        by_background, by_noise, by_plan = jax.random.split(key, 3)
-        params = state.gaussians.params
+    def differentiate(state: TrainState, batch: Batch) -> Gradients:
+        params, count = state.gaussians.params, batch.view.shape[0]
         dtype = params.means.dtype
         transparent = batch.pixels.shape[-1] == 4
+        by_background, *_ = _keys(state.key, state.step)
         background = background_of(config, transparent, by_background, dtype)
-        count = batch.view.shape[0]
         probe = jnp.zeros((count, state.gaussians.capacity, 2), dtype)
-        (loss, (quality, radii, demand, overflowed)), grads = differentiate(
+        (loss, (quality, view)), by = slopes(
             params, state.tuning, probe, state, batch, background
         )
-        finite = jnp.isfinite(loss) & all_within(grads, _STEEPEST)
-        width, height = batch.camera.width, batch.camera.height
-        if batch.size is not None:
-            width, height = batch.size.T
-        # The loss is a mean over the views of the step.
-        observation = Observation(grads[2] * count, radii, width, height)
+        size = batch.size
+        if size is None:
+            whole = jnp.asarray([batch.camera.width, batch.camera.height], jnp.int32)
+            size = jnp.broadcast_to(whole, (count, 2))
+        demand = view.demand
+        counts = demand.pairs, demand.capacity, view.overflowed
+        return Gradients(loss, quality, *by, view.radii, size, *counts)
+
+    def advance(state: TrainState, found: Gradients):
+        by = found.by_params, found.by_tuning, found.by_probe
+        finite = jnp.isfinite(found.loss) & all_within(by, _STEEPEST)
 
         def keep():
-            return state, jnp.int32(0), jnp.asarray(True)
+            return state, jnp.asarray(True)
 
         def skip():
-            return state.replace(step=state.step + 1), jnp.int32(0), jnp.asarray(True)
+            return state.replace(step=state.step + 1), jnp.asarray(True)
 
         def update():
-            moved, good = _optimise(state, grads, config, extent)
+            moved, good = _optimise(state, found, config, extent)
+            _, by_noise, _ = _keys(state.key, state.step)
             rate = means_rate(config.rates, moved.step / config.steps, extent)
-            keys = by_noise, by_plan
-            return *_densify(moved, observation, keys, densifier, rate), good
+            return _observe(moved, found, by_noise, densifier, rate), good
 
-        state, wanted, good = lax.cond(
-            overflowed, keep, lambda: lax.cond(finite, update, skip)
+        after, good = lax.cond(
+            found.overflowed, keep, lambda: lax.cond(finite, update, skip)
         )
-        return state, Metrics(
-            step=state.step,
-            loss=loss,
-            psnr=quality,
-            gaussians=num_active(state.gaussians),
-            wanted=wanted,
-            pairs=demand.pairs,
-            pair_capacity=demand.capacity,
-            overflowed=overflowed,
+        metrics = Metrics(
+            step=after.step,
+            loss=found.loss,
+            psnr=found.psnr,
+            gaussians=num_active(after.gaussians),
+            wanted=jnp.int32(0),
+            pairs=found.pairs,
+            pair_capacity=found.pair_capacity,
+            overflowed=found.overflowed,
             finite=finite & good,
         )
+        return after, metrics, ~found.overflowed & finite & densifier.due(after.step)
 
-    return train_step
+    def edit(state: TrainState, metrics: Metrics) -> tuple[TrainState, Metrics]:
+        *_, by_plan = _keys(state.key, state.step - 1)
+        plan, stats = densifier.plan(by_plan, state.step, state.gaussians, state.stats)
+        gaussians, moments = apply_edit(plan, state.moments)
+        state = state.replace(gaussians=gaussians, moments=moments, stats=stats)
+        count = num_active(gaussians)
+        return state, metrics._replace(gaussians=count, wanted=plan.wanted)
+
+    return Stages(differentiate, advance, edit)
+
+
+def gradients_like(state: TrainState, batch: int) -> Gradients:
+    """Shapes of what `Stages.differentiate` returns for ``batch`` views."""
+    dtype, slots = state.gaussians.params.means.dtype, state.gaussians.capacity
+
+    def shape(*sizes: int, dtype=dtype):
+        return jax.ShapeDtypeStruct(sizes, dtype)
+
+    return Gradients(
+        loss=shape(),
+        psnr=shape(),
+        by_params=state.gaussians.params,
+        by_tuning=state.tuning,
+        by_probe=shape(batch, slots, 2),
+        radii=shape(batch, slots),
+        size=shape(batch, 2, dtype=jnp.int32),
+        pairs=shape(dtype=jnp.int32),
+        pair_capacity=shape(dtype=jnp.int32),
+        overflowed=shape(dtype=jnp.bool_),
+    )
+
+
+def _keys(key: Array, step: Array) -> Array:
+    """[3] of the step behind ``step`` others: background, noise and edit."""
+    return jax.random.split(jax.random.fold_in(key, step), 3)
 
 
 def background_of(config: TrainConfig, transparent: bool, key: Array, dtype) -> Array:
@@ -231,10 +332,10 @@ def targets(batch: Batch, background: Array, dtype) -> tuple[Array, Array | None
 
 
 def _optimise(
-    state: TrainState, grads, config: TrainConfig, extent: float
+    state: TrainState, found: Gradients, config: TrainConfig, extent: float
 ) -> tuple[TrainState, Array]:
     """Parameters and corrections after one step of Adam; whether all made it."""
-    by_params, by_tuning, _ = grads
+    by_params, by_tuning = found.by_params, found.by_tuning
     bases = by_params.sh.shape[-2]
     degree = jnp.floor(jnp.sqrt(jnp.arange(bases, dtype=jnp.float32))).astype(jnp.int32)
     learnt = degree <= state.step // config.sh_every
@@ -274,23 +375,16 @@ def _still_numbers(before: Gaussians, params) -> tuple[Array, Any]:
     return jnp.all(jnp.stack([jnp.all(g) for g in jax.tree.leaves(good)])), kept
 
 
-def _densify(
-    state: TrainState, observation: Observation, keys, densifier: Densifier, rate: Array
-) -> tuple[TrainState, Array]:
-    """What the strategy does after a step; also how many Gaussians it wanted."""
-    by_noise, by_plan = keys
+def _observe(
+    state: TrainState, found: Gradients, key: Array, densifier: Densifier, rate: Array
+) -> TrainState:
+    """What the strategy does at each step: its noise, and what it gathers."""
     gaussians = state.gaussians
     if densifier.perturb is not None:
-        moved = densifier.perturb(by_noise, gaussians, rate)
+        moved = densifier.perturb(key, gaussians, rate)
         gaussians = gaussians.replace(params=moved)  # pyright: ignore
-    stats = densifier.observe(state.stats, observation)
-
-    def edit():
-        plan, fresh = densifier.plan(by_plan, state.step, gaussians, stats)
-        return (*apply_edit(plan, state.moments), fresh, plan.wanted)
-
-    def leave():
-        return gaussians, state.moments, stats, jnp.int32(0)
-
-    gaussians, moments, stats, wanted = lax.cond(densifier.due(state.step), edit, leave)
-    return state.replace(gaussians=gaussians, moments=moments, stats=stats), wanted
+    # The loss is a mean over the views of the step.
+    gradient = found.by_probe * found.radii.shape[0]
+    seen = Observation(gradient, found.radii, *found.size.T)
+    stats = densifier.observe(state.stats, seen)
+    return state.replace(gaussians=gaussians, stats=stats)
