@@ -11,8 +11,8 @@ with its switch on and off:
   much the gradients differ, relative to the largest.
 
 And what training leaves out because it is worth nothing there: the search for what is
-hidden (``RasterConfig.occlusion``), by the compiling and the time of a step, and by how
-many pairs of all views are hidden. ("with" is with the skip, that is without search.)
+hidden (``RasterConfig.occlusion``), by the compiling and the time of a step's gradient,
+and by how many pairs of all views are hidden. ("with" is with the skip: no search.)
 
 What is not skipped: the optimiser's updates of Gaussians without a gradient. The whole
 optimiser is a twentieth of a step (``benchmarks/training_step.py``).
@@ -42,7 +42,7 @@ from gsjax.train.frames import draw, make_frames  # noqa: E402
 from gsjax.train.held_out import results_of  # noqa: E402
 from gsjax.train.room import pairs_for  # noqa: E402
 from gsjax.train.start import extent_of  # noqa: E402
-from gsjax.train.step import make_train_step  # noqa: E402
+from gsjax.train.step import make_stages, make_train_step  # noqa: E402
 from gsjax.train.unseen import without_unseen  # noqa: E402
 
 SHARES = (0.75, 0.5, 0.25)  # of the pixels that the mask leaves
@@ -156,28 +156,30 @@ def of_masks(name: str, trained: Trained, result: FitResult, share: float) -> di
 
 
 def of_occlusion(name: str, trained: Trained, result: FitResult) -> list[dict]:
-    """A step, and its compiling, without the search for what is hidden."""
+    """The gradient of a step, and its compiling, without the search."""
     config, frames, state = trained.config, trained.frames, result.state
     raster = config.raster.replace(pair_capacity=pairs_for(state, frames, config))
     batch = draw(frames, jnp.zeros(config.batch, jnp.int32))
-    jax.clear_caches()
-    steps, seconds, pairs = {}, {}, {}
-    for occlusion in (False, True):
+    looks, seconds, pairs = {}, {True: [], False: []}, {}
+    for occlusion in (False, True, True, False):
         searching = raster.replace(occlusion=occlusion)
+        jax.clear_caches()
         begun = time.perf_counter()
-        step = make_train_step(config, trained.extent, searching)
-        steps[occlusion] = jax.jit(step).lower(state, batch).compile()
-        seconds[occlusion] = time.perf_counter() - begun
+        look = make_stages(config, trained.extent, searching).differentiate
+        looks[occlusion] = jax.jit(look).lower(state, batch).compile()
+        seconds[occlusion].append(time.perf_counter() - begun)
+    seconds = {kind: float(np.mean(found)) for kind, found in seconds.items()}
+    for occlusion in looks:
         pairs[occlusion] = sum(
             count_demand(
                 result.gaussians,
                 jax.tree.map(lambda a, i=index: a[i], frames.camera),
-                searching,
+                raster.replace(occlusion=occlusion),
             ).pairs.item()
             for index in range(frames.count)
         )
     ms = measure.interleaved(
-        {kind: lambda s=step: s(state, batch) for kind, step in steps.items()}
+        {kind: lambda f=look: f(state, batch) for kind, look in looks.items()}
     )
     hidden = pairs[False] - pairs[True]
     changes = f"{hidden} of {pairs[False]} pairs of {frames.count} views are hidden"
@@ -187,7 +189,7 @@ def of_occlusion(name: str, trained: Trained, result: FitResult) -> list[dict]:
             "with": found[False], "without": found[True],
             "ratio": found[False] / found[True], "changes": changes,
         }
-        for unit, found in (("s of compiling", seconds), ("ms a step", ms))
+        for unit, found in (("s of compiling", seconds), ("ms a gradient", ms))
     ]  # fmt: skip
 
 

@@ -3,7 +3,8 @@
 ``python benchmarks/training_step.py RUN...`` takes the last checkpoint of runs that
 ``gsjax train`` made, and times one step from there, in turn with its parts: the value
 and gradient of the picture by all parameters, the loss with its gradient by the
-picture, the optimiser, and one edit of the strategy (which is not due at each step).
+picture, the optimiser, and one edit of the strategy (not part of a step, as it is not
+due at each).
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from gsjax.train.start import empty_state, extent_of  # noqa: E402
 from gsjax.train.step import (  # noqa: E402
     _optimise,
     gradients_like,
-    make_train_step,
+    make_stages,
     targets,
 )
 
@@ -49,16 +50,19 @@ def parts(folder: Path) -> tuple[dict, dict]:
     raster = config.raster.replace(pair_capacity=pairs_for(state, frames, config))
     densifier = config.densifier(extent)
     raster = raster.replace(outputs=("rgb",), absgrad=densifier.absgrad)
-    train_step = make_train_step(config, extent, raster)
+    stages = make_stages(config, extent, raster)
     view = views_of_step(config.seed, int(state.step), config.batch, frames.count)
     batch = draw(frames, view)
     target, weight = targets(batch, jnp.zeros(3), jnp.float32)
     probe = jnp.zeros((config.batch, slots, 2))
     name = "abs_probe" if densifier.absgrad else "probe"
 
+    # Two programs, as in a run; but for the state, whose memory is not taken over.
     @jax.jit
-    def step(state, frames, view):
-        return train_step(state, draw(frames, view))
+    def differentiate(state, frames, view):
+        return stages.differentiate(state, draw(frames, view))
+
+    advance = jax.jit(stages.advance)
 
     @jax.jit
     @jax.value_and_grad
@@ -100,7 +104,7 @@ def parts(folder: Path) -> tuple[dict, dict]:
         "pair capacity": raster.pair_capacity,
     }
     return about, {
-        "step": lambda: step(state, frames, view),
+        "step": lambda: advance(state, differentiate(state, frames, view)),
         "picture v+g": lambda: picture(differentiated, batch.camera, cotangent),
         "loss v+g": lambda: loss(image),
         "optimiser": lambda: optimise(state, grads),
@@ -115,7 +119,7 @@ def main() -> None:
     rows = []
     for folder in parser.parse_args().runs:
         about, functions = parts(folder)
-        _, metrics = functions["step"]()
+        _, metrics, _ = functions["step"]()
         assert metrics.finite
         assert not metrics.overflowed, metrics.pair_capacity
         ms = measure.interleaved(functions)

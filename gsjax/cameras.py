@@ -18,7 +18,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from gsjax.errors import InputError
-from gsjax.numerics import host_array
+from gsjax.numerics import as_floats, host_array, to_device
 
 # What is nearer to the camera is not drawn, where nothing else is said; world units.
 NEAR = 0.01
@@ -157,7 +157,8 @@ def make_camera(
             )
         model = CAMERA_MODELS[model]
     _check_size(width, height)
-    viewmat, K, near, far = map(_as_float, (viewmat, K, near, far))
+    numbers = map(host_array, (viewmat, K, near, far))
+    viewmat, K, near, far = map(as_floats, numbers)
     if viewmat.ndim not in (2, 3) or viewmat.shape[-2:] != (4, 4):
         raise InputError(f"viewmat has shape {viewmat.shape}; [4, 4] or [B, 4, 4]")
     if not viewmat.size:
@@ -171,25 +172,21 @@ def make_camera(
         if value.shape not in ((), batch):
             raise InputError(f"{name} has shape {value.shape}; () or {batch} is wanted")
     _check_values(viewmat, K, near, far)
-    return Camera(
-        viewmat=jnp.asarray(viewmat),
-        K=_spread(K, (*batch, 3, 3)),
-        near=_spread(near, batch),
-        far=_spread(far, batch),
+    camera = Camera(
+        viewmat=viewmat,  # pyright: ignore
+        K=_spread(K, (*batch, 3, 3)),  # pyright: ignore
+        near=_spread(near, batch),  # pyright: ignore
+        far=_spread(far, batch),  # pyright: ignore
         width=int(width),
         height=int(height),
         model=model,
     )
+    return to_device(camera)
 
 
-def _as_float(value) -> Array | np.ndarray:
-    return host_array(value).astype(jnp.result_type(float))
-
-
-def _spread(value: Array | np.ndarray, shape: tuple[int, ...]) -> Array:
-    if isinstance(value, np.ndarray):
-        return jnp.asarray(np.broadcast_to(value, shape))
-    return jnp.broadcast_to(value, shape)
+def _spread(value: Array | np.ndarray, shape: tuple[int, ...]):
+    library = np if isinstance(value, np.ndarray) else jnp
+    return library.broadcast_to(value, shape)
 
 
 def _check_size(width, height) -> None:

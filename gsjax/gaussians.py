@@ -15,7 +15,7 @@ from jax.core import Tracer
 
 from gsjax import sh as sh_lib
 from gsjax.errors import InputError
-from gsjax.numerics import exp_log_scale, host_array
+from gsjax.numerics import as_floats, exp_log_scale, host_array, to_device
 
 Array = jax.Array
 
@@ -120,25 +120,28 @@ def make_gaussians(
         name: _padded(array, capacity - count, _EMPTY.get(name, 0.0))
         for name, array in arrays.items()
     }
-    active = np.arange(capacity) < count
+    # Of what is traced by iota: a mask from the host would be part of the program.
+    traced = any(isinstance(array, Tracer) for array in arrays.values())
+    active = (jnp if traced else np).arange(capacity) < count
     gaussians = Gaussians(params=GaussianParams(**padded), active=active)  # pyright: ignore
-    return jax.tree.map(jnp.asarray, gaussians)
+    return to_device(gaussians)
 
 
 def _as_float(name: str, value) -> Array | np.ndarray:
     array = host_array(value)
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
         raise InputError(f"{name} is complex; pass real numbers")
-    return array.astype(jnp.result_type(float))
+    return as_floats(array)
 
 
 def _padded(array: Array | np.ndarray, extra: int, value) -> Array | np.ndarray:
     """With ``extra`` more rows of ``value``."""
     if extra == 0:
         return array
-    rows = np.broadcast_to(np.asarray(value, array.dtype), (extra, *array.shape[1:]))
-    join = np.concatenate if isinstance(array, np.ndarray) else jnp.concatenate
-    return join([array, rows])
+    library = np if isinstance(array, np.ndarray) else jnp
+    value = library.asarray(value, array.dtype)
+    rows = library.broadcast_to(value, (extra, *array.shape[1:]))
+    return library.concatenate([array, rows])
 
 
 def capacity_bucket(count: int, minimum: int = 1024) -> int:

@@ -33,9 +33,33 @@ def host_array(value) -> Array | np.ndarray:
     There nothing is compiled: in a new process each kind of operation, by shape and
     dtype, takes JAX some 20 ms, on however few numbers.
     """
-    if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value)):
+    leaves = jax.tree.leaves(value)
+    if any(isinstance(x, jax.Array) or hasattr(x, "__jax_array__") for x in leaves):
         return jnp.asarray(value)
     return np.asarray(value)
+
+
+def as_floats(array: Array | np.ndarray) -> Array | np.ndarray:
+    """Of the type that JAX has for floats; in no memory of the caller's.
+
+    What NumPy need not convert is JAX's then, which copies it once.
+    """
+    dtype = jnp.result_type(float)
+    if isinstance(array, np.ndarray) and array.dtype == dtype:
+        return jnp.asarray(array)
+    return array.astype(dtype)
+
+
+def to_device(tree):
+    """The same pytree, what is NumPy's of it in JAX; it may share that memory.
+
+    Nothing is compiled for that: `jax.numpy.asarray` compiles its copying.
+    """
+
+    def one(leaf):
+        return jax.device_put(leaf) if isinstance(leaf, np.ndarray) else leaf
+
+    return jax.tree.map(one, tree)
 
 
 def safe_divide(numerator: Array, denominator: Array, where: Array) -> Array:

@@ -39,6 +39,15 @@ class Subject(NamedTuple):
     budget: float | None = None
 
 
+def from_anywhere(trained: RasterConfig) -> RasterConfig:
+    """The settings of a training, for views that are not of its photographs.
+
+    Such a view may be filled by what stands right before the camera, and what is behind
+    it is looked for; training does not, see `TrainConfig`.
+    """
+    return trained.replace(occlusion=RasterConfig.occlusion)
+
+
 def is_run(path: Path) -> bool:
     """Whether a name means a run: a folder, or nothing that is there with a suffix."""
     return path.is_dir() or not (path.exists() or path.suffix)
@@ -79,9 +88,7 @@ def open_subject(
     config, behind = RasterConfig.compat(), (0.0, 0.0, 0.0)
     if is_run(path):
         trained = load_settings(path).config
-        # Unlike a photograph, a view may be filled by what stands before the camera.
-        config = trained.raster.replace(occlusion=RasterConfig.occlusion)
-        behind = background_of(trained)
+        config, behind = from_anywhere(trained.raster), background_of(trained)
     if preset is not None:
         # Opacities were learnt with or without it: no matter of taste.
         config = PRESETS[preset](antialias=config.antialias)

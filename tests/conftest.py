@@ -163,9 +163,8 @@ def shared_programs():
     def program(self, state, frames, raster):
         extent = np.float32(fit_module.extent_of(self.scene))
         key = (Programs.kind, self.config, extent, frames.valid is None)
-        steps = self.steps
-        shared = compiled.setdefault(key, ({}, {}))
-        steps.differentiating, steps.advancing = shared
+        compiler = self.compiler
+        compiler.by_sizes, compiler.by_slots = compiled.setdefault(key, ({}, {}))
         return compile_one(self, state, frames, raster)
 
     fit_module._Run.program = program

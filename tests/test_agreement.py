@@ -6,10 +6,15 @@ sums are taken chunk by chunk, so they associate differently (≤ 2e-5 in float3
 in the last place). Batches are in test_batches.py.
 """
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
-from conftest import COMPAT, scene_of
+from conftest import COMPAT, camera_of, pose, scene_of
 from pictures import KINDS, images, largest_difference
+
+import gsjax
+from gsjax.numerics import in_float64
 
 
 @pytest.mark.parametrize(
@@ -45,3 +50,41 @@ def test_occlusion(report):
             assert found.demand.pairs <= plain.demand.pairs
             if kind == "wall":
                 assert found.demand.pairs < 0.4 * plain.demand.pairs
+
+
+def test_depths_that_differ_by_less_than_a_step_of_float32(report):
+    """Opaque ones, each before the next by less than float32 can tell of its z, in any
+    order of slots, far from the origin: their order is that of the numbers stored."""
+    rng, count = np.random.default_rng(0), 64
+    viewmat = (
+        pose()
+        @ np.r_[np.eye(4)[:3] + [[0, 0, 0, x] for x in (9, -7, 5)], [[0, 0, 0, 1]]]
+    )
+    camera = camera_of(viewmat=viewmat)
+    to_world = np.linalg.inv(np.asarray(camera.viewmat, np.float64))
+    seen = np.c_[np.zeros((count, 2)), 3 + 2e-8 * np.arange(count), np.ones(count)]
+    fields = {
+        "means": (seen @ to_world.T)[:, :3],
+        "quats": np.tile([1.0, 0, 0, 0], (count, 1)),
+        "log_scales": np.full((count, 3), -2.0),
+        "logit_opacities": np.full(count, 1.0),
+        "sh": rng.uniform(-1, 2, (count, 1, 3)),
+    }
+    mixed = rng.permutation(count)
+    with jax.enable_x64(False):
+        fields = {name: np.asarray(v[mixed], np.float32) for name, v in fields.items()}
+        scene, narrow = (
+            gsjax.make_gaussians(**fields),
+            jax.tree.map(jnp.float32, camera),
+        )
+        found = gsjax.render_exact(scene, narrow, COMPAT).rgb
+        row, means = np.asarray(narrow.viewmat)[2], fields["means"]
+        as_computed = sum(row[i] * means[:, i] for i in range(3)) + row[3]
+    wide, camera = in_float64((scene, narrow))
+    z = np.asarray(wide.params.means) @ np.asarray(camera.viewmat)[2, :3]
+    # What float32 makes of it is another order.
+    assert (np.argsort(z) != np.argsort(as_computed, kind="stable")).any()
+    wanted = gsjax.render_exact(wide, camera, COMPAT).rgb
+    error = float(jnp.abs(found - wanted).max())
+    report("order within a step of float32", error, 1e-5)
+    assert error <= 1e-5

@@ -15,6 +15,7 @@ from gsjax.raster.sorting import (
     bits_for,
     pair_keys,
     sort_pairs,
+    split_float,
 )
 
 LENGTH = 64  # one shape, one compilation
@@ -28,6 +29,7 @@ def sort_by_both(high, low, high_count, low_count):
 sort_narrow = partial(sort_by_both, high_count=2**10, low_count=2**12)
 sort_wide = partial(sort_by_both, high_count=2**20, low_count=2**31 - 1)
 argsort = jax.jit(argsort_float)
+split = jax.jit(split_float)
 descending = jax.jit(argsort_descending)
 
 
@@ -69,6 +71,23 @@ def test_floats_with_ties_and_infinities(dtype, data):
     drawn = data.draw(st.lists(bits, min_size=LENGTH, max_size=LENGTH))
     values = np.asarray(drawn, whole).view(dtype)
     np.testing.assert_array_equal(argsort(values), np.argsort(values, kind="stable"))
+
+
+@settings(deadline=None, max_examples=50)
+@given(data=st.data())
+def test_floats_in_two_parts(data):
+    """As the float64 that they are of: all but the last three bits count, of 64."""
+    low, high = (int(np.asarray(v, np.float64).view(np.uint64)) for v in
+                 (np.finfo(np.float32).tiny, 2.0**127))  # fmt: skip
+    start = data.draw(st.integers(low, high - 2**32))
+    near = st.integers(start, start + 2**31)  # some steps of float32
+    bits = st.one_of(near, st.integers(low, high), st.sampled_from([start]))
+    drawn = data.draw(st.lists(bits, min_size=LENGTH, max_size=LENGTH))
+    values = (np.asarray(drawn, np.uint64) & ~np.uint64(7)).view(np.float64)
+    values[data.draw(st.integers(0, LENGTH - 1))] = np.inf
+    np.testing.assert_array_equal(
+        argsort(*split(values)), np.argsort(values, kind="stable")
+    )
 
 
 def test_full_precision_of_the_depth():

@@ -134,3 +134,87 @@ def test_stacking_is_a_leading_axis():
     assert batch.model is PINHOLE
     with pytest.raises(InputError, match="one image size"):
         gsjax.stack_cameras([cameras[0], camera_of(width=9)])
+
+
+@pytest.fixture
+def compiled():
+    """The durations of what is compiled, as they come."""
+    from jax import monitoring
+
+    durations, listening = [], [True]
+
+    def note(event, duration, **_):
+        if listening and event.endswith("backend_compile_duration"):
+            durations.append(duration)
+
+    monitoring.register_event_duration_secs_listener(note)
+    yield durations
+    listening.clear()
+
+
+def test_to_convert_numbers_nothing_is_compiled(compiled):
+    """In a new process each program takes longer than all the work in it."""
+    rng, count = np.random.default_rng(0), 61  # shapes that nothing else has
+    arrays = {
+        "means": rng.normal(size=(count, 3)).astype(np.float16),
+        "quats": rng.normal(size=(count, 4)).astype(np.float32),
+        "log_scales": [[0, 0, 0]] * count,
+        "logit_opacities": rng.integers(-2, 2, (count, 1)),
+        "sh": rng.normal(size=(count, 4, 3)).astype(np.float32),
+    }
+    view = gsjax.look_at((0, -4, 1), (0, 0, 0)).astype(np.float32)
+    K = np.asarray(camera_of().K, np.float32)
+    scene = gsjax.make_gaussians(**arrays, capacity=83)
+    camera = gsjax.make_camera(
+        viewmat=np.stack([view] * 7), K=K, width=40, height=30, near=1, far=9
+    )
+    assert compiled == []
+    assert all(isinstance(a, jax.Array) for a in jax.tree.leaves((scene, camera)))
+    jax.jit(lambda x: x + 1)(0)
+    assert len(compiled) == 1
+    # The same as of what is JAX's already.
+    given = {name: jnp.asarray(value) for name, value in arrays.items()}
+    other = gsjax.make_gaussians(**given, capacity=83)
+    for a, b in zip(jax.tree.leaves(scene), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+        assert a.dtype == b.dtype
+
+
+@pytest.mark.parametrize("capacity", [None, 99])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_nobody_else_holds_their_memory(dtype, capacity):
+    """JAX would share an aligned array of NumPy's."""
+
+    def aligned(shape):
+        size = int(np.prod(shape)) * dtype(0).nbytes
+        memory = np.zeros(size + 64, np.uint8)
+        start = -memory.ctypes.data % 64
+        return memory[start : start + size].view(dtype).reshape(shape)
+
+    shapes = {"means": (64, 3), "quats": (64, 4), "log_scales": (64, 3)}
+    arrays = {name: aligned(shape) for name, shape in shapes.items()}
+    arrays |= {"logit_opacities": aligned((64,)), "sh": aligned((64, 1, 3))}
+    viewmat, K = aligned((4, 4)), aligned((3, 3))
+    viewmat[:], K[:] = np.eye(4), np.diag([9, 9, 1])
+    scene = gsjax.make_gaussians(**arrays, capacity=capacity)
+    camera = gsjax.make_camera(viewmat=viewmat, K=K, width=8, height=8)
+    before = [np.array(a) for a in jax.tree.leaves((scene, camera))]
+    for array in (*arrays.values(), viewmat, K):
+        array[...] = 7
+    for a, b in zip(before, jax.tree.leaves((scene, camera)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_traced_parts_of_lists():
+    """As focal lengths that are learnt are written into K."""
+
+    def focal(f):
+        K = [[f, 0, 4], [0, f, 3], [0, 0, 1]]
+        camera = gsjax.make_camera(viewmat=np.eye(4), K=K, width=8, height=6)
+        one = gsjax.make_gaussians(
+            means=[[0, 0, f]], quats=[[1, 0, 0, 0]], log_scales=[[0, 0, 0]],
+            logit_opacities=[0], sh=[[[0, 0, 0]]], capacity=3,
+        )  # fmt: skip
+        return camera.K[1, 1] ** 2 + one.params.means[0, 2]
+
+    assert jax.jit(jax.grad(focal))(3.0) == 7

@@ -39,7 +39,14 @@ from gsjax.optim import Rates
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Batch, draw, make_frames, views_of_step
-from gsjax.train.step import background_of, init_state, make_train_step, targets
+from gsjax.train.step import (
+    background_of,
+    gradients_like,
+    init_state,
+    make_stages,
+    make_train_step,
+    targets,
+)
 from gsjax.train.tuning import tuned_camera
 
 SLOTS = 96
@@ -108,6 +115,64 @@ def test_is_a_function():
     # The edit after the second step: everything is hot, until slots run out.
     assert [int(m.wanted) for m in first[1]] == [0, 120, 0]
     assert [int(m.gaussians) for m in first[1]] == [60, SLOTS, SLOTS]
+
+
+def test_stages_one_by_one_are_the_step():
+    """As a run takes them, over two edits; none is due where nothing was learnt."""
+    stages = make_stages(PLAIN, EXTENT)
+    differentiate, advance, edit = map(jax.jit, stages)
+
+    def one_by_one(state, batch):
+        found = differentiate(state, batch)
+        like = gradients_like(state, 1)
+        assert jax.tree.map(lambda a: (a.shape, a.dtype), found) == jax.tree.map(
+            lambda a: (a.shape, a.dtype), like
+        )
+        state, metrics, due = advance(state, found)
+        return edit(state, metrics) if due else (state, metrics)
+
+    state, edits = plain_state(), 0
+    for step in range(5):
+        batch = plain_batch(step)
+        wanted = plain_step(copy(state), batch)
+        found = one_by_one(state, batch)
+        for a, b in zip(*map(jax.tree.leaves, (found, wanted)), strict=True):
+            if not jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+                np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+        state, metrics = found
+        edits += int(metrics.wanted) > 0
+    assert edits == 2
+    gradients = differentiate(state, batch)  # step 5: behind it an edit is due
+    nan, full = jnp.asarray(jnp.nan), jnp.asarray(True)
+    skipped, metrics, due = advance(state, gradients._replace(loss=nan))
+    assert (changed(state, skipped), bool(due)) == ([".step"], False)
+    assert not metrics.finite
+    kept, metrics, due = advance(state, gradients._replace(overflowed=full))
+    assert (changed(state, kept), bool(due)) == ([], False)
+    assert metrics.overflowed
+    *_, due = advance(state, gradients)
+    assert due
+
+
+@pytest.mark.parametrize("strategy", ["adaptive", "mcmc"])
+@pytest.mark.parametrize("batch", [1, 2])
+def test_shapes_of_gradients(strategy, batch):
+    """Also where cameras are wider than what is learnt, and pictures of all sizes."""
+    config = TUNED.replace(strategy=strategy, batch=batch)
+    config = config.replace(adaptive=replace(config.adaptive, absgrad=True))
+    state = init_state(rough_start(0, SLOTS), config, EXTENT, VIEWS)
+    narrow = jax.tree.map(
+        lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, state
+    )
+    stages = make_stages(config, EXTENT)
+    views = jnp.zeros(batch, jnp.int32)
+    sizes = jnp.full((batch, 2), 8, jnp.int32)
+    for begun in (state, narrow):
+        seen = draw(plain_frames(), views)._replace(size=sizes)
+        found = jax.eval_shape(stages.differentiate, begun, seen)
+        assert found == gradients_like(begun, batch)
+        after, *_ = jax.eval_shape(stages.advance, begun, found)
+        assert after == jax.eval_shape(lambda s: s, begun)
 
 
 def test_its_state_may_be_donated():

@@ -16,6 +16,8 @@ from jax import lax
 
 Array = jax.Array
 
+_REST_BITS = 31
+
 
 def bits_for(count: int) -> int:
     """Bits that hold the numbers 0 to count - 1."""
@@ -42,13 +44,56 @@ def sort_pairs(keys: Sequence[Array], low_count: int) -> Array:
     return (lax.sort(keys[0], is_stable=True) & mask).astype(jnp.int32)
 
 
-def argsort_float(values: Array) -> Array:
-    """Stable ascending order [n] of floats ≥ 0 or +inf; ties by index."""
+def argsort_float(values: Array, rest: Array | None = None) -> Array:
+    """Stable ascending order [n] of floats ≥ 0 or +inf; ties by index.
+
+    Args:
+      values: [n].
+      rest: [n] int32 of `split_float`, what float32 ``values`` lack; or None.
+    """
     index = lax.iota(jnp.int32, values.shape[0])
-    if values.dtype == jnp.float32:
-        # Bits of non-negative floats order like the floats.
-        return _sort_wide(lax.bitcast_convert_type(values, jnp.uint32), index)
-    return lax.sort((values, index), num_keys=2)[1]
+    if values.dtype != jnp.float32:
+        return lax.sort((values, index), num_keys=2)[1]
+    # Bits of non-negative floats order like the floats.
+    bits = lax.bitcast_convert_type(values, jnp.uint32)
+    if rest is None:
+        return _sort_wide(bits, index)
+    # 31 bits of the float and as many of the rest; the index takes the place of those
+    # that count least, beyond the two that are free.
+    low_bits = bits_for(values.shape[0])
+    with jax.enable_x64(True):
+        wide = lax.convert_element_type(bits, jnp.uint64) << np.uint64(_REST_BITS)
+        rest = lax.convert_element_type(rest, jnp.int64)
+        wide += lax.convert_element_type(rest, jnp.uint64)  # may be negative: wraps
+        wide = wide >> np.uint64(max(low_bits - 2, 0))
+        key = (wide << np.uint64(low_bits)) | lax.convert_element_type(
+            index, jnp.uint64
+        )
+        low = lax.sort(key, is_stable=True) & np.uint64(2**low_bits - 1)
+        return lax.convert_element_type(low, jnp.int32)
+
+
+def split_float(values: Array) -> tuple[Array, Array]:
+    """float64 ``values``, 0 to 2¹²⁷ or +inf, as float32, and what that lacks of them.
+
+    Within ``jax.enable_x64(True)``.
+
+    Returns:
+      The nearest float32, and int32 in units of 2⁻³¹ of the distance to the next. By
+      both `argsort_float` orders as by the float64, but for as many of those 31 bits
+      as the indices take beyond two: of a million values, to 2⁻³⁷ of each.
+    """
+    high = lax.convert_element_type(values, jnp.float32)
+    # 2^(127 - e) of a float whose exponent is e: that of e in its bits, mirrored.
+    bits = lax.bitcast_convert_type(high, jnp.uint32)
+    mirrored = (np.uint32(254) - (bits >> np.uint32(23))) << np.uint32(23)
+    per_size = lax.bitcast_convert_type(mirrored, jnp.float32)
+    per_step = lax.convert_element_type(per_size, jnp.float64) * 2.0**23
+    left = (values - lax.convert_element_type(high, jnp.float64)) * per_step
+    # Half a step at most; and nothing of infinities and zeros.
+    usual = jnp.isfinite(high) & (high >= np.finfo(np.float32).tiny)
+    left = jnp.where(usual, left, 0.0)
+    return high, lax.convert_element_type(left * 2.0**_REST_BITS, jnp.int32)
 
 
 def argsort_descending(counts: Array) -> Array:

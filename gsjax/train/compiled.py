@@ -32,12 +32,12 @@ from gsjax.train.step import (
 Array = jax.Array
 
 
-class CompiledSteps:
+class StepCompiler:
     """The compiled stages of one run, by their sizes.
 
     Attributes:
-      differentiating: by size of the photographs, slots and settings.
-      advancing: of advancing and of editing, by slots.
+      by_sizes: differentiating, by size of the photographs, slots and settings.
+      by_slots: the stages behind it, by slots.
     """
 
     def __init__(
@@ -47,18 +47,20 @@ class CompiledSteps:
         self._config, self._extent, self._phase = config, extent, phase
         self._whole = whole_on(device_count(config.raster))
         self._worker = ThreadPoolExecutor(1)
-        self.differentiating: dict[Any, Any] = {}
-        self.advancing: dict[int, _Advancing] = {}
+        self.by_sizes: dict[Any, Any] = {}
+        self.by_slots: dict[int, _Behind] = {}
 
     def close(self) -> None:
-        """Wait for what is being compiled, and begin nothing more."""
-        self._worker.shutdown(cancel_futures=True)
+        """Begin nothing more; what is being compiled nobody waits for."""
+        self._worker.shutdown(wait=False, cancel_futures=True)
 
     def place(self, tree: Any) -> Any:
         """``tree`` where the programs want it: on all devices that they run on."""
         return tree if self._whole is None else jax.device_put(tree, self._whole)
 
-    def step(self, state: TrainState, frames: Frames, raster: RasterConfig) -> "Step":
+    def step(
+        self, state: TrainState, frames: Frames, raster: RasterConfig
+    ) -> "CompiledStep":
         """The stages for these sizes, compiled; editing perhaps not yet.
 
         Raises:
@@ -67,9 +69,9 @@ class CompiledSteps:
         slots = state.gaussians.capacity
         kind = (frames.pixels.shape, jax.tree.structure(frames))  # what it lacks, too
         sizes = (kind, slots, raster)
-        if sizes not in self.differentiating:
+        if sizes not in self.by_sizes:
             self._compile(sizes, state, frames, raster)
-        return Step(self.differentiating[sizes], *self.advancing[slots])
+        return CompiledStep(self.by_sizes[sizes], self.by_slots[slots])
 
     def _compile(
         self, sizes: Any, state: TrainState, frames: Frames, raster: RasterConfig
@@ -89,14 +91,14 @@ class CompiledSteps:
         def differentiate(state: TrainState, frames: Frames, view: Array) -> Gradients:
             return stages.differentiate(state, draw(frames, view))
 
-        if slots not in self.advancing:
-            self.advancing[slots] = self._begin(state, stages)
+        if slots not in self.by_slots:
+            self.by_slots[slots] = self._begin(state, stages)
         view = jax.ShapeDtypeStruct((config.batch,), jnp.int32)
         inputs = self._shapes((state, frames, view))
-        self.differentiating[sizes] = self._jit(differentiate).lower(*inputs).compile()
-        self.advancing[slots].advance.result()
+        self.by_sizes[sizes] = self._jit(differentiate).lower(*inputs).compile()
+        self.by_slots[slots].advance.result()
 
-    def _begin(self, state: TrainState, stages: Stages) -> "_Advancing":
+    def _begin(self, state: TrainState, stages: Stages) -> "_Behind":
         """Compile in another thread; it is traced in this one, whose settings of JAX
         are meant."""
         config, strategy = self._config, self._config.chosen
@@ -105,37 +107,39 @@ class CompiledSteps:
         advancing = self._worker.submit(advance.compile)
         when = strategy.start, strategy.stop, strategy.every
         if not edits_between(0, config.steps, *when):
-            return _Advancing(advancing, None)
+            return _Behind(advancing, None)
         _, metrics, _ = advance.out_info
         edit = self._jit(stages.edit, donate_argnums=0)
         edit = edit.lower(shapes, self._shapes(metrics))
-        return _Advancing(advancing, self._worker.submit(edit.compile))
+        return _Behind(advancing, self._worker.submit(edit.compile))
 
     def _jit(self, stage: Callable, **options):
         return jax.jit(stage, out_shardings=self._whole, **options)
 
     def _shapes(self, tree: Any) -> Any:
-        """Of arrays that lie where the programs want them."""
+        """Of arrays that lie where the programs want them, or on the one device that
+        they were put on."""
 
         def shape(a):
-            return jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=self._whole)
+            put = isinstance(a, jax.Array) and a.committed
+            lies = self._whole or (a.sharding if put else None)
+            return jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=lies)
 
         return jax.tree.map(shape, tree)
 
 
-class _Advancing(NamedTuple):
-    """What goes with the slots alone; None in a run without edits."""
+class _Behind(NamedTuple):
+    """What goes with the slots alone; no edit in a run without any."""
 
     advance: Future
     edit: Future | None
 
 
-class Step(NamedTuple):
+class CompiledStep(NamedTuple):
     """One step of a run by its compiled stages; see `gsjax.train.step.make_stages`."""
 
     differentiate: Any
-    advance: Future
-    edit: Future | None
+    behind: _Behind
 
     def __call__(
         self, state: TrainState, frames: Frames, view: Array
@@ -143,8 +147,9 @@ class Step(NamedTuple):
         """As `gsjax.train.step.TrainStep`, metrics on the host; the state's memory is
         taken over."""
         found = self.differentiate(state, frames, view)
-        state, metrics, due = self.advance.result()(state, found)
+        state, metrics, due = self.behind.advance.result()(state, found)
+        del found
         if due:
-            assert self.edit is not None
-            state, metrics = self.edit.result()(state, metrics)
+            assert self.behind.edit is not None
+            state, metrics = self.behind.edit.result()(state, metrics)
         return state, jax.device_get(metrics)

@@ -16,7 +16,7 @@ from gsjax.errors import CapacityError
 from gsjax.gaussians import Gaussians
 from gsjax.raster.types import RasterConfig
 from gsjax.scene.types import Photo, Scene
-from gsjax.train.compiled import CompiledSteps, Step
+from gsjax.train.compiled import CompiledStep, StepCompiler
 from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Frames, make_frames, views_of_step
 from gsjax.train.health import Health, check_photos
@@ -37,8 +37,8 @@ class Progress(NamedTuple):
     Attributes:
       metrics: of the step, on the host.
       seconds: since the start of this call, compilation included.
-      compile_seconds: of those, spent compiling.
-      compilations: programs compiled so far.
+      compile_seconds: of those, spent compiling before a step could begin.
+      compilations: sizes that a step was compiled for so far.
       divisor: how much smaller the images are.
       capacity: slots.
     """
@@ -149,11 +149,11 @@ def fit(
         state = initial_state(with_dense(scene, photos, config), config)
     else:  # a step takes the state's memory over: not the caller's
         state = _copied(state)
-    own: TrainState = run.steps.place(state)
+    own: TrainState = run.compiler.place(state)
     try:
         return run.loop(own, pair_capacity)
     finally:
-        run.steps.close()
+        run.compiler.close()
 
 
 @jax.jit
@@ -174,7 +174,7 @@ class _Run:
 
     def __post_init__(self):
         extent, phase = extent_of(self.scene), self.hooks.phase
-        self.steps = CompiledSteps(self.config, extent, phase)
+        self.compiler = StepCompiler(self.config, extent, phase)
 
     def loop(self, state: TrainState, pair_capacity: int | None) -> FitResult:
         config, hooks = self.config, self.hooks
@@ -186,7 +186,7 @@ class _Run:
             if frames is None or finer:
                 divisor = config.divisor(step)
                 frames = make_frames(self.scene.views, self.photos, divisor)
-                frames = self.steps.place(frames)
+                frames = self.compiler.place(frames)
             try:
                 if pair_capacity is None or finer:
                     begun = time.perf_counter()
@@ -246,15 +246,17 @@ class _Run:
             metrics=metrics,
             seconds=time.perf_counter() - self.start,
             compile_seconds=self.compile_seconds,
-            compilations=len(self.steps.differentiating),
+            compilations=len(self.compiler.by_sizes),
             divisor=divisor,
             capacity=state.gaussians.capacity,
         )
 
-    def program(self, state: TrainState, frames: Frames, raster: RasterConfig) -> Step:
+    def program(
+        self, state: TrainState, frames: Frames, raster: RasterConfig
+    ) -> CompiledStep:
         """The compiled step for these sizes."""
         begun = time.perf_counter()
-        step = self.steps.step(state, frames, raster)
+        step = self.compiler.step(state, frames, raster)
         self.compile_seconds += time.perf_counter() - begun
         return step
 

@@ -9,11 +9,11 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gsjax.cameras import Camera, make_camera
 from gsjax.images import opencv
+from gsjax.numerics import to_device
 from gsjax.scene.types import Photo, View
 
 Array = jax.Array
@@ -90,14 +90,15 @@ def make_frames(
         K=np.stack([photo.K for photo in small]),
         width=width,
         height=height,
-        near=jnp.asarray([view.near for view in views]),
+        near=np.asarray([view.near for view in views]),
     )
-    return Frames(
-        jnp.asarray(pixels),
-        None if valid.all() else jnp.asarray(valid),
+    frames = Frames(
+        pixels,  # pyright: ignore
+        None if valid.all() else valid,  # pyright: ignore
         camera,
-        None if (size == (width, height)).all() else jnp.asarray(size),
+        None if (size == (width, height)).all() else size,  # pyright: ignore
     )
+    return to_device(frames)
 
 
 def _shrunk(photo: Photo, divisor: int) -> Photo:

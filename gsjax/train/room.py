@@ -1,7 +1,8 @@
 """How many slots and pairs a run has room for, and how that grows.
 
-Each growth is a new program. To compile it takes longer than all its steps take for a
-little room beyond what is wanted, and less than for a lot.
+Each growth compiles anew: of pairs most of a step, of slots all of it. That takes
+longer than all its steps take for a little room beyond what is wanted, and less than
+for a lot.
 """
 
 import math

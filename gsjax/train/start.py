@@ -6,7 +6,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from gsjax.gaussians import make_gaussians
+from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.scene.dense import find_points
 from gsjax.scene.initialise import has_points, init_gaussians, scene_extent
 from gsjax.scene.types import Photo, Scene
@@ -84,11 +84,14 @@ def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
         capacity=lambda count: slots_for(count, 0, config),
         seed=config.seed,
     )
-    return _init_state(gaussians, config, extent_of(scene), len(scene.views))
+    return _begun(gaussians, config, extent_of(scene), len(scene.views))
 
 
-# One program instead of one for each array.
-_init_state = jax.jit(init_state, static_argnums=(1, 2, 3))
+def _begun(
+    gaussians: Gaussians, config: TrainConfig, extent: float, views: int
+) -> TrainState:
+    """`init_state` by one program, instead of one for each kind of array."""
+    return jax.jit(lambda scene: init_state(scene, config, extent, views))(gaussians)
 
 
 def empty_state(
@@ -101,4 +104,4 @@ def empty_state(
         sh=np.zeros((0, num_bases(config.sh_degree), 3)),
         capacity=capacity,
     )
-    return _init_state(gaussians, config, extent, views)
+    return _begun(gaussians, config, extent, views)

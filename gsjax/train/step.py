@@ -243,7 +243,10 @@ def make_stages(
             size = jnp.broadcast_to(whole, (count, 2))
         demand = view.demand
         counts = demand.pairs, demand.capacity, view.overflowed
-        return Gradients(loss, quality, *by, view.radii, size, *counts)
+        found = Gradients(loss, quality, *by, view.radii, size, *counts)
+        # Cameras may be wider than what is learnt.
+        like = gradients_like(state, count)
+        return jax.tree.map(lambda a, b: a.astype(b.dtype), found, like)
 
     def advance(state: TrainState, found: Gradients):
         by = found.by_params, found.by_tuning, found.by_probe
@@ -295,11 +298,14 @@ def gradients_like(state: TrainState, batch: int) -> Gradients:
     def shape(*sizes: int, dtype=dtype):
         return jax.ShapeDtypeStruct(sizes, dtype)
 
+    params, tuning = jax.tree.map(
+        lambda a: shape(*a.shape, dtype=a.dtype), (state.gaussians.params, state.tuning)
+    )
     return Gradients(
         loss=shape(),
         psnr=shape(),
-        by_params=state.gaussians.params,
-        by_tuning=state.tuning,
+        by_params=params,
+        by_tuning=tuning,
         by_probe=shape(batch, slots, 2),
         radii=shape(batch, slots),
         size=shape(batch, 2, dtype=jnp.int32),

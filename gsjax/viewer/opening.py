@@ -7,11 +7,10 @@ from typing import NamedTuple
 from gsjax.console import note, one_line
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
-from gsjax.raster.types import RasterConfig
 from gsjax.runinfo import describe_run
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene, View
-from gsjax.subjects import is_run, open_subject
+from gsjax.subjects import from_anywhere, is_run, open_subject
 from gsjax.train.config import TrainConfig
 from gsjax.train.folder import (
     background_of,
@@ -101,7 +100,7 @@ def exhibit_of_training(
     same time, and two programs that wait for one another's devices would for ever. So
     ``gaussians``, and what is shown in their place, must be on one.
     """
-    raster: RasterConfig = config.raster.replace(devices=1)
+    raster = from_anywhere(config.raster).replace(devices=1)
     renderer = ExactRenderer(raster, background_of(config))
     return _exhibit(gaussians, renderer, frusta_of(scene.views, photos), None)
 
