@@ -19,8 +19,6 @@ from gsjax.raster.types import RasterConfig
 # What rounding may do, as a share of the largest colour.
 ROUNDING = {"float32": 1e-4, "float64": 1e-9}
 _SEEN = 1e-14
-# Depths nearer than so many units of the last place of their terms may change places.
-_ULPS = 8
 
 
 class Dense(NamedTuple):
@@ -30,7 +28,6 @@ class Dense(NamedTuple):
       order: [N] their slots.
       alpha: [N, P] without cut and cap.
       colors: [N, 3].
-      near: [N] depth below which the next splat could be taken for the one in front.
       spread: [P] range of the colours there, of the channel with the largest.
       largest: [P] of the colours there, the background's among them.
       picture: [P, 3] rgb.
@@ -39,7 +36,6 @@ class Dense(NamedTuple):
     order: np.ndarray
     alpha: np.ndarray
     colors: np.ndarray
-    near: np.ndarray
     spread: np.ndarray
     largest: np.ndarray
     picture: np.ndarray
@@ -63,11 +59,6 @@ def dense(
         offset = pixel - means2d[order]
         power = np.einsum("ni,nij,nj->n", offset, inverse, offset)
         alpha[:, index] = opacity * np.exp(-0.5 * power)
-    # Of the sums that depths are: their largest term.
-    means = np.abs(np.asarray(gaussians.params.means)[order])
-    row = np.abs(np.asarray(camera.viewmat)[2])
-    size = means @ row[:3] + row[3]
-    near = depth[order] + _ULPS * np.finfo(np.float32).eps * size
     behind = np.asarray(background, np.float64)
     there = (alpha > _SEEN)[..., None]
     low = np.minimum(
@@ -78,10 +69,9 @@ def dense(
     )
     weight, left = _weights(alpha)
     picture = weight.T @ colors + left[:, None] * behind
-    swappable = np.append(np.where(near[:-1] > depth[order][1:], 1.0, 0.0), 0)
     spread = (high - low).max(axis=1)
     largest = np.maximum(np.abs(low), np.abs(high)).max(axis=1)
-    return Dense(order, alpha, colors, swappable, spread, largest, picture)
+    return Dense(order, alpha, colors, spread, largest, picture)
 
 
 def _weights(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -102,8 +92,7 @@ def allowed(
 ) -> np.ndarray:
     """[P] how far a channel may be off at the pixels, one knob after another.
 
-    Cap, cut, stop and SH degree as in `gsjax.planning.bounds`; rounding by `ROUNDING`,
-    and neighbours in depth that float32 may exchange, T α_i α_j each.
+    Cap, cut, stop and SH degree as in `gsjax.planning.bounds`; rounding by `ROUNDING`.
     """
     alpha, spread = found.alpha, found.spread
     capped = np.minimum(alpha, config.alpha_cap)
@@ -112,15 +101,12 @@ def allowed(
     low = capped < config.alpha_cut * (1 + 1e-3)
     cut = -np.expm1(np.log1p(-np.where(low, capped, 0)).sum(axis=0))
     kept = np.where(low, 0, capped)
-    weight, left = _weights(kept)
+    _, left = _weights(kept)
     most = config.stop
     if config.stop_rule == "before":
         most = config.stop / np.maximum(1 - kept.max(axis=0), 1e-16)
     stop = np.where(left <= config.stop * (1 + 1e-3), np.minimum(most, 1), 0)
     total = spread * (cap + cut + stop) + ROUNDING[dtype] * found.largest
-    if dtype == "float32":
-        following = np.append(alpha[1:], np.zeros_like(alpha[:1]), axis=0)
-        total = total + spread * (found.near[:, None] * weight * following).sum(axis=0)
     if degree < gaussians.sh_degree:
         total = total + _band_change(found, gaussians, camera, degree)
     return total
