@@ -165,9 +165,9 @@ def _wide_z(viewmat: Array, means) -> Array:
 def _front_to_back(z: Array, means: Array, viewmat: Array) -> Array:
     """Order [K] of camera z, infinity last; float32 in full, of the means [K, 3].
 
-    As computed in float32, z is off by some of its steps. Of a hundred thousand
-    Gaussians hundreds then change places, and where two of them overlap, so does a
-    pixel: by 4/255 at worst in guitar.ply, for which this is 0.002/255.
+    As computed in float32, z is off by some of its steps, and so are places in the
+    order: 1,233 of 90,854 in a view of guitar.ply, whose pixels are then off by up to
+    4/255 where two overlap (0.002/255 like this). Rounded once it is 1,189 still.
     """
     if z.dtype != jnp.float32:
         return argsort_float(z)

@@ -22,6 +22,8 @@ from gsjax.stress.scenes import (
     frustum,
     host_fields,
     not_finite,
+    oracle,
+    pose,
     scene_of,
     single,
     unequal,
@@ -193,6 +195,32 @@ def equal_depths(full: bool) -> Measured:
     return Measured(count if matters > 0.01 else np.nan, "permutations of three depths")
 
 
+def within_a_step(full: bool) -> Measured:
+    """Largest error of a colour where float32 cannot tell which of two is in front.
+
+    Opaque ones, one before another by less than a step of float32, in a view far from
+    the origin; against the dense oracle in float64.
+    """
+    viewmat, worst = pose(), 0.0
+    viewmat[:3, 3] += 9, -7, 5
+    camera, row = camera_of(viewmat), viewmat[2]
+    for seed in range(20 if full else 3):
+        rng = np.random.default_rng(seed)
+        points = np.zeros((SLOTS, 3))
+        points[:, 2] = 3 + 2e-8 * rng.permutation(SLOTS)
+        scene = scene_of(fields_at(points, 0.2, 0.7, viewmat, seed))
+        means = np.asarray(scene.params.means)
+        z = double(means) @ double(row[:3])
+        computed = sum(row[i] * means[:, i] for i in range(3)) + row[3]
+        if (np.argsort(z) == np.argsort(computed, kind="stable")).all():
+            return Measured(np.nan, "float32 has the order too")
+        out, _ = usual_gradients(scene, camera)
+        images, inside, _ = oracle(scene, camera)
+        error = np.abs(np.asarray(out.rgb) - images[..., :3])[inside]
+        worst = max(worst, float(error.max()))
+    return Measured(worst, f"{SLOTS} in 2.6e-6 of depth 3")
+
+
 def at_the_camera(full: bool) -> Measured:
     """Numbers not finite where the direction of the harmonics is hardly defined.
 
@@ -248,6 +276,7 @@ CASES = (
     Case("depth/near plane", "gradient by what is culled", 0, near_plane),
     Case("depth/NaN", "pixels changed", 0, depth_of_nan),
     Case("depth/equal", "pixels changed by slot order", 0, equal_depths),
+    Case("depth/within a step", "error of a colour", 1e-4, within_a_step),
     Case("slots/dead", "numbers changed by contents", 0, dead_slots),
     Case("bins/wild coordinates", "rows of tiles", 0, wild_coordinates),
     Case("colour/at the camera", "numbers not finite", 0, at_the_camera),
