@@ -110,19 +110,19 @@ def make_gaussians(
                 "axis of means sets the number of Gaussians)"
             )
     sh_lib.degree_of(arrays["sh"].shape[1])
-    capacity = max(count, 1) if capacity is None else capacity
-    if capacity < max(count, 1):
+    slots = max(count, 1) if capacity is None else capacity
+    if slots < max(count, 1):
         raise InputError(
             f"capacity {capacity} cannot hold {count} Gaussians; pass at least "
             f"{max(count, 1)}, or None"
         )
     padded = {
-        name: _padded(array, capacity - count, _EMPTY.get(name, 0.0))
+        name: _padded(array, slots - count, _EMPTY.get(name, 0.0))
         for name, array in arrays.items()
     }
     # Of what is traced by iota: a mask from the host would be part of the program.
     traced = any(isinstance(array, Tracer) for array in arrays.values())
-    active = (jnp if traced else np).arange(capacity) < count
+    active = (jnp if traced else np).arange(slots) < count
     gaussians = Gaussians(params=GaussianParams(**padded), active=active)  # pyright: ignore
     return to_device(gaussians)
 

@@ -242,8 +242,19 @@ def make_stages(
             whole = jnp.asarray([batch.camera.width, batch.camera.height], jnp.int32)
             size = jnp.broadcast_to(whole, (count, 2))
         demand = view.demand
-        counts = demand.pairs, demand.capacity, view.overflowed
-        found = Gradients(loss, quality, *by, view.radii, size, *counts)
+        by_params, by_tuning, by_probe = by
+        found = Gradients(
+            loss=loss,
+            psnr=quality,
+            by_params=by_params,
+            by_tuning=by_tuning,
+            by_probe=by_probe,
+            radii=view.radii,
+            size=size,
+            pairs=demand.pairs,
+            pair_capacity=demand.capacity,
+            overflowed=view.overflowed,
+        )
         # Cameras may be wider than what is learnt.
         like = gradients_like(state, count)
         return jax.tree.map(lambda a, b: a.astype(b.dtype), found, like)
@@ -295,7 +306,7 @@ def gradients_like(state: TrainState, batch: int) -> Gradients:
     """Shapes of what `Stages.differentiate` returns for ``batch`` views."""
     dtype, slots = state.gaussians.params.means.dtype, state.gaussians.capacity
 
-    def shape(*sizes: int, dtype=dtype):
+    def shape(*sizes: int, dtype=dtype) -> Any:
         return jax.ShapeDtypeStruct(sizes, dtype)
 
     params, tuning = jax.tree.map(
@@ -348,7 +359,7 @@ def _optimise(
     sh = jnp.where(learnt[:, None], by_params.sh, 0)
     params, moments = adam_step(
         state.gaussians.params,
-        by_params.replace(sh=sh),
+        by_params.replace(sh=sh),  # pyright: ignore
         state.moments,
         config.rates,
         state.step / config.steps,
