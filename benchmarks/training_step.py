@@ -30,12 +30,8 @@ from gsjax.train.folder import load_data, load_settings, run_files  # noqa: E402
 from gsjax.train.frames import draw, make_frames, views_of_step  # noqa: E402
 from gsjax.train.room import pairs_for  # noqa: E402
 from gsjax.train.start import empty_state, extent_of  # noqa: E402
-from gsjax.train.step import (  # noqa: E402
-    _optimise,
-    gradients_like,
-    make_stages,
-    targets,
-)
+from gsjax.train.state import gradients_like  # noqa: E402
+from gsjax.train.step import _optimise, make_stages, targets  # noqa: E402
 
 
 def parts(folder: Path) -> tuple[dict, dict]:

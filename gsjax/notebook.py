@@ -32,7 +32,7 @@ from gsjax.raster.types import RasterConfig, Render
 from gsjax.sheets import SheetRow, comparison
 from gsjax.sketches import Cell
 from gsjax.train.fit import Progress
-from gsjax.train.step import TrainState
+from gsjax.train.state import TrainState
 
 _LEAST, _MOST = 240, 1200  # px: shown enlarged below, made smaller above
 _MIME = {"webp": "image/webp", "gif": "image/gif", "webm": "video/webm"}

@@ -42,5 +42,5 @@ from gsjax.train.config import TrainConfig as TrainConfig
 from gsjax.train.fit import Hooks as Hooks
 from gsjax.train.fit import fit as fit
 from gsjax.train.fit import subset as subset
-from gsjax.train.step import init_state as init_state
+from gsjax.train.state import init_state as init_state
 from gsjax.train.step import make_train_step as make_train_step

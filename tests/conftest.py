@@ -11,6 +11,7 @@ import tempfile
 from functools import cache, partial
 from pathlib import Path
 
+import hypothesis
 import jax
 import numpy as np
 import pytest
@@ -18,6 +19,9 @@ from jax._src import compiler
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
+# A commit always passes, or never; --hypothesis-profile=default searches anew.
+hypothesis.settings.register_profile("gate", derandomize=True)
+hypothesis.settings.load_profile("gate")
 # Commands keep what they compile: for as long as these tests run, and not at home.
 _CACHE = tempfile.TemporaryDirectory(prefix="gsjax-tests-")
 os.environ["XDG_CACHE_HOME"] = _CACHE.name

@@ -26,7 +26,7 @@ from gsjax.train.checkpoint import load_checkpoint, save_checkpoint
 from gsjax.train.config import TrainConfig
 from gsjax.train.folder import RunSettings, load_settings, save_settings
 from gsjax.train.refined import save_cameras, with_cameras
-from gsjax.train.step import init_state
+from gsjax.train.state import init_state
 
 SCENE = scene_of_views(count=2, points=4)
 MODEL = ("cameras", "images", "points3D")

@@ -22,7 +22,7 @@ from gsjax.train.checkpoint import (
 )
 from gsjax.train.config import TrainConfig
 from gsjax.train.start import empty_state
-from gsjax.train.step import init_state
+from gsjax.train.state import init_state
 
 CONFIG = TrainConfig(sh_degree=1, refine_poses=True, exposure=True, seed=5)
 VIEWS, CAPACITY, EXTENT = 3, 12, 2.0

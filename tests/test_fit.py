@@ -47,7 +47,7 @@ from gsjax.train.room import (
     with_slots,
 )
 from gsjax.train.start import empty_state, initial_state, with_initial
-from gsjax.train.step import init_state
+from gsjax.train.state import init_state
 from gsjax.train.unseen import without_unseen
 
 STEPS, FINER = 60, 30

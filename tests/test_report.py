@@ -6,7 +6,7 @@ import pytest
 from gsjax.train.config import Level, TrainConfig
 from gsjax.train.fit import Progress
 from gsjax.train.report import Reporter
-from gsjax.train.step import Metrics
+from gsjax.train.state import Metrics
 
 CONFIG = TrainConfig(steps=100, levels=(Level(0.0, 4), Level(0.5, 2), Level(0.8, 1)))
 

@@ -77,9 +77,11 @@ def test_floats_with_ties_and_infinities(dtype, data):
 @given(data=st.data())
 def test_floats_in_two_parts(data):
     """As the float64 that they are of: all but the last three bits count, of 64."""
-    low, high = (int(np.asarray(v, np.float64).view(np.uint64)) for v in
-                 (np.finfo(np.float32).tiny, 2.0**127))  # fmt: skip
-    start = data.draw(st.integers(low, high - 2**32))
+    tiny, largest = np.finfo(np.float32).tiny, np.finfo(np.float32).max
+    low, top, high = np.array([tiny, 2.0**127, largest]).view(np.uint64).tolist()
+    # The halfway point below a power of two rounds up to it, into the next exponent.
+    edges = st.sampled_from([low, top - 2**29, top - 2**28, high - 2**32])
+    start = data.draw(st.one_of(edges, st.integers(low, high - 2**32)))
     near = st.integers(start, start + 2**31)  # some steps of float32
     bits = st.one_of(near, st.integers(low, high), st.sampled_from([start]))
     drawn = data.draw(st.lists(bits, min_size=LENGTH, max_size=LENGTH))

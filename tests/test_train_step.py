@@ -39,14 +39,8 @@ from gsjax.optim import Rates
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Batch, draw, make_frames, views_of_step
-from gsjax.train.step import (
-    background_of,
-    gradients_like,
-    init_state,
-    make_stages,
-    make_train_step,
-    targets,
-)
+from gsjax.train.state import gradients_like, init_state
+from gsjax.train.step import background_of, make_stages, make_train_step, targets
 from gsjax.train.tuning import tuned_camera
 
 SLOTS = 96

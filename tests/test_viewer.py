@@ -23,7 +23,7 @@ from gsjax.sheets import depth_colors
 from gsjax.train.config import TrainConfig
 from gsjax.train.fit import Progress
 from gsjax.train.start import initial_state
-from gsjax.train.step import Metrics
+from gsjax.train.state import Metrics
 from gsjax.viewer.exact import ExactRenderer, camera_of, picture
 from gsjax.viewer.live import copy_on_one_device
 from gsjax.viewer.splats import (

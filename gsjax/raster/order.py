@@ -165,9 +165,10 @@ def _wide_z(viewmat: Array, means) -> Array:
 def _front_to_back(z: Array, means: Array, viewmat: Array) -> Array:
     """Order [K] of camera z, infinity last; float32 in full, of the means [K, 3].
 
-    As computed in float32, z is off by some of its steps, and so are places in the
-    order: 1,233 of 90,854 in a view of guitar.ply, whose pixels are then off by up to
-    4/255 where two overlap (0.002/255 like this). Rounded once it is 1,189 still.
+    As computed in float32, z is off by some of its steps, and what is nearer to one
+    another than those stands in any order: a colour is off by as much as they differ
+    (the case "depth/within a step" of `gsjax stress`). Nor would rounding once do: what
+    rounds to the same number would be ordered by slot.
     """
     if z.dtype != jnp.float32:
         return argsort_float(z)

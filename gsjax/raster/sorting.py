@@ -74,7 +74,7 @@ def argsort_float(values: Array, rest: Array | None = None) -> Array:
 
 
 def split_float(values: Array) -> tuple[Array, Array]:
-    """float64 ``values``, 0 to 2¹²⁷ or +inf, as float32, and what that lacks of them.
+    """float64 ``values`` ≥ 0 or +inf as float32, and what that lacks of them.
 
     Within ``jax.enable_x64(True)``.
 
@@ -84,11 +84,12 @@ def split_float(values: Array) -> tuple[Array, Array]:
       as the indices take beyond two: of a million values, to 2⁻³⁷ of each.
     """
     high = lax.convert_element_type(values, jnp.float32)
-    # 2^(127 - e) of a float whose exponent is e: that of e in its bits, mirrored.
+    # Of a float between 2^e and its double, 2^(1 - e): the exponent's bits, 1 to 254,
+    # mirrored.
     bits = lax.bitcast_convert_type(high, jnp.uint32)
-    mirrored = (np.uint32(254) - (bits >> np.uint32(23))) << np.uint32(23)
+    mirrored = (np.uint32(255) - (bits >> np.uint32(23))) << np.uint32(23)
     per_size = lax.bitcast_convert_type(mirrored, jnp.float32)
-    per_step = lax.convert_element_type(per_size, jnp.float64) * 2.0**23
+    per_step = lax.convert_element_type(per_size, jnp.float64) * 2.0**22
     left = (values - lax.convert_element_type(high, jnp.float64)) * per_step
     # Half a step at most; and nothing of infinities and zeros.
     usual = jnp.isfinite(high) & (high >= np.finfo(np.float32).tiny)

@@ -23,7 +23,7 @@ import numpy as np
 from gsjax.errors import InputError
 from gsjax.files import make_folder, opened, write_file
 from gsjax.io.npy import read_npy
-from gsjax.train.step import TrainState
+from gsjax.train.state import TrainState
 
 _KEEP = 2
 _FORMAT = 1

@@ -20,14 +20,8 @@ from gsjax.raster.types import RasterConfig
 from gsjax.train.config import TrainConfig
 from gsjax.train.footprint import step_estimate
 from gsjax.train.frames import Frames, draw
-from gsjax.train.step import (
-    Gradients,
-    Metrics,
-    Stages,
-    TrainState,
-    gradients_like,
-    make_stages,
-)
+from gsjax.train.state import Gradients, Metrics, TrainState, gradients_like
+from gsjax.train.step import Stages, make_stages
 
 Array = jax.Array
 

@@ -27,7 +27,7 @@ from gsjax.train.room import (
     with_slots_ahead,
 )
 from gsjax.train.start import extent_of, initial_state, with_dense
-from gsjax.train.step import Metrics, TrainState
+from gsjax.train.state import Metrics, TrainState
 from gsjax.train.unseen import without_unseen
 
 

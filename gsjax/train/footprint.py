@@ -19,7 +19,7 @@ from gsjax.scene.types import Scene
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
 from gsjax.train.room import slots_for
-from gsjax.train.step import TrainState
+from gsjax.train.state import TrainState
 
 # Compiling a step for two CPU devices, most of which stays with the process; and each
 # further size of the pictures.

@@ -13,7 +13,7 @@ import numpy as np
 from gsjax.errors import DivergedError, InputError
 from gsjax.scene.initialise import require_points
 from gsjax.scene.types import Photo, Scene
-from gsjax.train.step import Metrics
+from gsjax.train.state import Metrics
 
 _MAX_BAD_STEPS = 50
 _SAMPLED = 20_000

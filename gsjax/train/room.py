@@ -19,7 +19,7 @@ from gsjax.raster.render import count_demand
 from gsjax.raster.types import RasterConfig
 from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Frames
-from gsjax.train.step import TrainState
+from gsjax.train.state import TrainState
 
 # Slots grow before an edit may run short of them.
 _SLOT_MARGIN = 1.1

@@ -48,7 +48,7 @@ from gsjax.train.start import (
     with_dense,
     with_initial,
 )
-from gsjax.train.step import TrainState
+from gsjax.train.state import TrainState
 
 
 class RunResult(NamedTuple):

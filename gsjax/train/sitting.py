@@ -23,7 +23,7 @@ from gsjax.train.history import Journal
 from gsjax.train.refined import refined_photos, refined_scene, save_cameras
 from gsjax.train.report import Reporter
 from gsjax.train.start import extent_of
-from gsjax.train.step import TrainState
+from gsjax.train.state import TrainState
 
 
 class Start(NamedTuple):

@@ -14,7 +14,7 @@ from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
 from gsjax.train.health import check_points
 from gsjax.train.room import slots_for
-from gsjax.train.step import TrainState, init_state
+from gsjax.train.state import TrainState, init_state
 
 _LEAST_FOUND = 1000
 

@@ -14,7 +14,7 @@ from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig
 from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Frames
-from gsjax.train.step import TrainState
+from gsjax.train.state import TrainState
 from gsjax.train.tuning import tuned_camera
 
 Array = jax.Array

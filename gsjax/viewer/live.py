@@ -15,7 +15,7 @@ from gsjax.gaussians import Gaussians
 from gsjax.scene.types import Photo, Scene
 from gsjax.train.config import TrainConfig
 from gsjax.train.fit import Progress
-from gsjax.train.step import TrainState
+from gsjax.train.state import TrainState
 from gsjax.viewer.opening import exhibit_of_training
 from gsjax.viewer.stage import require_viser
 from gsjax.viewer.window import Window

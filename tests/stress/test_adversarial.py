@@ -44,7 +44,7 @@ from gsjax.train.health import Health, check_points
 from gsjax.train.held_out import evaluate_run
 from gsjax.train.history import read_metrics
 from gsjax.train.run import resume_run, start_run
-from gsjax.train.step import Metrics
+from gsjax.train.state import Metrics
 
 pytestmark = pytest.mark.usefixtures("float32", "shared_programs")
 
