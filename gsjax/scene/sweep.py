@@ -18,12 +18,14 @@ from gsjax.scene.photos import scaled_intrinsics, size_within
 # px, a side: small ones keep edges, large ones find what has little texture.
 _WINDOWS = (3, 7)
 _LEAST_DEPTHS, _MOST_DEPTHS = 16, 128
+_MARGIN = max(_WINDOWS) // 2
 # Variance of a window that is told from noise: of 1.5 of 255 grey levels.
 _LEAST_VARIANCE = (1.5 / 255) ** 2
 # From a pixel as OpenCV counts, from its centre, to ours, and back.
 _TO_OURS = np.asarray([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
 _TO_THEIRS = np.asarray([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 _OUTSIDE = -1e3  # grey level of what is not there
+_REACHES_OUT = -1.0  # the mean of a window is below, with one such pixel in it
 
 
 class Pinhole(NamedTuple):
@@ -144,22 +146,22 @@ def sweep(
     shift = max(warp.shift(1 / farthest, 1 / nearest) for warp in warps)
     count = int(np.clip(np.ceil(shift), _LEAST_DEPTHS, _MOST_DEPTHS))
     inverses = np.linspace(1 / farthest, 1 / nearest, count)
-    windows = [_Window(shot.grey, side) for side in _WINDOWS]
+    view = _View(shot.grey)
     counted = (len(warps) + 1) // 2
     scores = np.empty((count, height, width), np.float32)
+    best = np.empty((counted, height, width), np.float32)
+    less = np.empty((height, width), np.float32)
     for depth, inverse in enumerate(inverses):
-        best = np.full((counted, height, width), -len(windows), np.float32)
+        best.fill(-len(_WINDOWS))
         for warp in warps:
-            image = warp.image(inverse)
-            square = image * image
-            new = sum(window.likeness(image, square) for window in windows)
+            new = view.likeness(warp.image(inverse))
             for held in best:  # the best of them, then the next
-                less = np.minimum(held, new)
+                np.minimum(held, new, out=less)
                 np.maximum(held, new, out=held)
-                new = less
+                new, less = less, new
         np.sum(best, axis=0, out=scores[depth])
-    scores /= counted * len(windows)
-    return _chosen(scores, inverses, windows[-1].usable)
+    scores /= counted * len(_WINDOWS)
+    return _chosen(scores, inverses, view.usable)
 
 
 class _Warp:
@@ -208,37 +210,64 @@ class _Warp:
         if constant + min(0, by_x * width) + min(0, by_y * height) <= 0:
             across, down = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
             image[by_x * across + by_y * down + constant <= 0] = _OUTSIDE
+        image[image < 0] = _OUTSIDE  # partly, too
         return image
 
 
-class _Window:
-    """The windows of a view, to be held against those of others."""
+class _View:
+    """The windows of a view, of every size, to be held against those of others.
 
-    def __init__(self, grey: np.ndarray, side: int):
-        self.grey, self.side = grey, side
-        self.mean = _box(grey, side)
-        variance = _box(grey * grey, side) - self.mean * self.mean
-        self.usable = (variance > _LEAST_VARIANCE) & _inside(grey, side)
-        self.scale = 1 / np.sqrt(np.maximum(variance, _LEAST_VARIANCE))
+    Attributes:
+      usable: [H, W] where the largest has something to tell it from others by.
+    """
 
-    def likeness(self, other: np.ndarray, square: np.ndarray) -> np.ndarray:
-        """[H, W] ZNCC with an image, whose square is given too; −1 where it reaches
-        out of it."""
-        mean = _box(other, self.side)
-        variance = _box(square, self.side) - mean * mean
-        both = _box(other * self.grey, self.side) - mean * self.mean
-        score = both * self.scale / np.sqrt(np.maximum(variance, _LEAST_VARIANCE))
-        return np.where(_inside(other, self.side), score, np.float32(-1))
+    def __init__(self, grey: np.ndarray):
+        self._grey = _with_margin(grey)
+        # An image, its square and its product with the view, one above the other: to be
+        # filtered in one go.
+        self._moments = np.empty((3, *self._grey.shape), np.float32)
+        self._set(grey)
+        self._windows = []
+        for side in _WINDOWS:
+            mean, square, _ = self._means(side)
+            variance = square - mean * mean
+            scale = 1 / np.sqrt(np.maximum(variance, _LEAST_VARIANCE))
+            self._windows.append((side, mean, scale))
+            self.usable = (variance > _LEAST_VARIANCE) & (mean > _REACHES_OUT)
+
+    def likeness(self, other: np.ndarray) -> np.ndarray:
+        """[H, W] the sum over the windows of their ZNCC with those of an image, −1
+        where they reach out of it."""
+        self._set(other)
+        total = np.zeros(other.shape, np.float32)
+        for side, my_mean, my_scale in self._windows:
+            mean, square, score = self._means(side)
+            square -= mean * mean
+            score -= mean * my_mean
+            score *= my_scale
+            score /= np.sqrt(np.maximum(square, _LEAST_VARIANCE))
+            score[mean < _REACHES_OUT] = -1
+            total += score
+        return total
+
+    def _set(self, other: np.ndarray) -> None:
+        image, square, product = self._moments
+        image[:] = _with_margin(other)
+        np.multiply(image, image, out=square)
+        np.multiply(image, self._grey, out=product)
+
+    def _means(self, side: int) -> np.ndarray:
+        """[3, H, W] the moments in windows of that side."""
+        tall = self._moments.reshape(-1, self._moments.shape[2])
+        window, border = (side, side), opencv().BORDER_REFLECT
+        means = opencv().boxFilter(tall, -1, window, borderType=border)
+        return means.reshape(self._moments.shape)[:, _MARGIN:-_MARGIN]
 
 
-def _box(image: np.ndarray, side: int) -> np.ndarray:
+def _with_margin(image: np.ndarray) -> np.ndarray:
+    """Above and below as much more as a window reaches out, mirrored."""
     cv2 = opencv()
-    return cv2.boxFilter(image, -1, (side, side), borderType=cv2.BORDER_REFLECT)
-
-
-def _inside(image: np.ndarray, side: int) -> np.ndarray:
-    """Where a window holds nothing that is not there."""
-    return opencv().erode(image, np.ones((side, side), np.uint8)) > -1e-3
+    return cv2.copyMakeBorder(image, _MARGIN, _MARGIN, 0, 0, cv2.BORDER_REFLECT)
 
 
 def _chosen(scores: np.ndarray, inverses: np.ndarray, usable: np.ndarray) -> DepthMap:
