@@ -81,6 +81,7 @@ def main() -> None:
         "capacity × 4, capacities left to default": (grown, gsjax.RasterConfig()),
         "base, capacities left to default": (base, gsjax.RasterConfig()),
         "95 % culled, config of base": (culled, fitted),
+        "95 % culled": (culled, gsjax.exact_config(culled, camera)),
         "behind 8 wide splats": (behind_few, gsjax.exact_config(behind_few, camera)),
         "behind 8, config of base": (behind_few, fitted),
         "behind 1024 splats": (behind_many, gsjax.exact_config(behind_many, camera)),

@@ -21,6 +21,7 @@ from typing import Annotated, Any
 
 from gsjax.console import one_line, warnings_as_lines
 from gsjax.errors import CapacityError, GsjaxError, InputError
+from gsjax.machine import restart_with_large_pages
 from gsjax.memory import unlimited
 
 _LONGEST = 2000  # characters of an error, whose remedy stands at its end
@@ -28,8 +29,11 @@ _EXHAUSTED = "RESOURCE_EXHAUSTED"  # as XLA tells it
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
-    argv = list(sys.argv[1:] if argv is None else argv)
+    """Run the command line, by default that of this process; returns the exit code."""
+    if argv is None:
+        restart_with_large_pages()
+        argv = sys.argv[1:]
+    argv = list(argv)
     debug = "--debug" in argv
     try:
         return _run(argv)

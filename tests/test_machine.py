@@ -1,11 +1,13 @@
-"""The cores that a process may use, by what Linux says of it."""
+"""The cores that a process may use, and the pages of its memory, by what Linux says."""
 
 import os
+import subprocess
+import sys
 
 import pytest
 from conftest import write_files
 
-from gsjax.machine import usable_cores
+from gsjax.machine import restart_with_large_pages, usable_cores
 
 
 @pytest.fixture(autouse=True)
@@ -60,3 +62,62 @@ def test_odd_files_limit_nothing(tmp_path, odd):
     (tmp_path / "sys/fs/cgroup/cpu.max").unlink()
     (tmp_path / "sys/fs/cgroup/cpu.max").mkdir()
     assert usable_cores(tmp_path) == 16
+
+
+PAGES = "sys/kernel/mm/transparent_hugepage/enabled"
+
+
+@pytest.mark.parametrize(
+    ("choice", "known", "wanted"),
+    [
+        ("always [madvise] never\n", None, "glibc.malloc.hugetlb=1"),
+        ("always [madvise] never\n", "a.b=2", "a.b=2:glibc.malloc.hugetlb=1"),
+        ("always [madvise] never\n", "glibc.malloc.hugetlb=0", None),
+        ("[always] madvise never\n", None, None),
+        ("always madvise [never]\n", None, None),
+        (None, None, None),
+    ],
+)
+def test_a_program_starts_anew_where_large_pages_must_be_asked_for(
+    choice, known, wanted, tmp_path, monkeypatch
+):
+    write_files(tmp_path, {PAGES: choice} if choice else {})
+    monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
+    if known is not None:
+        monkeypatch.setenv("GLIBC_TUNABLES", known)
+    monkeypatch.setattr(sys, "orig_argv", ["python", "-X", "utf8", "x.py", "a b"])
+    started = []
+    monkeypatch.setattr(os, "execve", lambda *all_: started.append(all_))
+    restart_with_large_pages(tmp_path)
+    if wanted is None:
+        assert not started
+        return
+    ((program, command, environment),) = started
+    assert program == sys.executable
+    assert command == [sys.executable, "-X", "utf8", "x.py", "a b"]
+    assert environment == {**os.environ, "GLIBC_TUNABLES": wanted}
+
+
+def test_a_program_that_starts_anew_is_the_same(tmp_path):
+    write_files(tmp_path, {PAGES: "always [madvise] never\n"})
+    program = (
+        "import os, pathlib, sys; from gsjax.machine import restart_with_large_pages;"
+        "print(os.getpid(), flush=True);"
+        "restart_with_large_pages(pathlib.Path(sys.argv[1]));"
+        "print(sys.argv[2:], os.environ['GLIBC_TUNABLES'], sys.stdin.read())"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path), "a b", ""]
+    environment = {k: v for k, v in os.environ.items() if k != "GLIBC_TUNABLES"}
+    told = subprocess.check_output(
+        command, env=environment, input="read once", text=True
+    )
+    first, second, rest = told.splitlines()
+    assert first == second  # one process
+    assert rest == "['a b', ''] glibc.malloc.hugetlb=1 read once"
+
+
+def test_one_that_cannot_start_anew_goes_on(tmp_path, monkeypatch):
+    write_files(tmp_path, {PAGES: "always [madvise] never\n"})
+    monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "none"))
+    restart_with_large_pages(tmp_path)

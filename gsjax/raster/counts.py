@@ -13,10 +13,6 @@ from gsjax.raster.types import Array
 COUNT_LIMIT = 2**30
 
 
-# Below this a sum takes less than its kernels, of which `jnp.cumsum` has fewest.
-_FEW = 4096
-
-
 def total_count(counts: Array) -> tuple[Array, Array]:
     """Sum of int32 counts, saturating: (total, whether it is below `COUNT_LIMIT`)."""
     safe = jnp.sum(counts.astype(jnp.float32)) < COUNT_LIMIT
@@ -24,23 +20,11 @@ def total_count(counts: Array) -> tuple[Array, Array]:
     return jnp.where(safe, total, 2**31 - 1), safe
 
 
-def running_total(counts: Array, levels: int = 3) -> Array:
-    """Inclusive sums [n] int32 of counts [n].
-
-    `jnp.cumsum` over neighbours added in pairs, ``levels`` times: on CPU a few times
-    faster than over the counts themselves, and quicker to compile than all levels of
-    `lax.associative_scan`.
-    """
-    size = counts.shape[0]
-    if levels == 0 or size < _FEW:
-        return jnp.cumsum(counts, dtype=jnp.int32)
-    counts = jnp.pad(counts.astype(jnp.int32), (0, size % 2))
-    first, second = counts[0::2], counts[1::2]
-    both = running_total(first + second, levels - 1)
-    before = jnp.pad(both, (1, 0))[:-1]
-    zero = jnp.int32(0)
-    spread = lax.pad(before + first, zero, [(0, 1, 1)])
-    return (spread + lax.pad(both, zero, [(1, 0, 1)]))[:size]
+def running_total(counts: Array) -> Array:
+    """Inclusive sums [n] int32 of counts [n]."""
+    if jax.default_backend() == "cpu":
+        return loops.running_total(counts.astype(jnp.int32))
+    return jnp.cumsum(counts, dtype=jnp.int32)
 
 
 def owners(ends: Array, room: int, start: Array | int = 0) -> Array:

@@ -8,6 +8,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from gsjax.cameras import Camera
@@ -220,6 +221,7 @@ def render_exact(
         is (see `gsjax.memory`).
       InputError: as `render`.
     """
+    config = _for_active(gaussians, config)
     while True:
         _check_memory(gaussians, camera, config)
         result = _render_jit(gaussians, camera, config, background, **kwargs)
@@ -268,6 +270,7 @@ def count_demand(
       CapacityError: as `render_exact`.
     """
     light = config.replace(outputs=("alpha",), absgrad=False, rungs=1)
+    light = _for_active(gaussians, light)
     while True:
         _check_memory(gaussians, camera, light)
         demand, overflowed = _demand_jit(gaussians, camera, light)
@@ -296,6 +299,15 @@ def _check_memory(gaussians: Gaussians, camera: Camera, config: RasterConfig) ->
         "render smaller images, or fewer Gaussians (export --min-opacity), or larger "
         "tiles (RasterConfig.tile_size)",
     )
+
+
+def _for_active(gaussians: Gaussians, config: RasterConfig) -> RasterConfig:
+    """``config``, where it leaves that open with room for the Gaussians there are: what
+    goes with the slots, most of it pairs, is not paid for those that are empty."""
+    room = capacity_bucket(int(np.sum(np.asarray(gaussians.active))))
+    if config.visible_capacity is not None or room >= gaussians.capacity:
+        return config
+    return config.replace(visible_capacity=room)
 
 
 def _fit(demand: Demand, max_capacity: int) -> dict[str, int]:

@@ -1,0 +1,53 @@
+"""Claim: tiles of 8 × 8 pixels are the fastest, though smaller ones evaluate less.
+
+``python benchmarks/tiles.py [RUN …]`` composites and renders the scenes of
+`compositor.py` with tiles of 4, 8 and 16 pixels a side, interleaved in one run, and
+counts what is evaluated (a Gaussian at a pixel) for each that changes the image. Of
+tiles of 2 it counts alone: their lists are what takes the time.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import gsjax
+
+gsjax.use_all_cores(queued=False)
+
+import compositor  # noqa: E402
+import measure  # noqa: E402
+import scenes  # noqa: E402
+
+TIMED, COUNTED = (4, 8, 16), (2, 4, 8, 16)
+SHOWN = ("composite", "composite v+g", "render", "render v+g")
+
+
+def main() -> None:
+    """Measure and save."""
+    rows = []
+    for case in scenes.real_cases(sys.argv[1:]):
+        functions, counts = {}, {}
+        for side in COUNTED:
+            config = gsjax.exact_config(
+                case.gaussians, case.camera, gsjax.RasterConfig(tile_size=side)
+            )
+            stages, _, evaluations, contributions = compositor.stages(case, config)
+            counts[side] = evaluations, contributions
+            if side in TIMED:
+                functions |= {f"{side} {name}": stages[name] for name in SHOWN}
+        ms = measure.interleaved(functions, 7)
+        for side, (evaluations, contributions) in counts.items():
+            rows.append(
+                {
+                    "scene": case.name,
+                    "tile": side,
+                    **{f"{name} ms": ms.get(f"{side} {name}") for name in SHOWN},
+                    "evaluations M": evaluations / 1e6,
+                    "per contribution": evaluations / contributions,
+                }
+            )
+    measure.save("tiles", rows, claim=__doc__)
+
+
+if __name__ == "__main__":
+    main()
