@@ -9,15 +9,14 @@ from __future__ import annotations
 import argparse
 import time
 
+import as_cli  # noqa: F401
+import jax
+import jax.numpy as jnp
+import measure
+import scenes
+from scaling import shifted
+
 import gsjax
-
-gsjax.use_all_cores(queued=False)
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import measure  # noqa: E402
-import scenes  # noqa: E402
-from scaling import shifted  # noqa: E402
 
 
 def main() -> None:

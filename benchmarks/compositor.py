@@ -14,30 +14,27 @@ from __future__ import annotations
 
 import sys
 
+import jax
+import jax.numpy as jnp
+import measure
+import numpy as np
+import scenes
+import yardstick
+from as_cli import QUEUED
+from jax import lax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
 import gsjax
-
-QUEUED = "--queued" in sys.argv
-gsjax.use_all_cores(queued=QUEUED)
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import measure  # noqa: E402
-import numpy as np  # noqa: E402
-import scenes  # noqa: E402
-import yardstick  # noqa: E402
-from jax import lax  # noqa: E402
-from jax.sharding import Mesh, NamedSharding, PartitionSpec  # noqa: E402
-
-from gsjax.raster import bins, schedules  # noqa: E402
-from gsjax.raster.alpha import alphas, pixel_centres  # noqa: E402
-from gsjax.raster.blend import (  # noqa: E402
+from gsjax.raster import bins, schedules
+from gsjax.raster.alpha import alphas, pixel_centres
+from gsjax.raster.blend import (
     running_product,
     splats_of,
     tables_of,
 )
-from gsjax.raster.composite import composite, corners, take_rows  # noqa: E402
-from gsjax.raster.order import depth_order  # noqa: E402
-from gsjax.raster.project import conics_of, project  # noqa: E402
+from gsjax.raster.composite import composite, corners, take_rows
+from gsjax.raster.order import depth_order
+from gsjax.raster.project import conics_of, project
 
 
 def stages(case: scenes.Case, config: gsjax.RasterConfig):

@@ -13,19 +13,14 @@ of depth by slot, in any setting.
 
 from __future__ import annotations
 
-import sys
+import jax
+import jax.numpy as jnp
+import measure
+import scenes
+from as_cli import QUEUED
 
 import gsjax
-
-QUEUED = "--queued" in sys.argv
-gsjax.use_all_cores(queued=QUEUED)
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import measure  # noqa: E402
-import scenes  # noqa: E402
-
-from gsjax.numerics import in_float64  # noqa: E402
+from gsjax.numerics import in_float64
 
 
 def functions(gaussians, camera, config=gsjax.RasterConfig()) -> dict:  # noqa: B008

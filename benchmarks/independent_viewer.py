@@ -22,16 +22,14 @@ import threading
 from pathlib import Path
 from typing import ClassVar
 
+import as_cli  # noqa: F401
+import cv2
+import measure
+import numpy as np
+
 import gsjax
-
-gsjax.use_all_cores(queued=False)
-
-import cv2  # noqa: E402
-import measure  # noqa: E402
-import numpy as np  # noqa: E402
-
-from gsjax.flights import path_entries  # noqa: E402
-from gsjax.train.folder import load_data, load_settings, run_files  # noqa: E402
+from gsjax.flights import path_entries
+from gsjax.train.folder import load_data, load_settings, run_files
 
 PACKAGES = ("@mkkellogg/gaussian-splats-3d@0.4.7", "three@0.167.1")
 PATIENCE = 300.0  # s: the browser draws without a GPU

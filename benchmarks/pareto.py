@@ -13,19 +13,17 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import as_cli  # noqa: F401
+import jax
+import measure
+import scenes
+
 import gsjax
-
-gsjax.use_all_cores(queued=False)
-
-import jax  # noqa: E402
-import measure  # noqa: E402
-import scenes  # noqa: E402
-
-from gsjax import files, images  # noqa: E402
-from gsjax.bench.pareto import front, pareto, points, stages  # noqa: E402
-from gsjax.bench.scenes import open_trial  # noqa: E402
-from gsjax.bench.sheet import front_picture, table  # noqa: E402
-from gsjax.scene.trials import TRIALS, Trial  # noqa: E402
+from gsjax import files, images
+from gsjax.bench.pareto import front, pareto, points, stages
+from gsjax.bench.scenes import open_trial
+from gsjax.bench.sheet import front_picture, table
+from gsjax.scene.trials import TRIALS, Trial
 
 REAL = {"guitar": scenes.guitar, "garden": scenes.garden}
 

@@ -12,15 +12,14 @@ import sys
 import time
 from pathlib import Path
 
+import as_cli  # noqa: F401
+import jax
+import jax.numpy as jnp
+import measure
+import numpy as np
+import scenes
+
 import gsjax
-
-gsjax.use_all_cores(queued=False)
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import measure  # noqa: E402
-import numpy as np  # noqa: E402
-import scenes  # noqa: E402
 
 SEEN, UNSEEN, TIMED = 12, 20, 3
 BUDGET = 1 / 255

@@ -27,12 +27,12 @@ SIZES = ((320, 180), (640, 360), (1280, 720), (1920, 1080))
 
 def point(count: int, width: int, height: int, room: int, cameras: int) -> dict:
     """One scene at one size, in this process, with ``room`` times the slots."""
-    import gsjax
-
-    gsjax.use_all_cores(queued=False)
+    import as_cli  # noqa: F401
     import jax
     import jax.numpy as jnp
     import scenes
+
+    import gsjax
 
     case = scenes.shell(count, width, height)
     gaussians = gsjax.grow(case.gaussians, room * case.gaussians.capacity)

@@ -8,17 +8,15 @@ front, and one of a thousand that overlap, which is also timed alone.
 
 from __future__ import annotations
 
+import as_cli  # noqa: F401
+import jax
+import jax.numpy as jnp
+import measure
+import numpy as np
+import scenes
+
 import gsjax
-
-gsjax.use_all_cores(queued=False)
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import measure  # noqa: E402
-import numpy as np  # noqa: E402
-import scenes  # noqa: E402
-
-from gsjax.cameras import camera_centre  # noqa: E402
+from gsjax.cameras import camera_centre
 
 
 def behind_camera(case: scenes.Case, share: float) -> gsjax.Gaussians:

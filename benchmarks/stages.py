@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import sys
 
+import as_cli  # noqa: F401
+import compositor
+import jax
+import measure
+import numpy as np
+import scenes
+
 import gsjax
-
-gsjax.use_all_cores(queued=False)
-
-import compositor  # noqa: E402
-import jax  # noqa: E402
-import measure  # noqa: E402
-import numpy as np  # noqa: E402
-import scenes  # noqa: E402
 
 
 def main() -> None:

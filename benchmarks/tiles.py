@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import sys
 
+import as_cli  # noqa: F401
+import compositor
+import measure
+import scenes
+
 import gsjax
-
-gsjax.use_all_cores(queued=False)
-
-import compositor  # noqa: E402
-import measure  # noqa: E402
-import scenes  # noqa: E402
 
 TIMED, COUNTED = (4, 8, 16), (2, 4, 8, 16)
 SHOWN = ("composite", "composite v+g", "render", "render v+g")

@@ -25,25 +25,23 @@ import tempfile
 import time
 from pathlib import Path
 
+import as_cli  # noqa: F401
+import jax
+import jax.numpy as jnp
+import measure
+import numpy as np
+
 import gsjax
-
-gsjax.use_all_cores(queued=False)
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import measure  # noqa: E402
-import numpy as np  # noqa: E402
-
-from gsjax.raster.render import count_demand  # noqa: E402
-from gsjax.scene.photos import load_photos  # noqa: E402
-from gsjax.train.config import Level, TrainConfig, preset  # noqa: E402
-from gsjax.train.fit import FitResult, fit, subset  # noqa: E402
-from gsjax.train.frames import draw, make_frames  # noqa: E402
-from gsjax.train.held_out import results_of  # noqa: E402
-from gsjax.train.room import pairs_for  # noqa: E402
-from gsjax.train.start import extent_of  # noqa: E402
-from gsjax.train.step import make_stages, make_train_step  # noqa: E402
-from gsjax.train.unseen import without_unseen  # noqa: E402
+from gsjax.raster.render import count_demand
+from gsjax.scene.photos import load_photos
+from gsjax.train.config import Level, TrainConfig, preset
+from gsjax.train.fit import FitResult, fit, subset
+from gsjax.train.frames import draw, make_frames
+from gsjax.train.held_out import results_of
+from gsjax.train.room import pairs_for
+from gsjax.train.start import extent_of
+from gsjax.train.step import make_stages, make_train_step
+from gsjax.train.unseen import without_unseen
 
 SHARES = (0.75, 0.5, 0.25)  # of the pixels that the mask leaves
 

@@ -12,26 +12,24 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import as_cli  # noqa: F401
+import jax
+import jax.numpy as jnp
+import measure
+
 import gsjax
-
-gsjax.use_all_cores(queued=False)
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import measure  # noqa: E402
-
-from gsjax.densify.types import apply_edit  # noqa: E402
-from gsjax.losses import photometric_spread  # noqa: E402
-from gsjax.raster.render import device_count  # noqa: E402
-from gsjax.scene.photos import load_photos  # noqa: E402
-from gsjax.train.checkpoint import load_latest, restore  # noqa: E402
-from gsjax.train.fit import subset  # noqa: E402
-from gsjax.train.folder import load_data, load_settings, run_files  # noqa: E402
-from gsjax.train.frames import draw, make_frames, views_of_step  # noqa: E402
-from gsjax.train.room import pairs_for  # noqa: E402
-from gsjax.train.start import empty_state, extent_of  # noqa: E402
-from gsjax.train.state import gradients_like  # noqa: E402
-from gsjax.train.step import _optimise, make_stages, targets  # noqa: E402
+from gsjax.densify.types import apply_edit
+from gsjax.losses import photometric_spread
+from gsjax.raster.render import device_count
+from gsjax.scene.photos import load_photos
+from gsjax.train.checkpoint import load_latest, restore
+from gsjax.train.fit import subset
+from gsjax.train.folder import load_data, load_settings, run_files
+from gsjax.train.frames import draw, make_frames, views_of_step
+from gsjax.train.room import pairs_for
+from gsjax.train.start import empty_state, extent_of
+from gsjax.train.state import gradients_like
+from gsjax.train.step import _optimise, make_stages, targets
 
 
 def parts(folder: Path) -> tuple[dict, dict]:

@@ -225,7 +225,7 @@ class _View:
         self._grey = _with_margin(grey)
         # An image, its square and its product with the view, one above the other: to be
         # filtered in one go.
-        self._moments = np.empty((3, *self._grey.shape), np.float32)
+        self._moments: np.ndarray = np.empty((3, *self._grey.shape), np.float32)
         self._set(grey)
         self._windows = []
         for side in _WINDOWS:
@@ -251,14 +251,14 @@ class _View:
         return total
 
     def _set(self, other: np.ndarray) -> None:
-        image, square, product = self._moments
-        image[:] = _with_margin(other)
-        np.multiply(image, image, out=square)
-        np.multiply(image, self._grey, out=product)
+        image = _with_margin(other)
+        self._moments[0] = image
+        np.multiply(image, image, out=self._moments[1])
+        np.multiply(image, self._grey, out=self._moments[2])
 
     def _means(self, side: int) -> np.ndarray:
         """[3, H, W] the moments in windows of that side."""
-        tall = self._moments.reshape(-1, self._moments.shape[2])
+        tall = self._moments.reshape(-1, self._grey.shape[1])
         window, border = (side, side), opencv().BORDER_REFLECT
         means = opencv().boxFilter(tall, -1, window, borderType=border)
         return means.reshape(self._moments.shape)[:, _MARGIN:-_MARGIN]
