@@ -18,6 +18,7 @@ from pictures import assert_same, images, largest_difference
 import gsjax
 from gsjax.errors import CapacityError
 from gsjax.raster.counts import total_count
+from gsjax.raster.render import _for_active
 
 
 @pytest.mark.new_emitters
@@ -90,6 +91,19 @@ def test_render_exact_regrows():
     assert_same(images(gaussians, camera, fitted), wanted)
     with pytest.raises(CapacityError, match="wants a pair capacity"):
         gsjax.render_exact(gaussians, camera, tiny, background, max_capacity=100)
+
+
+@pytest.mark.new_emitters
+def test_empty_slots_take_no_room():
+    gaussians, camera = cast(scene_of("random"), jnp.float32)
+    grown = gsjax.grow(gaussians, 4096)
+    open_ = COMPAT.replace(pair_capacity=None)
+    assert _for_active(grown, open_) == open_.replace(visible_capacity=1024)
+    assert _for_active(gaussians, open_) == open_
+    said = open_.replace(visible_capacity=4096)
+    assert _for_active(grown, said) == said
+    found = gsjax.render_exact(grown, camera, COMPAT, jnp.float32(BACKGROUND))
+    assert_same(found, images(gaussians, camera))
 
 
 def test_counts_past_32_bits_do_not_wrap():

@@ -209,7 +209,8 @@ def render_exact(
 ) -> Render:
     """`render`, jitted, its capacities regrown until nothing overflows.
 
-    For calls from the host; for use under jit, see `exact_config`.
+    For calls from the host; for use under jit, see `exact_config`. Capacities that are
+    left open go by the Gaussians that are active, and not by the slots.
 
     Args:
       gaussians, camera, config, background: as for `render`.
