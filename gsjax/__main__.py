@@ -2,6 +2,6 @@
 
 import sys
 
-from gsjax.cli import main
+from gsjax.cli import program
 
-sys.exit(main())
+sys.exit(program())

@@ -28,12 +28,15 @@ _LONGEST = 2000  # characters of an error, whose remedy stands at its end
 _EXHAUSTED = "RESOURCE_EXHAUSTED"  # as XLA tells it
 
 
+def program() -> int:
+    """`main` as a program of its own."""
+    restart_with_large_pages()
+    return main()
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line, by default that of this process; returns the exit code."""
-    if argv is None:
-        restart_with_large_pages()
-        argv = sys.argv[1:]
-    argv = list(argv)
+    """Run the command line; returns the exit code."""
+    argv = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in argv
     try:
         return _run(argv)
@@ -190,4 +193,4 @@ def _parse(argv: list[str]):
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(program())

@@ -89,6 +89,9 @@ def evaluate(
       CapacityError: as `render_exact`.
     """
     config = (config or RasterConfig()).replace(outputs=("rgb", "depth"))
+    # One program for all that a training measures, however many are active by then.
+    room = config.visible_capacity or gaussians.capacity
+    config = config.replace(visible_capacity=room)
     behind = np.asarray(background, np.float32)
     gaussians = on_all_devices(gaussians)
     for view, photo in zip(views, photos, strict=True):

@@ -58,12 +58,14 @@ def restart_with_large_pages(root: Path = ROOT) -> None:
     """Start this program anew, with its memory in pages of 2 MB, where it must ask.
 
     XLA takes the temporaries of a program anew at each call, those of a large picture
-    from the system, and that hands them out page by page: of the usual 4 kB, a fifth of
-    the time of a render goes there. Linux has larger ones, in most distributions for
-    who asks ("madvise"), and glibc (from 2.35) asks if GLIBC_TUNABLES says so when a
-    process starts. So call this first thing in a program. It returns where nothing is
-    to be gained, and in what it has started; ``GLIBC_TUNABLES=glibc.malloc.hugetlb=0``
-    in the environment keeps it from starting anything.
+    from the system, and that hands them out page by page, of the usual 4 kB slowly.
+    Linux has larger ones, in most distributions for who asks ("madvise"), and glibc
+    (from 2.35; others do not mind) asks if GLIBC_TUNABLES says so when a process
+    starts. So call this first thing in a program that lies in a file, or is a module;
+    what is typed, or read from stdin, could not be read again, and goes on as it is. So
+    does what has been started by this, and where there is nothing to ask for.
+    ``GLIBC_TUNABLES=glibc.malloc.hugetlb=0`` in the environment keeps it from starting
+    anything.
 
     Args:
       root: under which /sys lies.
@@ -72,6 +74,8 @@ def restart_with_large_pages(root: Path = ROOT) -> None:
     known = os.environ.get("GLIBC_TUNABLES", "")
     choice = text_of(root / "sys/kernel/mm/transparent_hugepage/enabled")
     if "[madvise]" not in choice or name in known or not sys.executable:
+        return
+    if sys.argv[0] in ("", "-") or "ipykernel" in sys.modules:  # typed, or from stdin
         return
     tunables = f"{known}:{name}=1".lstrip(":")
     command = [sys.executable, *sys.orig_argv[1:]]

@@ -221,7 +221,9 @@ def live(
         steps.append((step, float(metrics.psnr)))
         if step % every and len(steps) > 1:
             return
-        view = render_exact(state.gaussians, camera, fixed, behind)
+        # One program, however many Gaussians there are by now.
+        config = fixed.replace(visible_capacity=state.gaussians.capacity)
+        view = render_exact(state.gaussians, camera, config, behind)
         preview = _preview(view, photo, f"step {step}")
         title = f"PSNR, dB; {int(metrics.gaussians):,} Gaussians"
         size = (max(preview.shape[1], 400), 300)

@@ -20,7 +20,7 @@ from jax._src import compiler
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 # A commit always passes, or never; --hypothesis-profile=default searches anew.
-hypothesis.settings.register_profile("gate", derandomize=True)
+hypothesis.settings.register_profile("gate", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("gate")
 # Commands keep what they compile: for as long as these tests run, and not at home.
 _CACHE = tempfile.TemporaryDirectory(prefix="gsjax-tests-")

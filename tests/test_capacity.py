@@ -99,6 +99,8 @@ def test_empty_slots_take_no_room():
     grown = gsjax.grow(gaussians, 4096)
     open_ = COMPAT.replace(pair_capacity=None)
     assert _for_active(grown, open_) == open_.replace(visible_capacity=1024)
+    many = gsjax.grow(gaussians, 2**20)
+    assert _for_active(many, open_).visible_capacity == 1024
     assert _for_active(gaussians, open_) == open_
     said = open_.replace(visible_capacity=4096)
     assert _for_active(grown, said) == said

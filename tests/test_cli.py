@@ -363,10 +363,20 @@ def test_process_has_the_code_and_no_traceback(tmp_path):
     assert done.stderr.count("\n") == 1
 
 
+def test_only_a_program_of_its_own_starts_anew(monkeypatch):
+    done = []
+    monkeypatch.setattr(cli, "restart_with_large_pages", lambda: done.append("anew"))
+    monkeypatch.setattr(sys, "argv", ["gsjax", "--version"])
+    assert cli.main() == cli.main(["--version"]) == 0
+    assert not done
+    assert cli.program() == 0
+    assert done == ["anew"]
+
+
 PROGRAMS = {
     "package": ["-m", "gsjax"],
     "module": ["-m", "gsjax.cli"],
-    "script": ["-c", "import sys; from gsjax.cli import main; sys.exit(main())"],
+    "script": ["-c", "import sys; from gsjax.cli import program; sys.exit(program())"],
 }
 
 

@@ -389,3 +389,27 @@ def test_where_nothing_is_found_it_starts_as_without(monkeypatch):
     assert int(initial_state(some, config).gaussians.active.sum()) == 5
     monkeypatch.setattr(start_module, "_LEAST_FOUND", ALL)
     assert with_dense(bare, taken()[1], config) is bare
+
+
+def test_likeness_is_the_correlation_of_the_windows():
+    rng = np.random.default_rng(0)
+    grey, other = rng.random((2, 12, 9), np.float32)
+    other[11, 4] = sweep_module._OUTSIDE
+    wanted = np.zeros(grey.shape)
+    for side in sweep_module._WINDOWS:
+
+        def windows(image, side=side):
+            wide = np.pad(image.astype(np.float64), side // 2, mode="symmetric")
+            return np.lib.stride_tricks.sliding_window_view(wide, (side, side))
+
+        mine, theirs = windows(grey), windows(other)
+        axes, least = (2, 3), sweep_module._LEAST_VARIANCE
+        covariance = np.mean(mine * theirs, axes) - mine.mean(axes) * theirs.mean(axes)
+        variances = np.maximum([mine.var(axes), theirs.var(axes)], least)
+        score = covariance / np.sqrt(variances[0] * variances[1])
+        out = (theirs == sweep_module._OUTSIDE).any(axes)
+        assert out.any()
+        assert not out.all()
+        wanted += np.where(out, -1, score)
+    found = sweep_module._View(grey).likeness(other)
+    np.testing.assert_allclose(found, wanted, atol=1e-4)

@@ -86,6 +86,7 @@ def test_a_program_starts_anew_where_large_pages_must_be_asked_for(
     if known is not None:
         monkeypatch.setenv("GLIBC_TUNABLES", known)
     monkeypatch.setattr(sys, "orig_argv", ["python", "-X", "utf8", "x.py", "a b"])
+    monkeypatch.setattr(sys, "argv", ["x.py", "a b"])
     started = []
     monkeypatch.setattr(os, "execve", lambda *all_: started.append(all_))
     restart_with_large_pages(tmp_path)
@@ -96,8 +97,13 @@ def test_a_program_starts_anew_where_large_pages_must_be_asked_for(
     assert program == sys.executable
     assert command == [sys.executable, "-X", "utf8", "x.py", "a b"]
     assert environment == {**os.environ, "GLIBC_TUNABLES": wanted}
+    for typed in ("", "-"):
+        monkeypatch.setattr(sys, "argv", [typed])
+        restart_with_large_pages(tmp_path)
+    assert len(started) == 1
 
 
+@pytest.mark.skipif(os.name == "nt", reason="a process is not replaced there")
 def test_a_program_that_starts_anew_is_the_same(tmp_path):
     write_files(tmp_path, {PAGES: "always [madvise] never\n"})
     program = (
@@ -120,4 +126,5 @@ def test_one_that_cannot_start_anew_goes_on(tmp_path, monkeypatch):
     write_files(tmp_path, {PAGES: "always [madvise] never\n"})
     monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "none"))
+    monkeypatch.setattr(sys, "argv", ["x.py"])
     restart_with_large_pages(tmp_path)

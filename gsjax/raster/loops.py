@@ -3,8 +3,8 @@
 XLA's CPU backend makes one kernel of a `while` whose turn touches less than 1 kB (its
 `SmallWhileLoopHoistingPass`), arrays of any size among what it carries: a turn then
 takes a nanosecond or two, and some hundred times as long where it does not. So a turn
-holds arithmetic on numbers, slices and updates of one number, and no gather, scatter
-or sort; and what it reads of an array that it also writes, it carries over from the
+holds arithmetic on numbers, slices and updates of a few, and no gather, scatter or
+sort; and what it reads of an array that it also writes, it carries over from the
 turn before: else XLA copies that array in every turn. No derivative is taken here, and
 a batch goes one after another.
 

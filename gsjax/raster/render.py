@@ -32,6 +32,7 @@ from gsjax.raster.rasterise import rasterise
 from gsjax.raster.types import Array, Demand, RasterConfig, Render
 
 DEFAULT_CONFIG = RasterConfig()
+_LEAST_ROOM = 1024  # slots
 
 
 def render(
@@ -304,9 +305,15 @@ def _check_memory(gaussians: Gaussians, camera: Camera, config: RasterConfig) ->
 
 def _for_active(gaussians: Gaussians, config: RasterConfig) -> RasterConfig:
     """``config``, where it leaves that open with room for the Gaussians there are: what
-    goes with the slots, most of it pairs, is not paid for those that are empty."""
-    room = capacity_bucket(int(np.sum(np.asarray(gaussians.active))))
-    if config.visible_capacity is not None or room >= gaussians.capacity:
+    goes with the slots, most of it pairs, is not paid for those that are empty.
+
+    A half, a quarter, … of the slots: each that is used is a program of its own.
+    """
+    active = int(np.sum(np.asarray(gaussians.active)))
+    room = gaussians.capacity
+    while room > _LEAST_ROOM and -(-room // 2) >= active:
+        room = -(-room // 2)
+    if config.visible_capacity is not None or room == gaussians.capacity:
         return config
     return config.replace(visible_capacity=room)
 

@@ -54,13 +54,15 @@ def pairs_for(state: TrainState, frames: Frames, config: TrainConfig) -> int:
         tile = config.raster.tile_size
         tiles = np.prod([-(-side // tile) for side in frames.pixels.shape[1:3]])
         most = _PAIRS_OF_TILE * int(tiles)
+    # The same settings for each, and however many Gaussians there are: one program.
+    raster = config.raster.replace(visible_capacity=state.gaussians.capacity)
     cameras = jax.device_get(frames.camera)  # to take one of them compiles nothing
     for index in np.unique(probed.astype(int)):
         camera = jax.tree.map(lambda a, i=index: a[i], cameras)
         if scene is not None:
             wanted = expected_pairs(scene, camera, config.raster)
-        else:  # the same settings for each: one program
-            wanted = count_demand(state.gaussians, camera, config.raster).capacity
+        else:
+            wanted = count_demand(state.gaussians, camera, raster).capacity
         most = max(most, int(wanted))
     return roomy_pairs(most, state, config)
 
