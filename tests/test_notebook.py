@@ -308,11 +308,10 @@ def test_live_draws_in_one_place(displayed, monkeypatch):
         hook = live("camera", photo, every=3)
         for step in range(1, 8):
             metrics = SimpleNamespace(step=step, psnr=20.0 + step, gaussians=7)
-            hook(
-                SimpleNamespace(gaussians=f"scene {step}"),
-                SimpleNamespace(metrics=metrics),
-            )
-        assert [scene for scene, _, _ in calls] == ["scene 1", "scene 3", "scene 6"]
+            scene = SimpleNamespace(name=f"scene {step}", capacity=99)
+            hook(SimpleNamespace(gaussians=scene), SimpleNamespace(metrics=metrics))
+        assert [s.name for s, _, _ in calls] == ["scene 1", "scene 3", "scene 6"]
+        assert {config.visible_capacity for _, _, config in calls} == {99}
         assert {camera for _, camera, _ in calls} == {"camera"}
         assert {config.outputs for _, _, config in calls} == {("rgb", "depth")}
         assert len(first) == 1
