@@ -1,6 +1,6 @@
 """To import this sets a benchmark up as the command line is: memory in large pages, a
-device for each core, and calls that are waited for; with ``--queued``, calls that may
-pile up, as is the library's default.
+device for each core, and calls that are waited for; with ``--queued``, where a program
+takes it, calls that may pile up, as is the library's default.
 """
 
 import sys

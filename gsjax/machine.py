@@ -75,7 +75,8 @@ def restart_with_large_pages(root: Path = ROOT) -> None:
     choice = text_of(root / "sys/kernel/mm/transparent_hugepage/enabled")
     if "[madvise]" not in choice or name in known or not sys.executable:
         return
-    if sys.argv[0] in ("", "-") or "ipykernel" in sys.modules:  # typed, or from stdin
+    typed = len(sys.orig_argv) < 2 or sys.argv[0] in ("", "-")  # or read from stdin
+    if typed or "ipykernel" in sys.modules:
         return
     tunables = f"{known}:{name}=1".lstrip(":")
     command = [sys.executable, *sys.orig_argv[1:]]

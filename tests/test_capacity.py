@@ -1,5 +1,7 @@
 """Capacity is never silent: one too few is reported, exactly enough is exact."""
 
+from importlib import import_module
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -94,7 +96,7 @@ def test_render_exact_regrows():
 
 
 @pytest.mark.new_emitters
-def test_empty_slots_take_no_room():
+def test_empty_slots_take_no_room(monkeypatch):
     gaussians, camera = cast(scene_of("random"), jnp.float32)
     grown = gsjax.grow(gaussians, 4096)
     open_ = COMPAT.replace(pair_capacity=None)
@@ -104,8 +106,22 @@ def test_empty_slots_take_no_room():
     assert _for_active(gaussians, open_) == open_
     said = open_.replace(visible_capacity=4096)
     assert _for_active(grown, said) == said
+    taken = []
+
+    def recorded(call):
+        def one(gaussians, camera, config, *more):
+            taken.append(config.visible_capacity)
+            return call(gaussians, camera, config, *more)
+
+        return one
+
+    module = import_module("gsjax.raster.render")
+    for name in ("_render_jit", "_demand_jit"):
+        monkeypatch.setattr(module, name, recorded(getattr(module, name)))
     found = gsjax.render_exact(grown, camera, COMPAT, jnp.float32(BACKGROUND))
     assert_same(found, images(gaussians, camera))
+    assert gsjax.exact_config(grown, camera, COMPAT).visible_capacity == 1024
+    assert taken == [1024, 1024]
 
 
 def test_counts_past_32_bits_do_not_wrap():
