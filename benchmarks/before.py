@@ -68,7 +68,7 @@ def compared(scene: str, before: list[dict], now: list[dict]) -> list[dict]:
 def main(commit: str, dataset: Path, held_out: list[str]) -> None:
     """Measure and save."""
     options = ["-m", "gsjax.cli", "train", str(dataset.resolve())]
-    options += ["--preset", "fast", "--eval-every", "50"]
+    options += ["--preset", "fast", "--eval-every", "25"]
     if held_out:
         options += ["--test-images", *held_out]
     rows, curves = [], {}

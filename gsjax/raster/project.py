@@ -103,13 +103,13 @@ def project(
         quats=_columns(rows.quats),
         log_scales=_columns(rows.log_scales),
         logit_opacities=rows.logit_opacities,
-        colors=_columns(colour_rows.reshape(room, -1)),
+        colors=_blocks(colour_rows.reshape(room, -1), colour_rows.shape[-1]),
         shift=None if probe is None else _columns(probe[order]),
     )
 
     def some(size: int, components: _Components, camera, count) -> Projected:
         live = lax.iota(jnp.int32, size) < count
-        front = jax.tree.map(lambda a: a[:size], components)
+        front = jax.tree.map(lambda a: a[..., :size], components)
         out = _project_components(front, camera, config, live, features is None)
         if size == room:
             return out
@@ -156,7 +156,7 @@ def ellipses(
         quats=tuple(quats),
         log_scales=tuple(log_scales),
         logit_opacities=logits,
-        colors=(jnp.zeros_like(logits),),
+        colors=(jnp.zeros_like(logits)[None],),
         shift=None,
     )
     live = lax.iota(jnp.int32, slots.shape[0]) < count
@@ -165,21 +165,25 @@ def ellipses(
 
 
 def _columns(rows: Array) -> tuple[Array, ...]:
-    """The columns of [R, M], [R] each.
+    """The columns of [R, M], [R] each."""
+    return tuple(block[0] for block in _blocks(rows, 1))
+
+
+def _blocks(rows: Array, width: int) -> tuple[Array, ...]:
+    """The columns of [R, M], ``width`` at a time: [width, R] each.
 
     By `lax.split`, whose transpose puts M derivatives side by side. That of M slices is
     the sum of M arrays of zeros with one column each, which XLA's CPU backend (jax
     0.10.2) forms number by number: M² operations a row.
     """
-    parts = lax.split(rows.T, (1,) * rows.shape[1], axis=0)
-    return tuple(part[0] for part in parts)
+    return tuple(lax.split(rows.T, (width,) * (rows.shape[1] // width), axis=0))
 
 
 class _Components(NamedTuple):
     """Parameters of the ranks, [R] each: see `GaussianParams`.
 
     Attributes:
-      colors: 3 K coefficients, the channel running fastest, or C features.
+      colors: K coefficients [3, R] each, or features, [C, R].
       shift: of the projected mean, px, or None.
     """
 
@@ -214,8 +218,9 @@ def _project_components(
     and z put into one array in the same loop, they would cost as much as all the rest
     of a render. It is recomputed in the backward pass rather than kept.
     """
-    for value in rows.colors:
-        live &= jnp.abs(value) < COLOR_LIMIT
+    for values in rows.colors:
+        for value in values:
+            live &= jnp.abs(value) < COLOR_LIMIT
     quat, good = near_one(
         tuple(jnp.where(live, q, 1) for q in rows.quats), (1.0, 0.0, 0.0, 0.0)
     )
@@ -247,7 +252,8 @@ def _project_components(
     if harmonic:
         colors = _sh_colors(camera, means, rows.colors, live)
     else:
-        colors = jnp.stack([jnp.where(live, value, 0) for value in rows.colors])
+        (features,) = rows.colors
+        colors = jnp.where(live, features, 0)
     return Projected(
         u=u,
         v=v,
@@ -313,12 +319,13 @@ def _dilate(m1, m2, dilation: float):
 
 
 def _sh_colors(camera: Camera, means, coefficients, live: Array) -> Array:
-    """Colour [3, R] of 3 K coefficients seen from the camera; + 0.5, ≥ 0.
+    """Colour [3, R] of K coefficients [3, R] seen from the camera; + 0.5, ≥ 0.
 
-    Summed in plain sight: as a reduction of [K, 1, R] · [K, 3, R] over K, XLA's CPU
-    backend (jax 0.10.2, YNNPACK) gets it wrong from some 10⁴ Gaussians on.
+    The channels together: a third as many derivatives, each a kernel to compile. Over
+    K summed in plain sight: as a reduction of [K, 1, R] · [K, 3, R], XLA's CPU backend
+    (jax 0.10.2, YNNPACK) gets it wrong from some 10⁴ Gaussians on.
     """
-    degree = sh_lib.degree_of(len(coefficients) // 3)
+    degree = sh_lib.degree_of(len(coefficients))
     if degree == 0:
         basis = [sh_lib.C0]
     else:
@@ -326,12 +333,9 @@ def _sh_colors(camera: Camera, means, coefficients, live: Array) -> Array:
         offset = tuple(m - c for m, c in zip(means, centre))
         direction, _ = safe_normalize(offset, (0.0, 0.0, 1.0))
         basis = sh_lib.sh_basis(degree, *direction)
-    colors = []
-    for channel in range(3):
-        mine = [jnp.where(live, c, 0) for c in coefficients[channel::3]]
-        raw = sum(value * c for value, c in zip(basis, mine)) + 0.5
-        colors.append(jnp.where(raw > 0, raw, 0))
-    return jnp.stack(colors)
+    raw = sum(value * jnp.where(live, c, 0) for value, c in zip(basis, coefficients))
+    raw = raw + 0.5
+    return jnp.where(raw > 0, raw, 0)
 
 
 def conics_of(projected: Projected) -> Array:
