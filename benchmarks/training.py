@@ -3,8 +3,9 @@
 ``python benchmarks/training.py DATASET [IMAGE …]`` trains with `gsjax train --preset
 fast`, once for each strategy (or the one of ``--strategy``), with the named images held
 out (else every 8th), in a process that has nothing compiled; with ``--steps N`` so many
-steps. Kept are PSNR and SSIM of the held-out views over seconds; compiling counts,
-measuring does not. What was kept of other runs of that dataset stays.
+steps, ``--max-gaussians N`` no more Gaussians, ``--preset NAME`` another preset. Kept
+are PSNR and SSIM of the held-out views over seconds; compiling counts, measuring does
+not. What was kept of other runs of that dataset stays.
 """
 
 from __future__ import annotations
@@ -24,16 +25,15 @@ from gsjax.train.history import read_metrics
 
 EVERY = 50
 STRATEGIES = ("mcmc", "adaptive")
+CHANGES = ("preset", "steps", "max-gaussians")
 
 
 def train(
-    dataset: Path, held_out: list[str], strategy: str, steps: int | None, run: Path
+    dataset: Path, held_out: list[str], strategy: str, other: list[str], run: Path
 ) -> None:
     """One run, from a cold start."""
     program = ["-m", "gsjax.cli", "train", str(dataset), "-o", str(run)]
-    options = ["--preset", "fast", "--strategy", strategy, "--eval-every", str(EVERY)]
-    if steps is not None:
-        options += ["--steps", str(steps)]
+    options = ["--strategy", strategy, "--eval-every", str(EVERY), *other]
     if held_out:
         options += ["--test-images", *held_out]
     measure.run_cold([*program, *options])
@@ -49,17 +49,19 @@ def kept(path: Path, held_out: list[str], new: list[str]) -> list[dict]:
 
 
 def main(
-    dataset: Path, held_out: list[str], strategies: list[str], steps: int | None
+    dataset: Path, held_out: list[str], strategies: list[str], changes: dict[str, str]
 ) -> None:
-    """Measure, save and draw."""
+    """Measure, save and draw; ``changes`` to the preset "fast", by their options."""
     path = measure.RESULTS / f"training_{dataset.name}.json"
-    more = "" if steps is None else f", {steps} steps"
+    more = "".join(f", {name} {value}" for name, value in changes.items())
+    changes = {"preset": "fast", **changes}
+    other = [text for name, value in changes.items() for text in (f"--{name}", value)]
     rows = kept(path, held_out, [strategy + more for strategy in strategies])
     machine = measure.machine()
     with tempfile.TemporaryDirectory() as folder:
         for strategy in strategies:
             run = Path(folder) / strategy
-            train(dataset, held_out, strategy, steps, run)
+            train(dataset, held_out, strategy, other, run)
             found = read_metrics(run_files(run).held_out)
             logged = read_metrics(run_files(run).metrics)[-1]
             last = {key: logged[key] for key in ("compilations", "compile_seconds")}
@@ -86,7 +88,9 @@ if __name__ == "__main__":
     parser.add_argument("dataset", type=Path)
     parser.add_argument("images", nargs="*")
     parser.add_argument("--strategy", action="append", choices=STRATEGIES)
-    parser.add_argument("--steps", type=int)
+    for option in CHANGES:
+        parser.add_argument(f"--{option}", dest=option)
     given = parser.parse_args()
     chosen = given.strategy or list(STRATEGIES)
-    main(given.dataset, given.images, chosen, given.steps)
+    changed = {name: getattr(given, name) for name in CHANGES if getattr(given, name)}
+    main(given.dataset, given.images, chosen, changed)
