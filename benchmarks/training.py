@@ -5,7 +5,8 @@ fast`, once for each strategy (or the one of ``--strategy``), with the named ima
 out (else every 8th), in a process that has nothing compiled; with ``--steps N`` so many
 steps, ``--max-gaussians N`` no more Gaussians, ``--preset NAME`` another preset. Kept
 are PSNR and SSIM of the held-out views over seconds; compiling counts, measuring does
-not. What was kept of other runs of that dataset stays.
+not. What was kept of other runs of that dataset stays. Drawn are PSNR over seconds,
+and that of the ends over Gaussians where runs differ in these alone.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import measure
-import numpy as np
 
 from gsjax import files, images
 from gsjax.curves import Series, curves
@@ -67,20 +68,51 @@ def main(
             last = {key: logged[key] for key in ("compilations", "compile_seconds")}
             rows += [{"strategy": strategy + more, **record} for record in found]
             rows[-1] |= {**last, "date": machine["date"]}
-    names = dict.fromkeys(row["strategy"] for row in rows)
-    series = []
-    for name in names:
-        found = [row for row in rows if row["strategy"] == name]
-        x, y = np.asarray([(r["seconds"], r["psnr"]) for r in found]).T
-        series.append(Series(name, x, y))
     measure.RESULTS.mkdir(exist_ok=True)
     content = {"machine": machine, "claim": __doc__, "held out": held_out}
     files.write_json(path, {**content, "rows": rows})
     title = f"{dataset.name}: PSNR of what was held out, dB"
-    picture = curves(series, title=title, x_label="seconds")
-    files.write_file(path.with_suffix(".png"), images.encode_png(picture))
+    draw(path.with_suffix(".png"), over_seconds(rows), title, "seconds")
+    sizes = path.with_name(f"{path.stem}_gaussians.png")
+    draw(sizes, over_gaussians(rows), f"{title}, at the end", "thousand Gaussians")
     for row in rows:
         print(row)
+
+
+def by(rows: list[dict], key: Callable[[dict], str]) -> dict[str, list[dict]]:
+    """Rows of a key together, in their order."""
+    found: dict[str, list[dict]] = {}
+    for row in rows:
+        found.setdefault(key(row), []).append(row)
+    return found
+
+
+def over_seconds(rows: list[dict]) -> list[Series]:
+    """A line a run."""
+    runs = by(rows, lambda row: row["strategy"])
+    return [line(name, run, "seconds", 1) for name, run in runs.items()]
+
+
+def over_gaussians(rows: list[dict]) -> list[Series]:
+    """A line for runs that differ in their most Gaussians alone: the ends of each."""
+    ends = [run[-1] for run in by(rows, lambda row: row["strategy"]).values()]
+    alike = by(ends, lambda row: row["strategy"].split(", max-gaussians")[0])
+    several = {name: found for name, found in alike.items() if len(found) > 1}
+    for found in several.values():
+        found.sort(key=lambda row: row["gaussians"])
+    return [line(name, found, "gaussians", 1e-3) for name, found in several.items()]
+
+
+def line(name: str, rows: list[dict], over: str, unit: float) -> Series:
+    """PSNR over one of what was kept."""
+    return Series(name, [unit * r[over] for r in rows], [r["psnr"] for r in rows])
+
+
+def draw(path: Path, series: list[Series], title: str, x_label: str) -> None:
+    """Write a picture of the lines, if there are any."""
+    if series:
+        picture = curves(series, title=title, x_label=x_label)
+        files.write_file(path, images.encode_png(picture))
 
 
 if __name__ == "__main__":
@@ -93,4 +125,6 @@ if __name__ == "__main__":
     given = parser.parse_args()
     chosen = given.strategy or list(STRATEGIES)
     changed = {name: getattr(given, name) for name in CHANGES if getattr(given, name)}
+    if changed.get("preset") == "fast":
+        del changed["preset"]
     main(given.dataset, given.images, chosen, changed)

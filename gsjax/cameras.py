@@ -18,7 +18,8 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from gsjax.errors import InputError
-from gsjax.numerics import as_floats, host_array, to_device
+from gsjax.numerics import real_floats, to_device
+from gsjax.settings import whole
 
 # What is nearer to the camera is not drawn, where nothing else is said; world units.
 NEAR = 0.01
@@ -156,9 +157,11 @@ def make_camera(
                 f"unknown camera model {model!r}; known: {sorted(CAMERA_MODELS)}"
             )
         model = CAMERA_MODELS[model]
-    _check_size(width, height)
-    numbers = map(host_array, (viewmat, K, near, far))
-    viewmat, K, near, far = map(as_floats, numbers)
+    if not isinstance(model, CameraModel):
+        raise InputError(f"model is {model!r}; a name or a CameraModel is wanted")
+    width, height = _whole_size(width, height)
+    named = {"viewmat": viewmat, "K": K, "near": near, "far": far}
+    viewmat, K, near, far = (real_floats(name, v) for name, v in named.items())
     if viewmat.ndim not in (2, 3) or viewmat.shape[-2:] != (4, 4):
         raise InputError(f"viewmat has shape {viewmat.shape}; [4, 4] or [B, 4, 4]")
     if not viewmat.size:
@@ -177,8 +180,8 @@ def make_camera(
         K=_spread(K, (*batch, 3, 3)),  # pyright: ignore
         near=_spread(near, batch),  # pyright: ignore
         far=_spread(far, batch),  # pyright: ignore
-        width=int(width),
-        height=int(height),
+        width=width,
+        height=height,
         model=model,
     )
     return to_device(camera)
@@ -189,11 +192,15 @@ def _spread(value: Array | np.ndarray, shape: tuple[int, ...]):
     return library.broadcast_to(value, shape)
 
 
-def _check_size(width, height) -> None:
-    if int(width) != width or int(height) != height or min(width, height) < 1:
-        raise InputError(
-            f"image size {width} × {height}: width and height must be whole and ≥ 1"
-        )
+def _whole_size(width, height) -> tuple[int, int]:
+    told = f"image size {width} × {height}: width and height must be whole and ≥ 1"
+    try:
+        size = whole("width", width), whole("height", height)
+    except InputError as error:
+        raise InputError(told) from error
+    if min(size) < 1:
+        raise InputError(told)
+    return size
 
 
 def _check_values(viewmat, K, near, far) -> None:
@@ -273,11 +280,10 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     Raises:
       InputError: if the size is not whole, or below 1.
     """
-    _check_size(width, height)
+    width, height = _whole_size(width, height)
     sx, sy = width / camera.width, height / camera.height
     scale = jnp.asarray([[sx, 1, sx], [1, sy, sy], [1, 1, 1]], camera.K.dtype)
-    size = {"width": int(width), "height": int(height)}
-    return replace(camera, K=camera.K * scale, **size)
+    return replace(camera, K=camera.K * scale, width=width, height=height)
 
 
 def stack_cameras(cameras: list[Camera]) -> Camera:

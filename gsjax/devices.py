@@ -23,8 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from gsjax.errors import InputError
 from gsjax.machine import usable_cores
 from gsjax.programs import drop_oldest, drop_torn
+from gsjax.settings import whole
 
 # Programs are a few hundred kB each; a folder of more than this loses its oldest.
 _MAX_KEPT_BYTES = 500_000_000
@@ -57,9 +59,11 @@ def use_all_cores(count: int | None = None, *, queued: bool = True) -> int:
 
     Raises:
       RuntimeError: if JAX has started already with another number of devices.
+      InputError: if ``count`` is not whole, or below 1.
     """
-    if count is None:
-        count = usable_cores()
+    count = usable_cores() if count is None else whole("count", count)
+    if count < 1:
+        raise InputError(f"count {count}: at least one device is wanted")
     keep_memory()
     threads = 2 * count if queued and count > 1 else None
     with _threads(threads):

@@ -86,15 +86,18 @@ def evaluate(
 
     Raises:
       ValueError: if there are more of one than of the other.
+      InputError: as `Photo.require`.
       CapacityError: as `render_exact`.
     """
-    config = (config or RasterConfig()).replace(outputs=("rgb", "depth"))
+    config = config or RasterConfig()
+    config = config.replace(outputs=("rgb", "depth"), absgrad=False)
     # One program for all that a training measures, however many are active by then.
     room = config.visible_capacity or gaussians.capacity
     config = config.replace(visible_capacity=room)
     behind = np.asarray(background, np.float32)
     gaussians = on_all_devices(gaussians)
     for view, photo in zip(views, photos, strict=True):
+        photo.require(view.name)
         height, width = photo.pixels.shape[:2]
         camera = make_camera(
             viewmat=view.viewmat, K=photo.K, width=width, height=height, near=view.near

@@ -15,7 +15,8 @@ from jax.core import Tracer
 
 from gsjax import sh as sh_lib
 from gsjax.errors import InputError
-from gsjax.numerics import as_floats, exp_log_scale, host_array, to_device
+from gsjax.numerics import exp_log_scale, real_floats, to_device
+from gsjax.settings import whole
 
 Array = jax.Array
 
@@ -90,7 +91,7 @@ def make_gaussians(
         "logit_opacities": logit_opacities,
         "sh": sh,
     }
-    arrays = {name: _as_float(name, value) for name, value in arrays.items()}
+    arrays = {name: real_floats(name, value) for name, value in arrays.items()}
     opacities = arrays["logit_opacities"]
     if opacities.ndim == 2 and opacities.shape[-1] == 1:
         arrays["logit_opacities"] = opacities[:, 0]
@@ -110,7 +111,7 @@ def make_gaussians(
                 "axis of means sets the number of Gaussians)"
             )
     sh_lib.degree_of(arrays["sh"].shape[1])
-    slots = max(count, 1) if capacity is None else capacity
+    slots = max(count, 1) if capacity is None else whole("capacity", capacity)
     if slots < max(count, 1):
         raise InputError(
             f"capacity {capacity} cannot hold {count} Gaussians; pass at least "
@@ -125,13 +126,6 @@ def make_gaussians(
     active = (jnp if traced else np).arange(slots) < count
     gaussians = Gaussians(params=GaussianParams(**padded), active=active)  # pyright: ignore
     return to_device(gaussians)
-
-
-def _as_float(name: str, value) -> Array | np.ndarray:
-    array = host_array(value)
-    if jnp.issubdtype(array.dtype, jnp.complexfloating):
-        raise InputError(f"{name} is complex; pass real numbers")
-    return as_floats(array)
 
 
 def _padded(array: Array | np.ndarray, extra: int, value) -> Array | np.ndarray:
@@ -152,10 +146,15 @@ def capacity_bucket(count: int, minimum: int = 1024) -> int:
     Args:
       count: what is to be held.
       minimum: the smallest bucket, itself a 2^k or 1.5 · 2^k.
+
+    Raises:
+      InputError: if ``minimum`` is none of them.
     """
-    size = minimum
+    size = whole("minimum", minimum)
+    if size < 1 or size // (size & -size) not in (1, 3):
+        raise InputError(f"minimum {minimum}: a bucket, 2^k or 1.5 · 2^k, is wanted")
     while size < count:
-        size = size * 3 // 2 if size & (size - 1) == 0 else size // 3 * 4
+        size = size // 3 * 4 if size & (size - 1) else max(2, size * 3 // 2)
     return size
 
 
@@ -183,7 +182,7 @@ def grow(gaussians: Gaussians, capacity: int) -> Gaussians:
     Raises:
       InputError: if ``capacity`` is below the present one (see `compact`).
     """
-    extra = capacity - gaussians.capacity
+    extra = whole("capacity", capacity) - gaussians.capacity
     if extra < 0:
         raise InputError(
             f"capacity {capacity} is below the present {gaussians.capacity}; use "
@@ -249,7 +248,7 @@ def compact(gaussians: Gaussians, capacity: int | None = None) -> Gaussians:
     Raises:
       InputError: if ``capacity`` is below 1, or outside jit if more are active.
     """
-    capacity = gaussians.capacity if capacity is None else capacity
+    capacity = whole("capacity", gaussians.capacity if capacity is None else capacity)
     if capacity < 1:
         raise InputError(f"capacity {capacity}: at least 1 slot is wanted")
     active = gaussians.active
@@ -274,6 +273,7 @@ def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     Raises:
       InputError: if there is no such degree.
     """
+    degree = whole("degree", degree)
     if not 0 <= degree <= sh_lib.MAX_DEGREE:
         raise InputError(f"SH degree {degree}: 0 to {sh_lib.MAX_DEGREE} is wanted")
     sh = gaussians.params.sh

@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.errors import InputError
+
 Array = jax.Array
 
 # Range of log scales that the projection can square in float32 without overflow
@@ -39,12 +41,17 @@ def host_array(value) -> Array | np.ndarray:
     return np.asarray(value)
 
 
-def as_floats(array: Array | np.ndarray) -> Array | np.ndarray:
-    """Of the type that JAX has for floats; in no memory of the caller's.
+def real_floats(name: str, value) -> Array | np.ndarray:
+    """An array of the type that JAX has for floats; in no memory of the caller's.
 
     What NumPy need not convert is JAX's then, which copies it once.
+
+    Raises:
+      InputError: if it is complex; ``name`` says what.
     """
-    dtype = jnp.result_type(float)
+    array, dtype = host_array(value), jnp.result_type(float)
+    if jnp.issubdtype(array.dtype, jnp.complexfloating):
+        raise InputError(f"{name} is complex; pass real numbers")
     if isinstance(array, np.ndarray) and array.dtype == dtype:
         return jnp.asarray(array)
     return array.astype(dtype)

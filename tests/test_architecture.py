@@ -18,7 +18,7 @@ from gsjax import RasterConfig
 PACKAGE = Path(gsjax.__file__).parent
 FLOORS = {
     0: (
-        *("errors", "files", "numerics", "rotations", "sh"),
+        *("errors", "files", "numerics", "rotations", "settings", "sh"),
         *("devices", "programs", "machine", "memory"),
     ),
     1: ("gaussians", "cameras", "distortion"),

@@ -65,6 +65,19 @@ def test_other_errors_of_gaussians():
         gsjax.grow(gsjax.make_gaussians(**GOOD), 3)
 
 
+@pytest.mark.parametrize("capacity", [100.5, "100", True])
+def test_capacities_are_whole(capacity):
+    gaussians = gsjax.make_gaussians(**GOOD)
+    for make in (
+        lambda: gsjax.make_gaussians(**GOOD, capacity=capacity),
+        lambda: gsjax.grow(gaussians, capacity),
+        lambda: gsjax.compact(gaussians, capacity),
+    ):
+        with pytest.raises(InputError, match=f"capacity = {capacity!r}"):
+            make()
+    assert gsjax.grow(gaussians, np.int64(100)).capacity == 100
+
+
 def test_opacities_may_be_a_column():
     column = {**GOOD, "logit_opacities": np.arange(4.0)[:, None]}
     flat = gsjax.make_gaussians(**column).params.logit_opacities
@@ -86,6 +99,12 @@ def put(matrix, place, value):
         ({"width": 0}, "width"),
         ({"height": -3}, "height"),
         ({"width": 8.5}, "width"),
+        ({"width": np.nan}, "width"),
+        ({"height": np.inf}, "height"),
+        ({"height": None}, "height"),
+        ({"model": 3}, "model is 3; a name or a CameraModel"),
+        ({"viewmat": 1j * EYE}, "viewmat is complex"),
+        ({"K": K + 0j}, "K is complex"),
         ({"model": "fisheye"}, "unknown camera model 'fisheye'"),
         ({"viewmat": np.eye(3)}, "viewmat"),
         ({"viewmat": np.zeros((2, 3, 4, 4))}, "viewmat"),
@@ -194,9 +213,52 @@ def test_settings(name, value):
         RasterConfig.accurate().replace(**{name: value})
 
 
+def test_gaussians_of_unequal_length():
+    """JAX would take the last row for every slot beyond it, in silence."""
+    gaussians, camera = scene_of("random")
+    for name, array in vars(gaussians.params).items():
+        for wrong in (array[:-1], array[:, None], array + 0j):
+            params = gaussians.params.replace(**{name: wrong})
+            with pytest.raises(InputError, match=name):
+                gsjax.render(gaussians.replace(params=params), camera, COMPAT)
+    for wrong in (gaussians.active[:-1], gaussians.active[None]):
+        with pytest.raises(InputError, match="wanted"):
+            gsjax.render(gaussians.replace(active=wrong), camera, COMPAT)
+    numbers = gaussians.replace(active=gaussians.active.astype(float))
+    with pytest.raises(InputError, match=r"active .* of float"):
+        gsjax.render(numbers, camera, COMPAT)
+    params = gaussians.params.replace(sh=gaussians.params.sh[:, :5])
+    with pytest.raises(InputError, match="5 spherical-harmonic"):
+        gsjax.render(gaussians.replace(params=params), camera, COMPAT)
+
+
+def test_cameras_put_together_by_hand():
+    gaussians, camera = scene_of("random")
+    both = gsjax.stack_cameras([camera, camera])
+    for name in ("viewmat", "K", "near", "far"):
+        mixed = gsjax.Camera(**{**vars(both), name: getattr(camera, name)})
+        with pytest.raises(InputError, match="see make_camera"):
+            gsjax.render(gaussians, mixed, COMPAT)
+        imaginary = getattr(camera, name) + 0j
+        with pytest.raises(InputError, match=f"{name} is complex"):
+            gsjax.render(
+                gaussians, gsjax.Camera(**{**vars(camera), name: imaginary}), COMPAT
+            )
+    twice = jax.tree.map(lambda a: a[None], both)
+    with pytest.raises(InputError, match="see make_camera"):
+        gsjax.render(gaussians, twice, COMPAT)
+
+
+def test_a_background_in_the_place_of_settings():
+    with pytest.raises(InputError, match="a RasterConfig is wanted, and the backgr"):
+        gsjax.render(*scene_of("random"), BACKGROUND)
+
+
 @pytest.mark.parametrize(
     ("named", "kwargs"),
     [
+        ("features is complex", {"features": jnp.zeros((COUNT, 3), complex)}),
+        ("background is complex", {"background": jnp.zeros(3, complex)}),
         ("features", {"features": jnp.zeros((COUNT + 1, 3))}),
         ("features", {"features": jnp.zeros(COUNT)}),
         ("features", {"features": [1, 2, 3]}),
@@ -263,6 +325,22 @@ def test_arrays_of_numpy(batched):
     wanted = jax.jit(lambda g, c: gsjax.render(g, c, COMPAT, **given).rgb)
     assert np.std(found) > 0.01
     np.testing.assert_allclose(found, wanted(gaussians, camera), atol=1e-5)
+
+
+def test_a_probe_of_another_precision():
+    """It follows the scene's, as the optimiser's zeros under x64 may not."""
+    gaussians, camera = cast(scene_of("random"), jnp.float32)
+    config = COMPAT.replace(absgrad=True)
+    zeros = np.zeros((COUNT, 2))
+    assert jnp.asarray(zeros).dtype == jnp.float64
+    out = jax.eval_shape(
+        lambda p, a: gsjax.render(
+            gaussians, camera, config, probe=p, abs_probe=a
+        ),
+        zeros,
+        zeros,
+    )  # fmt: skip
+    assert out.rgb.dtype == jnp.float32
 
 
 def spoilt(gaussians, value):

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import shlex
 import shutil
 from pathlib import Path
 from typing import NamedTuple
@@ -111,6 +112,13 @@ def test_a_hint_says_what_it_needs(monkeypatch):
     assert common.view_hint(Path("a/run")) == "gsjax view a/run"
 
 
+def test_a_hint_is_a_line_for_a_shell():
+    words = ["render", Path("my runs/it's"), "-o", Path("a;b/flight.webm")]
+    line = common.command_line(*words)
+    assert shlex.split(line) == ["gsjax", *map(str, words)]
+    assert common.command_line("info", Path("a/run")) == "gsjax info a/run"
+
+
 # --- render ---
 
 
@@ -166,7 +174,7 @@ def test_a_file_before_the_cameras_of_a_dataset(demo, tmp_path, capsys):
     assert len(names(tmp_path / "c")) == PHOTOS
     capsys.readouterr()
     assert cli.main([*of_file, "--path", "test", "-o", str(tmp_path / "d")]) == 2
-    assert "no such views" in error_of(capsys)
+    assert "names none; train has all of its views" in error_of(capsys)
 
 
 def test_a_file_before_the_cameras_of_a_dataset_without_photographs(
@@ -364,6 +372,12 @@ BAD = {
     "frames": (2, render("--path", "train", "--frames", "5", "-o", "o"), "--frames"),
     "no frames": (2, render("--frames", "0", "-o", "o"), "--frames 0"),
     "movie": (2, render("-o", "a.mp4"), ".webm are written"),
+    "picture": (2, render("-o", "o.png"), "a folder is wanted, for a PNG of each view"),
+    "no names": (
+        2,
+        lambda _d, _t: ["train", "a", "-o", "b", "--test-images"],
+        "--test-images wants the name of one view at least",
+    ),
     "two kinds": (2, render("-o", "a.gif", "--what", "rgb,depth"), "one of --what"),
     "arrays": (2, render("-o", "a.gif", "--npy"), "no --npy"),
     "rate": (2, render("-o", "o", "--fps", "5"), "--fps 5"),

@@ -335,3 +335,11 @@ def test_bad_splits():
         split_views(views_of(NAMES), every=-1)
     with pytest.raises(InputError, match=r"all 20 views are test views"):
         split_views(views_of(NAMES), every=1)
+    with pytest.raises(InputError, match=r"every = 2\.5: a whole number is wanted"):
+        split_views(views_of(NAMES), every=2.5)  # pyright: ignore
+    with pytest.raises(InputError, match="no views to split"):
+        split_views([])
+
+
+def test_one_name_is_not_its_letters():
+    assert split_views(views_of(NAMES), test_names=NAMES[5])[1] == [5]

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from gsjax import devices
+from gsjax import InputError, devices
 
 
 @pytest.fixture
@@ -85,6 +85,12 @@ for _ in range(500):
     x = step(x)
 assert jnp.isfinite(x).all()
 """
+
+
+@pytest.mark.parametrize("count", [0, -1, 1.5, "2"])
+def test_no_number_of_devices(count):
+    with pytest.raises(InputError, match="count"):
+        devices.use_all_cores(count)
 
 
 def test_calls_may_pile_up():

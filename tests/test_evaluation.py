@@ -1,5 +1,7 @@
 """Scores of held-out views: of what, over what, and their means."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,11 +9,12 @@ from captures import scene_of_views
 from conftest import LIGHT, assert_not_empty
 
 import gsjax
-from gsjax import RasterConfig
+from gsjax import InputError, RasterConfig
 from gsjax.evaluation import LPIPS_NOTE, ViewResult, evaluate, summarise
 from gsjax.metrics import psnr, ssim
 from gsjax.scene.initialise import init_gaussians
 from gsjax.scene.types import Photo
+from gsjax.train.health import check_photos
 
 CONFIG = RasterConfig(**LIGHT)
 BEHIND = (0.2, 0.6, 0.4)
@@ -110,6 +113,39 @@ def test_as_many_photographs_as_views(gaussians, scene, renders):
     photo = photo_of(scene.views[0], renders[0])
     with pytest.raises(ValueError, match="shorter"):
         list(evaluate(gaussians, scene.views, [photo], config=CONFIG))
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [
+        ("pixels", np.zeros((24, 32, 3), np.float32)),  # 0 to 1: learnt as black
+        ("pixels", np.zeros((24, 32, 4), np.uint8)),
+        ("pixels", np.zeros((24, 32), np.uint8)),
+        ("pixels", np.zeros((0, 32, 3), np.uint8)),
+        ("alpha", np.zeros((24, 31), np.uint8)),
+        ("alpha", np.zeros((24, 32))),
+        ("valid", np.zeros((24, 32), np.uint8)),
+        ("K", np.eye(4)),
+        ("K", None),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_photographs_of_another_kind(part, value, gaussians, scene):
+    view = scene.views[0]
+    photo = photo_of(view, np.zeros((24, 32, 3), np.uint8))._replace(**{part: value})
+    with pytest.raises(InputError, match=f"{view.name}: {part} of the photo"):
+        scored(gaussians, scene, [photo])
+    with pytest.raises(InputError, match=f"{view.name}: {part} of the photo"):
+        check_photos(replace(scene, views=scene.views[:1]), [photo])
+
+
+def test_the_settings_of_a_training_will_do(gaussians, scene, renders):
+    """With absolute gradients, which only a derivative has."""
+    photo = photo_of(scene.views[0], renders[0])
+    config = CONFIG.replace(absgrad=True)
+    (found,) = scored(gaussians, scene, [photo], config=config)
+    (wanted,) = scored(gaussians, scene, [photo])
+    assert (found.psnr, found.ssim) == (wanted.psnr, wanted.ssim)
 
 
 def test_summary_is_the_mean_of_the_views():

@@ -535,10 +535,16 @@ def test_zero_quaternion_is_culled():
             assert (grads[name][6] != 0).any(), name
 
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
-def test_alpha_of_exactly_one(dtype, report):
-    """Two Gaussians of opacity 1 centred on one pixel, with others around them."""
-    config = SMOOTH.replace(alpha_cap=1.0)
+@pytest.mark.parametrize(
+    ("dtype", "cap"),
+    [(jnp.float64, 1.0), (jnp.float32, 1.0), (jnp.float32, 1 - 1e-9)],
+)
+def test_alpha_of_exactly_one(dtype, cap, report):
+    """Two Gaussians of opacity 1 centred on one pixel, with others around them.
+
+    A cap that float32 has as 1 is one of 1 there.
+    """
+    config = SMOOTH.replace(alpha_cap=cap)
     point = base_point()
     point["viewmat"] = jnp.eye(4)
     point["K"] = jnp.asarray([[20.0, 0, 9.5], [0, 21.0, 6.5], [0, 0, 1]])

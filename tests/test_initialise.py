@@ -136,6 +136,25 @@ def test_random_ones_are_in_view():
     assert init_gaussians(scene, random_count=30, max_count=10).capacity == 10
 
 
+@pytest.mark.parametrize(
+    ("kwargs", "named"),
+    [
+        *(({"opacity": value}, "opacity") for value in (0.0, 1.0, np.nan)),
+        *(({"scale": value}, "scale") for value in (0.0, -1.0, np.inf, np.nan)),
+    ],
+    ids=str,
+)
+def test_out_of_range(kwargs, named):
+    with pytest.raises(InputError, match=named):
+        init_gaussians(scene_of_views(points=9), **kwargs)
+
+
+def test_a_colour_for_each_point():
+    scene = scene_of_views(points=9)
+    with pytest.raises(InputError, match="9 points and 8 colours"):
+        init_gaussians(replace(scene, colors=scene.colors[:8]))
+
+
 def test_no_points():
     with pytest.raises(InputError, match="no points to start from"):
         init_gaussians(scene_of_views(points=0))

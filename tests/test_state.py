@@ -88,6 +88,15 @@ def test_buckets_hold_and_are_few():
         assert gsjax.capacity_bucket(bucket) == bucket
 
 
+def test_buckets_from_one_on():
+    found = [gsjax.capacity_bucket(n, minimum=1) for n in (0, *range(1, 14), 17, 25)]
+    assert found == [1, 1, 2, 3, 4, 6, 6, 8, 8, 12, 12, 12, 12, 16, 24, 32]
+    assert gsjax.capacity_bucket(100, minimum=96) == 128
+    for minimum in (0, -4, 5, 7, 9, 1.5, "1"):
+        with pytest.raises(gsjax.InputError, match="minimum"):
+            gsjax.capacity_bucket(100, minimum)
+
+
 def project_directions(camera, directions):
     """Pixels, in units of the image, of camera directions [N, 3]."""
     u, v = camera.model.project_point(camera.K, tuple(directions.T))

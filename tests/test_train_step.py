@@ -111,6 +111,18 @@ def test_is_a_function():
     assert [int(m.gaussians) for m in first[1]] == [60, SLOTS, SLOTS]
 
 
+def test_all_that_is_visible_has_room():
+    """Metrics tell of pairs alone, so a room for what is visible is not used."""
+    state, batch = plain_state(), plain_batch()
+    few = PLAIN.raster.replace(visible_capacity=3)
+    wanted = jax.make_jaxpr(make_train_step(PLAIN, EXTENT))(state, batch)
+    for step in (
+        make_train_step(PLAIN, EXTENT, few),
+        make_train_step(PLAIN.replace(raster=few), EXTENT),
+    ):
+        assert str(jax.make_jaxpr(step)(state, batch)) == str(wanted)
+
+
 def test_stages_one_by_one_are_the_step():
     """As a run takes them, over two edits; none is due where nothing was learnt."""
     stages = make_stages(PLAIN, EXTENT)

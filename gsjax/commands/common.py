@@ -6,6 +6,7 @@ is heavy to import is imported there.
 
 import contextlib
 import re
+import shlex
 from dataclasses import dataclass
 from importlib.util import find_spec
 from inspect import get_annotations
@@ -98,7 +99,12 @@ def parse_budget(text: str) -> float:
 def view_hint(run: Path) -> str:
     """How to look at a run, and what that needs if it is not installed."""
     needs = "" if find_spec("viser") else "  (needs pip install 'gsjax[viewer]')"
-    return f"gsjax view {run}{needs}"
+    return command_line("view", run) + needs
+
+
+def command_line(*words: str | Path) -> str:
+    """A call of this program, as a shell takes it whatever the names of files are."""
+    return shlex.join(["gsjax", *map(str, words)])
 
 
 def start_jax() -> None:

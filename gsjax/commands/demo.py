@@ -9,6 +9,7 @@ from tyro.conf import arg
 from gsjax.commands.common import (
     Command,
     UsageError,
+    command_line,
     parse_size,
     start_jax,
     view_hint,
@@ -68,9 +69,11 @@ class DemoCommand(Command):
         )
         note("done; next, try")
         note(f"  {view_hint(files.run)}")
-        note(f"  gsjax info {files.run}")
-        note(f"  gsjax render {files.run} --path test -o {self.out / 'views'}")
-        note(f"  gsjax export {files.run} {self.out / 'scene.ply'} --min-opacity 0.01")
+        views, small = ("--path", "test", "-o", self.out / "views"), "--min-opacity"
+        ply = self.out / "scene.ply"
+        note(f"  {command_line('info', files.run)}")
+        note(f"  {command_line('render', files.run, *views)}")
+        note(f"  {command_line('export', files.run, ply, small, '0.01')}")
         note("and with photographs of your own")
         note("  gsjax sfm PHOTOS -o DATASET")
         note("  gsjax train DATASET -o RUN --preset fast")

@@ -18,6 +18,7 @@ from gsjax.commands.common import (
 from gsjax.console import note, say
 
 _OTHER_MOVIES = (".mp4", ".mov", ".m4v", ".avi", ".mkv")
+_PICTURES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(kw_only=True)
@@ -35,7 +36,7 @@ class RenderCommand(HeavyCommand):
     path: Literal["test", "train", "orbit", "spiral", "interpolate"] | None = None
     """Of a run: its held-out or its training views; once around what they look at; a
     spiral before it; or a flight through all of them. Default of a run: orbit, of a
-    dataset: train, which is all its views."""
+    dataset: train, which is all its views; test are those that it names so."""
     frames: int | None = None
     """Of orbit, spiral and interpolate; default 120."""
     fps: float | None = None
@@ -91,7 +92,8 @@ class RenderCommand(HeavyCommand):
             largest = settings.config.max_size
         elif self.cameras.is_dir():
             scene = load_dataset(self.cameras, poses_only=True)
-            data = Data(scene, train=list(range(len(scene.views))), test=[])
+            named = [i for i, view in enumerate(scene.views) if view.split == "test"]
+            data = Data(scene, train=list(range(len(scene.views))), test=named)
         if data is None:
             assert self.cameras is not None, "else it is a run's"
             entries, origin = load_near_transforms(self.cameras, size=size)
@@ -102,7 +104,9 @@ class RenderCommand(HeavyCommand):
             )
             origin = data.scene.origin
         if not entries:
-            raise UsageError(f"--path {path}: there are no such views")
+            of_run = "this run holds none out" if self.cameras is None else ""
+            none = of_run or f"{self.cameras} names none; train has all of its views"
+            raise UsageError(f"--path {path}: there are no such views: {none}")
         subject = open_subject(
             self.scene, origin=origin, preset=self.preset, background=background
         )
@@ -160,6 +164,11 @@ class RenderCommand(HeavyCommand):
         movie = suffix in MOVIE_SUFFIXES
         if suffix in _OTHER_MOVIES:
             raise UsageError(f"-o {self.out}: {', '.join(MOVIE_SUFFIXES)} are written")
+        if suffix in _PICTURES:
+            raise UsageError(
+                f"-o {self.out}: a folder is wanted, for a PNG of each view, or a "
+                f"movie ({', '.join(MOVIE_SUFFIXES)})"
+            )
         if movie and (len(kinds) > 1 or self.npy):
             raise UsageError(
                 f"-o {self.out}: a movie shows one of --what, and has no --npy; a "

@@ -6,7 +6,13 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.commands.common import HeavyCommand, UsageError, start_jax, view_hint
+from gsjax.commands.common import (
+    HeavyCommand,
+    UsageError,
+    command_line,
+    start_jax,
+    view_hint,
+)
 from gsjax.console import decibels, note, say
 
 # What does not change the run itself.
@@ -72,7 +78,7 @@ class TrainCommand(HeavyCommand):
     test_every: int | None = None
     """Hold out every so many-th view to measure with, 0 for none; default: the test
     views that the dataset names, or every 8th where it names none."""
-    test_images: tuple[str, ...] = ()
+    test_images: tuple[str, ...] | None = None
     """Hold out these views instead."""
     checkpoint_every: int | None = None
     """Steps between checkpoints, 0 only at the end; default: the preset's."""
@@ -84,13 +90,15 @@ class TrainCommand(HeavyCommand):
     """Where; the next free port if it is taken."""
     resume: bool = False
     """Go on where the run in RUN stopped, with the settings that it has; to the same
-    bits, with as many cores."""
+    bits, with as many cores. Where there is none yet, start one."""
     overwrite: bool = False
     """Replace a run that exists."""
 
     def run(self) -> int:
         if self.resume and self.overwrite:
             raise UsageError("--resume and --overwrite exclude each other")
+        if self.test_images is not None and not self.test_images:
+            raise UsageError("--test-images wants the name of one view at least")
         if self.test_images and self.test_every is not None:
             raise UsageError("--test-every and --test-images exclude each other")
         if not 1 <= self.viewer_port < 2**16:
@@ -133,6 +141,8 @@ class TrainCommand(HeavyCommand):
             dataset = self.dataset.resolve() if moved else None
             result = resume_run(self.out, dataset=dataset, watch=watch)
         else:
+            if self.resume:  # after a kill before there was anything, too
+                note(f"{self.out} is no run yet; one is started there")
             result = start_run(
                 self._settings(), self.out, overwrite=self.overwrite, watch=watch
             )
@@ -150,8 +160,9 @@ class TrainCommand(HeavyCommand):
         say(str(result.files.preview))
         note("next: look at it, fly through it, see how it went")
         note(f"  {view_hint(self.out)}")
-        note(f"  gsjax render {self.out} --path interpolate -o {self.out}/flight.webm")
-        note(f"  gsjax info {self.out}")
+        flight = ("--path", "interpolate", "-o", self.out / "flight.webm")
+        note(f"  {command_line('render', self.out, *flight)}")
+        note(f"  {command_line('info', self.out)}")
         return 0
 
     def _refuse_other(self, settings) -> None:
@@ -230,5 +241,5 @@ class TrainCommand(HeavyCommand):
             factor=self.factor,
             skip_missing=self.skip_missing,
             every=self.test_every,
-            test_images=self.test_images,
+            test_images=self.test_images or (),
         )

@@ -19,10 +19,10 @@ from gsjax.densify.penalties import mean_penalty
 from gsjax.densify.schedule import edits_between, grown, is_due
 from gsjax.densify.slots import assign, copy_into, where_slots
 from gsjax.densify.types import Densifier, Observation, SlotEdit
-from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.numerics import exp_log_scale, logit
 from gsjax.rotations import quaternion_to_matrix
+from gsjax.settings import require_ranges, settle
 
 Array = jax.Array
 
@@ -81,6 +81,7 @@ class AdaptiveSettings:
     initial_scale: float = 1.0
 
     def __post_init__(self):
+        settle(self)
         checks = {
             "start": self.start >= 0,
             "every": self.every >= 1,
@@ -93,12 +94,7 @@ class AdaptiveSettings:
             "scale_penalty": self.scale_penalty >= 0,
             "max_gaussians": self.max_gaussians >= 1,
         }
-        for name, good in checks.items():
-            if not good:
-                raise InputError(
-                    f"AdaptiveSettings.{name} = {getattr(self, name)!r} is out of "
-                    "range; see its documentation"
-                )
+        require_ranges(self, checks)
 
     def likely(self, count: int, since: int, until: int) -> int:
         """How many ``count`` Gaussians may be by step ``until``, from ``since`` on."""

@@ -20,10 +20,10 @@ from gsjax.densify.penalties import mean_penalty
 from gsjax.densify.schedule import edits_between, grown, is_due
 from gsjax.densify.slots import copy_into
 from gsjax.densify.types import Densifier, SlotEdit
-from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.numerics import exp_log_scale, logit
 from gsjax.rotations import covariance
+from gsjax.settings import require_ranges, settle
 
 Array = jax.Array
 
@@ -64,6 +64,7 @@ class McmcSettings:
     initial_scale: float = 0.1
 
     def __post_init__(self):
+        settle(self)
         checks = {
             "start": self.start >= 0,
             "every": self.every >= 1,
@@ -74,12 +75,7 @@ class McmcSettings:
             "opacity_penalty": self.opacity_penalty >= 0,
             "scale_penalty": self.scale_penalty >= 0,
         }
-        for name, good in checks.items():
-            if not good:
-                raise InputError(
-                    f"McmcSettings.{name} = {getattr(self, name)!r} is out of range; "
-                    "see its documentation"
-                )
+        require_ranges(self, checks)
 
     def likely(self, count: int, since: int, until: int) -> int:
         """How many ``count`` Gaussians will be by step ``until``, from ``since`` on."""

@@ -239,8 +239,9 @@ def blend_alphas(
     carried: Array, alpha: Array, parts: Parts, config: RasterConfig
 ) -> tuple[Array, dict[str, Array]]:
     """`blend_chunk` of Gaussians whose ``alpha`` [G, K, P] is known."""
-    # A cap of 1 needs the rule that does not divide.
-    product = transmittance if config.alpha_cap < 1 else running_product
+    # A cap of 1, as α has it, needs the rule that does not divide.
+    apart = np.asarray(config.alpha_cap, alpha.dtype) < 1
+    product = transmittance if apart else running_product
     total, before = product(alpha)
     reached = carried[:, None] * before
     behind = reached * (1 - alpha)

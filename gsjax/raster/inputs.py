@@ -1,11 +1,71 @@
-"""What a caller passes to `render` beside scene and camera: its shape checked, and with
-the leading axis of a batch. Each raises InputError if a shape does not fit.
+"""What a caller passes to `render`: its shape checked, and with the leading axis of a
+batch. Each raises InputError if a shape does not fit, or a number is complex.
 """
+
+import jax.numpy as jnp
 
 from gsjax.cameras import Camera
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
-from gsjax.raster.types import Array
+from gsjax.raster.types import Array, RasterConfig
+from gsjax.sh import degree_of
+
+
+def check_gaussians(gaussians: Gaussians) -> None:
+    """A row of every parameter for each slot: JAX takes the last for what is beyond."""
+    active, params = gaussians.active, gaussians.params
+    if active.ndim != 1 or active.dtype != bool:
+        raise InputError(
+            f"active has shape {active.shape} of {active.dtype}; (N,) of bool is "
+            "wanted: jax.vmap goes over several scenes"
+        )
+    slots = gaussians.capacity
+    if slots < 1:
+        raise InputError("there are no slots: at least one is wanted")
+    bases = params.sh.shape[1] if params.sh.ndim == 3 else "K"
+    wanted = {
+        "means": (slots, 3),
+        "quats": (slots, 4),
+        "log_scales": (slots, 3),
+        "logit_opacities": (slots,),
+        "sh": (slots, bases, 3),
+    }
+    for name, shape in wanted.items():
+        array = getattr(params, name)
+        if array.shape != shape:
+            raise InputError(
+                f"{name} has shape {array.shape}; {shape} is wanted, of {slots} slots"
+            )
+        check_real(name, array)
+    degree_of(params.sh.shape[1])
+
+
+def check_camera(camera: Camera) -> None:
+    batch = camera.viewmat.shape[:-2]
+    wanted = {"viewmat": (*batch, 4, 4), "K": (*batch, 3, 3), "near": batch}
+    for name, shape in {**wanted, "far": batch}.items():
+        array = getattr(camera, name)
+        if jnp.shape(array) != shape or len(batch) > 1:
+            raise InputError(
+                f"{name} of the camera has shape {jnp.shape(array)}; one camera, or a "
+                "batch with a leading axis on every array, is wanted: see make_camera"
+            )
+        check_real(name, array)
+    if 0 in batch:
+        raise InputError("there are no cameras: at least one is wanted")
+
+
+def check_config(config: RasterConfig) -> None:
+    if not isinstance(config, RasterConfig):
+        raise InputError(
+            f"config is of {type(config).__name__}; a RasterConfig is wanted, and the "
+            "background after it"
+        )
+
+
+def check_real(name: str, array) -> None:
+    if jnp.issubdtype(jnp.result_type(array), jnp.complexfloating):
+        raise InputError(f"{name} is complex; pass real numbers")
 
 
 def with_batch(name: str, probe, gaussians: Gaussians, camera: Camera):
@@ -48,3 +108,4 @@ def check_features(features, gaussians: Gaussians) -> None:
         raise InputError(
             f"features has shape {shape}; ({gaussians.capacity}, C) is wanted, C ≥ 1"
         )
+    check_real("features", features)

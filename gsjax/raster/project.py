@@ -232,7 +232,7 @@ def _project_components(
     x, y, z = jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1)
     u, v = camera.model.project_point(camera.K, (x, y, z))
     if rows.shift is not None:
-        u, v = u + rows.shift[0], v + rows.shift[1]
+        u, v = (a + b.astype(a.dtype) for a, b in zip((u, v), rows.shift))
     live &= (jnp.abs(u) < jnp.inf) & (jnp.abs(v) < jnp.inf)
 
     m1, m2 = _half_covariance(camera, (x, y, z), quat, scales)

@@ -20,7 +20,11 @@ from gsjax.raster import bins
 from gsjax.raster.counts import total_count
 from gsjax.raster.footprint import render_estimate as render_estimate
 from gsjax.raster.inputs import (
+    check_camera,
+    check_config,
     check_features,
+    check_gaussians,
+    check_real,
     checked_mask,
     checked_size,
     with_batch,
@@ -75,19 +79,20 @@ def render(
       ``demand.capacity`` is the `RasterConfig.pair_capacity` that would do.
 
     Raises:
-      InputError: if a shape does not fit, or there is no camera or no slot.
+      InputError: if a shape does not fit, a number is complex, or there is no camera
+        or no slot.
     """
+    check_config(config)
     # Tracers cannot index what is NumPy's.
     gaussians = jax.tree.map(jnp.asarray, gaussians)
     features, probe, abs_probe, mask, size = (
         None if value is None else jnp.asarray(value)
         for value in (features, probe, abs_probe, mask, size)
     )
+    check_camera(camera)
+    check_gaussians(gaussians)
     cameras = camera if camera.batched else jax.tree.map(lambda a: a[None], camera)
     count = cameras.viewmat.shape[0]
-    for name, there in (("cameras", count), ("slots", gaussians.capacity)):
-        if there < 1:
-            raise InputError(f"there are no {name}: at least one is wanted")
     probe = with_batch("probe", probe, gaussians, camera)
     abs_probe = with_batch("abs_probe", abs_probe, gaussians, camera)
     if (abs_probe is not None) != config.absgrad:
@@ -166,6 +171,7 @@ def _finish(
     if "rgb" in config.outputs:
         rgb = total[..., :colors]
         if background is not None:
+            check_real("background", background)
             background = jnp.asarray(background, rgb.dtype)
             if background.shape not in ((colors,), (cameras, colors)):
                 raise InputError(

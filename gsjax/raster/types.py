@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 
-from gsjax.errors import InputError
+from gsjax.settings import require_ranges, settle
 
 Array = jax.Array
 
@@ -27,7 +27,7 @@ class RasterConfig:
     Attributes:
       alpha_cut: a Gaussian is left out of a pixel where its α is below this; it
         also sets the extent, sqrt(2 ln(opacity / alpha_cut)) standard deviations.
-      alpha_cap: α is at most this; below 1.
+      alpha_cap: α is at most this; at most 1.
       stop: a pixel stops once its transmittance T has fallen to this.
       stop_rule: "before": a Gaussian that would bring T to ``stop`` is not blended
         (the field's rule); "after": it is blended, then the pixel stops.
@@ -82,6 +82,7 @@ class RasterConfig:
     devices: int | None = None
 
     def __post_init__(self):
+        settle(self)
         checks = {
             "alpha_cut": 0 < self.alpha_cut < 1,
             "alpha_cap": self.alpha_cut < self.alpha_cap <= 1,
@@ -101,12 +102,7 @@ class RasterConfig:
             "rungs": self.rungs >= 1,
             "devices": self.devices is None or self.devices >= 1,
         }
-        for name, good in checks.items():
-            if not good:
-                raise InputError(
-                    f"RasterConfig.{name} = {getattr(self, name)!r} is out of range; "
-                    "see its documentation"
-                )
+        require_ranges(self, checks)
 
     @classmethod
     def compat(cls, **changes) -> "RasterConfig":

@@ -74,7 +74,7 @@ def init_gaussians(
     Args:
       scene: its points are taken.
       sh_degree: colours are of degree 0, the rest is zero.
-      opacity: of each.
+      opacity: of each, above 0 and below 1.
       scale: times the root mean square distance to the three nearest neighbours.
       max_count: of more points than that, that many are drawn.
       random_count: that many, drawn evenly from the ball of the scene's extent around
@@ -84,14 +84,24 @@ def init_gaussians(
       seed: of what is drawn.
 
     Raises:
-      InputError: if the scene has no points and ``random_count`` is None.
+      InputError: if the scene has no points and ``random_count`` is None, or not a
+        colour for each, or ``opacity`` or ``scale`` is out of its range.
     """
+    if not 0 < opacity < 1:
+        raise InputError(f"opacity {opacity}: above 0 and below 1 is wanted")
+    if not 0 < scale < np.inf:
+        raise InputError(f"scale {scale}: a number above 0 is wanted")
     rng = np.random.default_rng(seed)
     if random_count is not None:
         points = points_in_ball(scene, random_count, rng)
         colors = rng.uniform(size=(random_count, 3))
     else:
         require_points(scene)
+        if len(scene.colors) != len(scene.points):
+            raise InputError(
+                f"{scene.source}: {len(scene.points)} points and {len(scene.colors)} "
+                "colours; one for each is wanted"
+            )
         finite = finite_points(scene)
         points, colors = scene.points[finite], scene.colors[finite] / 255.0
     if len(points) > max_count:

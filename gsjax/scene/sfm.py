@@ -33,10 +33,6 @@ from gsjax.scene.sfm_photos import (
 from gsjax.scene.video import sharpest_frames
 
 EXHAUSTIVE_UP_TO = 60  # photos: 1770 pairs, minutes on two cores
-_REMEDY = (
-    "photos that overlap by two thirds or more, sharp, of a scene with texture that "
-    "stays still, help; so may --matcher exhaustive, or a larger --max-size"
-)
 
 
 @dataclass(frozen=True)
@@ -104,7 +100,7 @@ class SfmReport:
             return None
         return (
             f"only {good} of {good + bad} images could be registered (they are in "
-            f"{self.output}); {_REMEDY}"
+            f"{self.output}); {_remedy(self.settings['matcher'])}"
         )
 
 
@@ -230,6 +226,15 @@ def _with_cameras(photographs: list[Photograph], choice: str) -> list[Photograph
     return changed
 
 
+def _remedy(matcher: str) -> str:
+    """What to do where cameras are not found, which were matched so."""
+    every = "" if matcher == "exhaustive" else "--matcher exhaustive, or "
+    return (
+        "photos that overlap by two thirds or more, sharp, of a scene with texture "
+        f"that stays still, help; so may {every}a larger --max-size"
+    )
+
+
 def _matcher(settings: SfmSettings, source: Path, count: int) -> str:
     if settings.matcher != "auto":
         return settings.matcher
@@ -271,7 +276,7 @@ def _solve(
     most, pairs = best_pair(database)
     raise SfmError(
         f"no cameras could be found for the {count} images; {pairs} pairs of them "
-        f"match, the best by {most} features; {_REMEDY}"
+        f"match, the best by {most} features; {_remedy(matcher)}"
     )
 
 

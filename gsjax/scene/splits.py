@@ -6,6 +6,7 @@ from pathlib import PurePosixPath
 
 from gsjax.errors import InputError
 from gsjax.scene.types import View
+from gsjax.settings import whole
 
 _EVERY = 8
 
@@ -23,16 +24,20 @@ def split_views(
       views: all views.
       every: distance of test views in the order of names; 0 for none. None leaves it
         to the dataset, else 8.
-      test_names: names of test views; the part behind the last "/" is enough where
-        no other view has it.
+      test_names: name, or names, of test views; the part behind the last "/" is enough
+        where no other view has it.
 
     Raises:
-      InputError: on an unknown or ambiguous name, a negative ``every``, or if no view
-        is left to train with.
+      InputError: on an unknown or ambiguous name, an ``every`` that is negative or not
+        whole, or if there is no view, or none is left to train with.
     """
+    if not views:
+        raise InputError("there are no views to split; at least one is wanted")
+    every = None if every is None else whole("every", every)
     if every is not None and every < 0:
         raise InputError(f"every {every}: 0 (no test views) or more is wanted")
     if test_names:
+        test_names = [test_names] if isinstance(test_names, str) else test_names
         test = {_index_of(views, name) for name in test_names}
     elif every is None and any(view.split == "test" for view in views):
         test = {index for index, view in enumerate(views) if view.split == "test"}

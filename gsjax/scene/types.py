@@ -125,3 +125,30 @@ class Photo(NamedTuple):
     alpha: np.ndarray | None
     valid: np.ndarray | None
     K: np.ndarray
+
+    def require(self, name: str) -> None:
+        """See that the arrays are as above: others would be learnt as noise.
+
+        Raises:
+          InputError: if one is not; ``name`` says of which view.
+        """
+        size = np.shape(self.pixels)[:2]
+        wanted = {
+            "pixels": (*size, 3) if len(size) == 2 else ("H", "W", 3),
+            "alpha": size,
+            "valid": size,
+            "K": (3, 3),
+        }
+        kinds = {"pixels": np.uint8, "alpha": np.uint8, "valid": np.bool_}
+        for part, shape in wanted.items():
+            value, kind = getattr(self, part), kinds.get(part)
+            if value is None and part in ("alpha", "valid"):
+                continue
+            array = np.asarray(value)
+            wrong = array.shape != shape or array.size == 0
+            if wrong or (kind is not None and array.dtype != kind):
+                told = f" of {np.dtype(kind).name}" if kind else ""
+                raise InputError(
+                    f"{name}: {part} of the photo has shape {array.shape} of "
+                    f"{array.dtype}; {shape}{told} is wanted"
+                )

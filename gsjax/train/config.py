@@ -1,5 +1,6 @@
 """Settings of a training run, and its presets."""
 
+import math
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -9,6 +10,7 @@ from gsjax.densify.types import Densifier
 from gsjax.errors import InputError
 from gsjax.optim import Rates
 from gsjax.raster.types import RasterConfig
+from gsjax.settings import number, require_ranges, settle
 
 STRATEGIES = ("adaptive", "mcmc")
 BACKGROUNDS = ("auto", "black", "white", "random")
@@ -22,10 +24,16 @@ class Level:
     Attributes:
       start: share of all steps, 0 to 1.
       divisor: of width and height.
+
+    Raises:
+      InputError: if one is no number.
     """
 
     start: float
     divisor: int
+
+    def __post_init__(self):
+        settle(self)
 
 
 @dataclass(frozen=True)
@@ -102,11 +110,16 @@ class TrainConfig:
     )
 
     def __post_init__(self):
+        settle(self)
+        if self.strategy not in STRATEGIES:  # which others depend on
+            require_ranges(self, {"strategy": False})
+        rates = _settled(self.rates)
+        object.__setattr__(self, "rates", rates)
+        first, last = rates.means
         checks = {
             "steps": 1 <= self.steps < 2**31 - 1,
             "seed": 0 <= self.seed < 2**31,
             "batch": self.batch >= 1,
-            "strategy": self.strategy in STRATEGIES,
             "max_size": self.max_size is None or self.max_size >= 8,
             "levels": bool(self.levels)
             and self.levels[0].start == 0
@@ -115,24 +128,23 @@ class TrainConfig:
             "sh_degree": 0 <= self.sh_degree <= 4,
             "sh_every": self.sh_every >= 1,
             "ssim_weight": 0 <= self.ssim_weight <= 1,
-            "rates' cooling": 0 < self.rates.cooling <= 1,
+            "rates' means": first == last >= 0 or min(first, last) > 0,
+            "rates": all(0 <= rate < math.inf for rate in (first, last, *rates[1:])),
+            "rates' cooling": 0 < rates.cooling <= 1,
+            "pose_rate": 0 <= self.pose_rate < math.inf,
+            "intrinsics_rate": 0 <= self.intrinsics_rate < math.inf,
+            "exposure_rate": 0 <= self.exposure_rate < math.inf,
             "background": self.background in BACKGROUNDS,
             "initial": self.initial in INITIALS,
             "initial_count": self.initial_count >= 1,
             "dense_count": self.dense_count >= 0,
-            "strategy's initial_opacity": 0 < self.chosen.initial_opacity < 1,
-            "strategy's initial_scale": self.chosen.initial_scale > 0,
+            f"{self.strategy}'s initial_opacity": 0 < self.chosen.initial_opacity < 1,
+            f"{self.strategy}'s initial_scale": self.chosen.initial_scale > 0,
             "max_initial": self.max_initial >= 1,
             "every_eval": self.every_eval >= 0,
             "every_checkpoint": self.every_checkpoint >= 0,
         }
-        for name, good in checks.items():
-            if not good:
-                found = getattr(self, name, self.chosen)
-                raise InputError(
-                    f"TrainConfig.{name} = {found!r} is out of range; see its "
-                    "documentation"
-                )
+        require_ranges(self, checks)
 
     def replace(self, **changes) -> "TrainConfig":
         """A copy with some settings changed."""
@@ -158,6 +170,19 @@ class TrainConfig:
         """How much smaller the images are at ``step`` (from 0)."""
         share = step / self.steps
         return next(lv.divisor for lv in reversed(self.levels) if share >= lv.start)
+
+
+def _settled(rates: Rates) -> Rates:
+    """Their numbers as Python's.
+
+    Raises:
+      InputError: if one is none.
+    """
+    first, last = rates.means
+    means = number("Rates.means", first), number("Rates.means", last)
+    rest = rates._asdict()
+    del rest["means"]
+    return Rates(means, **{k: number(f"Rates.{k}", v) for k, v in rest.items()})
 
 
 def scaled(config: TrainConfig, steps: int) -> TrainConfig:

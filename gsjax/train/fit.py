@@ -194,10 +194,7 @@ class _Run:
                         state = with_slots_ahead(state, config)
                     pair_capacity = pairs_for(state, frames, config)
                     self.compile_seconds += time.perf_counter() - begun
-                # No limit of what is visible: only the pairs are regrown.
-                raster = config.raster.replace(
-                    pair_capacity=pair_capacity, visible_capacity=None
-                )
+                raster = config.raster.replace(pair_capacity=pair_capacity)
                 program = self.program(state, frames, raster)
                 view = views_of_step(config.seed, step, config.batch, frames.count)
                 state, metrics = program(state, frames, view)

@@ -16,6 +16,7 @@ measured too.
 """
 
 import json
+import shlex
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -218,7 +219,8 @@ def _no_run(path: Path) -> str:
     if not path.is_dir():
         return "a file, where the folder of a run is wanted"
     if is_dataset(path):
-        return f"a dataset; train on it first (gsjax train {path} -o RUN)"
+        call = shlex.join(["gsjax", "train", str(path)])
+        return f"a dataset; train on it first ({call} -o RUN)"
     return "no run is here (config.json is missing)"
 
 

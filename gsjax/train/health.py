@@ -31,12 +31,15 @@ def check_photos(scene: Scene, photos: Sequence[Photo]) -> None:
     """Warn of photographs that are masked altogether.
 
     Raises:
-      InputError: if all are, or there is not one for each view.
+      InputError: if all are, or there is not one for each view, or one has pixels of
+        another kind than `Photo` says.
     """
     if len(photos) != len(scene.views) or not photos:
         raise InputError(
             f"{len(photos)} photos for {len(scene.views)} views; one for each is wanted"
         )
+    for view, photo in zip(scene.views, photos):
+        photo.require(view.name)
     masked = [v.name for v, photo in zip(scene.views, photos) if not is_seen(photo)]
     if len(masked) == len(photos):
         raise InputError(

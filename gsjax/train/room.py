@@ -30,7 +30,7 @@ _FEWEST_SLOTS = 1024
 # For pairs: of a scene that does not grow, and from less to more of one that does.
 _PAIR_MARGIN, _GROWING_MARGINS = 1.5, (2.5, 4.0)
 _PER_GROWTH = 1.2  # pairs grow with Gaussians, and views not probed may want more
-_WIDENING = 1.5  # and Gaussians begin narrow, half as wide as they are apart
+_WIDENING = 2.0  # and Gaussians begin narrow, half as wide as they are apart
 # A program takes as long to compile as so many empty pairs take in one view: 22 s at
 # 0.12 µs each, on two cores.
 _PAIRS_OF_PROGRAM = 1.8e8

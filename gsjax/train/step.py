@@ -60,7 +60,7 @@ def make_train_step(
       config: the settings.
       extent: of the scene, in its units.
       raster: how to render, with a `pair_capacity` that fits; default
-        ``config.raster``.
+        ``config.raster``. Its ``visible_capacity`` is not used.
 
     Returns:
       (`TrainState`, `Batch` of B views) → (`TrainState`, `Metrics`). Look at
@@ -85,8 +85,9 @@ def make_stages(
       config, extent, raster: as for `make_train_step`.
     """
     densifier = config.densifier(extent)
+    # Room for all that is visible: `Metrics` would not tell how many there are.
     raster = (raster or config.raster).replace(
-        outputs=("rgb",), absgrad=densifier.absgrad
+        outputs=("rgb",), absgrad=densifier.absgrad, visible_capacity=None
     )
 
     def objective(params, tuning, probe, state, batch: Batch, background):
