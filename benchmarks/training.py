@@ -111,7 +111,9 @@ def line(name: str, rows: list[dict], over: str, unit: float) -> Series:
 def draw(path: Path, series: list[Series], title: str, x_label: str) -> None:
     """Write a picture of the lines, if there are any."""
     if series:
-        picture = curves(series, title=title, x_label=x_label)
+        # The names of the lines stand beside the title.
+        size = (720 if len(series) < 4 else 1200, 420)
+        picture = curves(series, title=title, x_label=x_label, size=size)
         files.write_file(path, images.encode_png(picture))
 
 

@@ -17,7 +17,7 @@ from gsjax.gaussians import Gaussians
 from gsjax.movies import check_movie, write_movie
 from gsjax.scene import paths
 from gsjax.scene.image_files import natural_order, short_names
-from gsjax.scene.image_header import image_size
+from gsjax.scene.photos import size_within, stored_size
 from gsjax.scene.transforms import CameraEntry
 from gsjax.scene.types import Scene, View
 from gsjax.sheets import depth_colors
@@ -166,14 +166,7 @@ def _entry(
 def _as_trained(view: View, max_size: int | None) -> View:
     """The view at the size at which `load_photo` gives its photograph; where that is
     not there, at the size that the camera is for."""
-    width, height = view.width, view.height
-    if view.image.exists():
-        width, height = image_size(view.image)
-    longest = max(width, height)
-    if max_size is not None and longest > max_size:
-        width, height = (
-            max(1, round(side * (max_size / longest))) for side in (width, height)
-        )
+    width, height = size_within(*stored_size(view), max_size)
     K = view.K * ([width / view.width], [height / view.height], [1])
     return replace(view, K=K, width=width, height=height, lens=None)
 

@@ -85,6 +85,12 @@ def write_movie(
     return len(pictures)
 
 
+def played_rate(suffix: str, fps: float) -> float:
+    """Frames per second at which a movie of that suffix is played, if ``fps`` are
+    asked for: a GIF has no more than 50."""
+    return min(fps, 50.0) if suffix == ".gif" else fps
+
+
 def encode_animation(suffix: str, frames: Iterable[np.ndarray], fps: float) -> bytes:
     """An animation that loops for ever, of RGB uint8 frames of one size.
 
@@ -100,7 +106,7 @@ def encode_animation(suffix: str, frames: Iterable[np.ndarray], fps: float) -> b
     animation = cv2.Animation()
     animation.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
     # Rounded at the ends of frames, so that the whole takes as long as it should.
-    unit, rate = (10, min(fps, 50)) if suffix == ".gif" else (1, fps)
+    unit, rate = 10 if suffix == ".gif" else 1, played_rate(suffix, fps)
     ends = np.rint(np.arange(len(animation.frames) + 1) * 1000 / (rate * unit)) * unit
     animation.durations = np.diff(ends).astype(int).tolist()
     if suffix == ".gif":

@@ -80,9 +80,9 @@ print(f"{size:,} bytes, {size / gsjax.num_active(scene):.0f} a Gaussian")
 # %% [markdown]
 # ## What it consists of
 #
-# The picture that `gsjax info SCENE.ply --plot` draws. Two hills of opacity: the knot,
-# near 1, and the dust, near 0. The surfaces are of flat Gaussians, all 1 to 6.7; the
-# dust has any shape.
+# The picture that `gsjax info SCENE.ply --plot OUT.png` draws. Two hills of opacity:
+# the knot, near 1, and the dust, near 0. The surfaces are of flat Gaussians, all 1 to
+# 6.7; the dust has any shape.
 
 # %%
 Picture(histograms(scene, title="knot and dust"))
@@ -192,8 +192,8 @@ assert rows["SH degree 0"][0] < 0.75 * rows["plan"][0]
 # ## Around it
 #
 # The orbit as a movie within the notebook, in the colours of the settings above, and
-# the same for a file: `gsjax render SCENE.ply -o orbit.webm`, or from Python
-# `gsjax.movies.write_movie`.
+# the same for a file: `gsjax render SCENE.ply --cameras DATASET --path orbit -o
+# orbit.webm`, or from Python `gsjax.movies.write_movie`.
 
 # %%
 light = smaller["opacity > 0.05"]

@@ -449,6 +449,33 @@ def test_wild_values_stay_finite(dtype):
         assert (leaf[unseen] == 0).all()
 
 
+def test_at_the_lens_in_a_far_world():
+    """In front of the camera, but behind it as float32 adds up its depth."""
+    gaussians, camera = cast(scene_of("random"), jnp.float32)
+    viewmat = np.array(camera.viewmat)
+    centre = 3e5 * np.asarray([1.0, -0.7, 0.4])
+    rng = np.random.default_rng(0)
+    seen = np.stack(
+        [*(0.01 * rng.normal(size=(2, COUNT))), rng.uniform(0, 0.05, COUNT)]
+    )
+    means = (centre + seen.T @ viewmat[:3, :3]).astype(np.float32)
+    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+    row = viewmat[2]
+    true = means.astype(float) @ row[:3].astype(float) + float(row[3])
+    found = row[0] * means[:, 0] + row[1] * means[:, 1] + row[2] * means[:, 2] + row[3]
+    near = 1e-3
+    behind = (true > near) & (found <= 0)
+    assert behind.sum() > 5
+    params = gaussians.params.replace(means=jnp.asarray(means))
+    moved = {"viewmat": jnp.asarray(viewmat), "near": jnp.float32(near)}
+    camera = gsjax.Camera(**{**vars(camera), **moved})
+    out, grads = loss_and_gradients(gaussians.replace(params=params), camera)
+    assert (out.radii[behind] == 0).all()
+    assert (out.radii > 0).any()
+    for leaf in jax.tree.leaves(grads):
+        assert np.isfinite(leaf).all()
+
+
 def test_a_camera_that_is_not_finite_draws_nothing_under_jit():
     """Outside jit it cannot be made; under jit it cannot raise."""
     gaussians, camera = scene_of("random")

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import pytest
+from captures import to_opengl
 
 import gsjax
 from gsjax import cli
@@ -106,7 +107,7 @@ def test_demo(made, capsys):
 
 def test_a_hint_says_what_it_needs(monkeypatch):
     monkeypatch.setattr(common, "find_spec", lambda _: None)
-    needs = "gsjax view a/run  (needs pip install 'gsjax[viewer]')"
+    needs = "gsjax view a/run  # needs pip install 'gsjax[viewer]'"
     assert common.view_hint(Path("a/run")) == needs
     monkeypatch.setattr(common, "find_spec", lambda _: object())
     assert common.view_hint(Path("a/run")) == "gsjax view a/run"
@@ -191,6 +192,33 @@ def test_a_file_before_the_cameras_of_a_dataset_without_photographs(
     for name in names(tmp_path / "b"):
         first, second = (tmp_path / x / name for x in "ab")
         assert first.read_bytes() == second.read_bytes()
+    capsys.readouterr()
+
+
+@pytest.mark.long
+def test_the_test_views_of_a_dataset(demo, tmp_path, capsys):
+    """Those that it names so, which need not have photographs."""
+    dataset = tmp_path / "dataset"
+    dataset.mkdir()
+    lens = {"w": WIDTH, "h": HEIGHT, "fl_x": 60.0, "cx": WIDTH / 2, "cy": HEIGHT / 2}
+    for split, seen in (("train", "abc"), ("test", "de")):
+        frames = [
+            {
+                "file_path": f"{name}.png",
+                "transform_matrix": to_opengl(
+                    gsjax.look_at((3, ord(name) - 99, 1), (0, 0, 0))
+                ).tolist(),
+            }
+            for name in seen
+        ]
+        content = json.dumps({**lens, "frames": frames})
+        (dataset / f"transforms_{split}.json").write_text(content)
+    args = ["render", str(demo / "run" / "splat.ply"), "--preset", "compat"]
+    args += ["--cameras", str(dataset), "-o", str(tmp_path / "views"), "--path"]
+    assert cli.main([*args, "test"]) == 0
+    assert names(tmp_path / "views") == ["d.png", "e.png"]
+    assert cli.main([*args, "train", "--overwrite"]) == 0
+    assert names(tmp_path / "views") == [f"{name}.png" for name in "abcde"]
     capsys.readouterr()
 
 

@@ -71,6 +71,29 @@ def test_equal_to_pycolmap(synthetic, form):
     check_equal(read_colmap(synthetic / form), theirs)
 
 
+def test_a_mark_of_byte_order_is_no_text(synthetic, tmp_path):
+    """Some editors on Windows put one before UTF-8."""
+    shutil.copytree(synthetic / "txt", tmp_path / "txt")
+    for path in (tmp_path / "txt").glob("*.txt"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    check_equal(
+        read_colmap(tmp_path / "txt"), pycolmap.Reconstruction(synthetic / "txt")
+    )
+
+
+def test_a_larger_model_beside_the_first_is_told(tmp_path):
+    """COLMAP writes several where it could not join them, not the largest first."""
+    dataset(tmp_path, scene_of_views(count=3))
+    write_colmap(tmp_path / "sparse/1", scene_of_views(count=2))
+    damaged = tmp_path / "sparse/3"
+    damaged.mkdir()
+    (damaged / "images.bin").write_bytes(b"\xff" * 9)
+    assert len(load_dataset(tmp_path).views) == 3
+    write_colmap(tmp_path / "sparse/2", scene_of_views(count=5))
+    with pytest.warns(UserWarning, match=r"3 images are in this model, and 5 in .*2; "):
+        assert len(load_dataset(tmp_path).views) == 3
+
+
 def test_binary_goes_before_text(synthetic, tmp_path):
     for form in ("bin", "txt"):
         shutil.copytree(synthetic / form, tmp_path, dirs_exist_ok=True)

@@ -488,6 +488,40 @@ def test_pairs_are_estimated_before_the_first_step(initial):
     assert expected_pairs(start, aside, config.raster) < 0.2 * counted
 
 
+def test_a_view_of_nothing_wants_little_room():
+    """As one that is masked altogether, at a step that grows the slots."""
+    state = initial_state(scene(), CONFIG)
+    for step in (0, 1, CONFIG.chosen.stop):
+        at = state.replace(step=jnp.int32(step))
+        assert roomy_pairs(0, at, CONFIG) == roomy_pairs(1, at, CONFIG) > 0
+
+
+@pytest.mark.parametrize("strategy", ["adaptive", "mcmc"])
+@pytest.mark.parametrize("stop", [99, 100, 1000])
+def test_nothing_is_edited_behind_the_last_step(strategy, stop):
+    """What an edit makes, and what a reset takes away, is still to be learnt."""
+    edits = {"start": 0, "every": 10, "stop": stop}
+    config = TrainConfig(
+        steps=100,
+        strategy=strategy,
+        adaptive=AdaptiveSettings(**edits, reset_every=50),
+        mcmc=McmcSettings(**edits),
+    )
+    strategy = config.densifier(EXTENT)
+    due = [step for step in range(200) if strategy.due(jnp.int32(step))]
+    assert due == [*range(10, 100, 10)]
+    assert config.chosen.stop == 99
+    assert config.replace(steps=5000).chosen.stop == stop
+    if isinstance(config.chosen, AdaptiveSettings):  # nor reset, which edits follow
+        gaussians = rough_start(1, 64)
+        stats = strategy.init(gaussians)
+        reset = [
+            bool(strategy.plan(jax.random.key(0), step, gaussians, stats)[0][3])
+            for step in map(jnp.int32, (50, 80, 90))
+        ]
+        assert reset == [True, False, False]
+
+
 def test_more_pairs_than_can_be_addressed():
     state = initial_state(scene(), CONFIG)
     done = state.replace(step=jnp.int32(CONFIG.chosen.stop))

@@ -48,6 +48,14 @@ def test_known_poses(tmp_path):
     np.testing.assert_array_equal(scene.origin, 0)
 
 
+def test_what_is_hidden_is_no_photograph(tmp_path):
+    """macOS puts a file beside each one that it copies to a disk of another kind."""
+    dataset(tmp_path)
+    for index in range(4):
+        (tmp_path / "images" / f"._IMG_{9 - index}.JPG").write_bytes(b"\0\5\x16\7")
+    assert len(load_dataset(tmp_path).views) == 4
+
+
 def test_a_camera_at_rest(tmp_path):
     # Down, right, back = −y, x, z: OpenGL's camera at the origin, looking along −z.
     row = [0, 1, 0, 0, 24, -1, 0, 0, 0, 32, 0, 0, 1, 0, 40, 1, 2]

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from captures import scene_of_views
+from captures import save_photo, scene_of_views
 from conftest import LIGHT, camera_of, frustum_points, gaussians_at, write_files
 
 import gsjax
@@ -220,6 +220,25 @@ def test_the_estimate_of_a_run_is_what_runs_took(name, changes, measured, report
     found = run_estimate(replace(made, views=views), config, count, slots, begins=True)
     report(f"memory of {name}", abs(np.log(found.total / 1e6 / measured)), np.log(1.5))
     assert 1 / 1.5 < found.total / 1e6 / measured < 1.5
+
+
+def test_photographs_count_as_their_files_have_them(tmp_path):
+    """Whatever size their camera is for: copies made smaller, or larger originals."""
+    config = preset("default").replace(max_size=1600)
+    made = scene_of_views(2)
+
+    def bytes_of(width, height, camera):
+        path = save_photo(tmp_path / f"{width}.png", np.zeros((height, width, 3), "u1"))
+        views = [
+            replace(view, image=path, width=camera[0], height=camera[1])
+            for view in made.views
+        ]
+        scene = replace(made, views=tuple(views))
+        return run_estimate(scene, config, 1000, 1024).parts["of photographs"]
+
+    small, large = bytes_of(320, 240, (320, 240)), bytes_of(640, 480, (640, 480))
+    assert bytes_of(320, 240, (640, 480)) == small
+    assert bytes_of(640, 480, (320, 240)) == large == 4 * small
 
 
 def test_one_is_told_as_one(capsys):

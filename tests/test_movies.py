@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gsjax
-from gsjax.movies import encode_animation, write_movie
+from gsjax.movies import encode_animation, played_rate, write_movie
 
 
 def pictures(count=6, width=64, height=48):
@@ -65,6 +65,8 @@ def test_a_name_with_a_colon(tmp_path, monkeypatch):
 def test_a_gif_is_not_faster_than_browsers_show(tmp_path):
     write_movie(tmp_path / "a.gif", pictures(4), fps=200)
     assert animation_of(tmp_path / "a.gif")[1] == [20] * 4
+    assert played_rate(".gif", 200) == 1000 / 20
+    assert (played_rate(".gif", 24), played_rate(".webp", 200)) == (24, 200)
 
 
 @pytest.mark.parametrize(("width", "height"), [(64, 48), (65, 47), (33, 22), (1, 1)])

@@ -218,6 +218,65 @@ def test_splits_by_name(tmp_path):
     assert [view.split for view in views] == ["train", "train", "test"]
 
 
+@pytest.mark.parametrize("form", ["./{}", "{}", ".\\{}"])
+def test_splits_by_names_however_they_are_spelt(tmp_path, form):
+    frames = frames_of(scene_of_views(4), "./images/frame_{}.png")
+    names = [form.format(f"images/frame_{n}.png") for n in range(4)]
+    lists = {"train_filenames": names[:3], "test_filenames": names[3:]}
+    nerfstudio(tmp_path, frames=frames, **lists)
+    splits = [view.split for view in load_dataset(tmp_path).views]
+    assert splits == ["train"] * 3 + ["test"]
+
+
+def test_frames_in_no_list_and_in_two(tmp_path):
+    """As nerfstudio has it, nothing is learnt of the former; the latter are held out,
+    where nerfstudio would learn from them too."""
+    names = [f"images/frame_{n}.png" for n in range(4)]
+    nerfstudio(tmp_path, train_filenames=names[:2], test_filenames=names[3:])
+    with pytest.warns(UserWarning, match="1 of 4 frames are in none of its lists, im"):
+        views = load_dataset(tmp_path).views
+    assert [view.name for view in views] == [names[0], names[1], names[3]]
+    for other in ("test_filenames", "val_filenames"):
+        nerfstudio(tmp_path, **{"train_filenames": names, other: names[1:2]})
+        with pytest.warns(UserWarning, match=f"1 of 4 frames .* with, {names[1]} f"):
+            views = load_dataset(tmp_path).views
+        assert [view.split for view in views] == ["train", "test", "train", "train"]
+    # Without a list to train with, what is in none is trained with.
+    nerfstudio(tmp_path, test_filenames=names[:1])
+    views = load_dataset(tmp_path).views
+    assert [view.split for view in views] == ["test", None, None, None]
+
+
+def test_a_list_of_frames_that_are_not_there(tmp_path):
+    nerfstudio(tmp_path, test_filenames=["images/frame_0.png", "frame_1.png"])
+    with pytest.raises(InputError, match=r"1 of 2 names of test_filenames .*'frame_1"):
+        load_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("kept", ["images", "originals"])
+def test_sizes_that_are_not_given_are_those_of_the_originals(tmp_path, kept):
+    """What is in px is of them, where smaller copies are read."""
+    frames = frames_of(scene_of_views(2), "images/{}.png")
+    for index in range(2):
+        save_photo(tmp_path / f"images_2/{index}.png", np.zeros((12, 16, 3), np.uint8))
+        save_photo(tmp_path / f"{kept}/{index}.png")
+    pixels = {"fl_x": 40.0, "fl_y": 42.0, "cx": 15.5, "cy": 12.25}
+    put(tmp_path, frames, **pixels)
+    if kept == "originals":
+        with pytest.raises(InputError, match=r"smaller copy is not there; give w and"):
+            load_dataset(tmp_path, factor=2)
+        put(tmp_path, frames, camera_angle_x=2 * math.atan(0.4))
+        copies = load_dataset(tmp_path, factor=2).views[0]
+        assert (copies.width, copies.K[0, 0]) == (16, pytest.approx(20))
+        return
+    for more in ({"factor": 2}, {"images": "images_2"}):
+        view = load_dataset(tmp_path, **more).views[0]
+        assert (view.width, view.height) == SIZE
+        np.testing.assert_allclose(
+            load_photo(view).K, [[20, 0, 7.75], [0, 21, 6.125], [0, 0, 1]]
+        )
+
+
 def test_masks_and_smaller_copies(tmp_path):
     made = scene_of_views(2)
     frames = frames_of(made, "images/{}.png")
@@ -424,6 +483,10 @@ def test_point_clouds(tmp_path):
 
 def test_bad_point_clouds(tmp_path):
     path = tmp_path / "a.ply"
+    made = scene_of_views(points=9)
+    cloud(path, made.points, made.colors.astype(float), "float")
+    with pytest.raises(InputError, match=r"colours are floating-point, and up to 2"):
+        read_point_cloud(path)
     cloud(path, np.asarray([[0, 1, 2], [0, np.nan, 1]]), None)
     with pytest.raises(InputError, match=r"1 of 2 points have .*the first: \[1\]"):
         read_point_cloud(path)

@@ -3,6 +3,7 @@
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import (
@@ -81,6 +82,26 @@ def test_bit_equal_with_and_without(preset, layers, across):
         assert int(with_it.demand.pairs) < 0.6 * int(without.demand.pairs)
     if layers == 0:
         assert int(with_it.demand.pairs) == int(without.demand.pairs)
+
+
+@pytest.mark.parametrize("kind", ["colours", "features"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e33])
+def test_what_is_not_drawn_hides_nothing(kind, value):
+    """Opaque, wide and before all others, but with a colour that cannot be drawn."""
+    gaussians, camera, config = scene_behind(8), camera_of(), PRESETS["compat"]
+    features = np.ones((COUNT, 2))
+    if kind == "colours":
+        sh = gaussians.params.sh.at[:8, -1, 1].set(value)
+        gaussians = gaussians.replace(params=gaussians.params.replace(sh=sh))
+    else:
+        features[:8, 1] = value
+    given = jnp.asarray(features) if kind == "features" else None
+    whole, count = depth_order(gaussians, camera, config.replace(occlusion=False))
+    order, left = depth_order(gaussians, camera, config, given)
+    assert left == count
+    np.testing.assert_array_equal(order, whole)
+    good, _ = depth_order(scene_behind(8), camera, config, jnp.ones((COUNT, 2)))
+    assert (np.asarray(good) < COUNT).sum() < 0.9 * count
 
 
 @pytest.mark.parametrize("preset", PRESETS)

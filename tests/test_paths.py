@@ -142,6 +142,21 @@ def test_spiral_stays_among_the_cameras_and_looks_at_the_focus():
     assert closing < 1.5 * np.linalg.norm(np.diff(where, axis=0), axis=1).max()
 
 
+@pytest.mark.parametrize("elevation", [0.0, 0.5, 0.9])
+def test_a_spiral_of_cameras_all_around_is_before_the_first(elevation):
+    """They have no mean pose: it stays upright, and off what they look at."""
+    cameras = np.concatenate([ring(24, elevation), ring(16, elevation + 0.3)])
+    path = paths.spiral(cameras, FRAMES)
+    assert_rigid(path)
+    assert (-path[:, 1, :3] @ (0, 0, 1) > 0).all()
+    away = centres(path) - TARGET
+    assert (np.linalg.norm(away, axis=1) > 1.0).all()
+    assert (away @ (centres(cameras)[0] - TARGET) > 0).all()
+    seen = path[:, :3, :3] @ TARGET + path[:, :3, 3]
+    assert (np.abs(seen[:, :2] / seen[:, 2:]) < 0.3).all()
+    assert (seen[:, 2] > 0).all()
+
+
 @pytest.mark.parametrize("closed", [False, True])
 def test_interpolation_passes_through_the_cameras(closed):
     rng = np.random.default_rng(1)

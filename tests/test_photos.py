@@ -5,13 +5,16 @@ import os
 import struct
 import time
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Barrier
 
 import cv2
 import numpy as np
 import pytest
 from captures import save_photo
 
+import gsjax.scene.photos as photos_module
 from gsjax.errors import InputError
 from gsjax.scene.decode import telling_of_damage
 from gsjax.scene.image_header import MAX_PIXELS, check_image, image_size
@@ -320,6 +323,46 @@ def test_past_the_fold_nothing_is_valid(tmp_path):
     fold = np.sqrt(2 / 3)
     assert photo.valid[radius < fold - 1e-3].all()
     assert not photo.valid[radius > fold + 1e-3].any()
+
+
+def made_by(lens):
+    """Its maps, of one camera."""
+    return photos_module._maps(lens, np.eye(3), 9, 7)
+
+
+def test_maps_of_cameras_are_made_at_a_time_and_each_once(monkeypatch):
+    """A camera for each photograph, as COLMAP has it unless it is asked for one, is no
+    queue; and threads that want the same wait for one of them."""
+    lenses = [Lens("radial_tangential", (k, 0, 0, 0)) for k in (0.1, 0.2)]
+    both, made = Barrier(2, timeout=20), []
+
+    def maps(lens, *_):
+        both.wait()
+        made.append(lens)
+        return lens
+
+    monkeypatch.setattr(photos_module, "undistortion_maps", maps)
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda i: made_by(lenses[i % 2]), range(8)))
+    assert found == lenses * 4
+    assert sorted(made) == lenses
+
+
+def test_maps_that_failed_are_tried_again(monkeypatch):
+    lens = Lens("radial_tangential", (0.3, 0, 0, 0))
+    for error in (MemoryError, MemoryError, None):
+
+        def maps(*_, error=error):
+            if error is not None:
+                raise error
+            return "maps"
+
+        monkeypatch.setattr(photos_module, "undistortion_maps", maps)
+        if error is None:
+            assert made_by(lens) == "maps"
+        else:
+            with pytest.raises(error):
+                made_by(lens)
 
 
 def test_lens_of_a_smaller_copy(tmp_path):

@@ -222,6 +222,23 @@ def test_a_splat_that_is_not_drawn_does_not_come_back():
     assert reason(made, "capacity").why.startswith("19 slots in place of 20")
 
 
+def test_colours_too_far_apart_for_a_budget():
+    """Where to stop and the cap alone are beyond it: said, and by how much."""
+    scene = fog(20)
+    sh = scene.params.sh.at[5, 0].set(1e4)
+    bright = scene.replace(params=scene.params.replace(sh=sh))
+    with pytest.raises(InputError, match=r"colours span 2\.82e\+03"):
+        gsjax.plan(bright, looking(1, 0), budget=1e-3, config=CONFIG)
+
+
+@pytest.mark.usefixtures("as_fitting")
+def test_a_colour_that_counts_as_infinite_is_left_out():
+    scene = fog(20, opacity=(0.3, 0.9))
+    sh = scene.params.sh.at[3, 0].set(1e33)
+    scene = scene.replace(params=scene.params.replace(sh=sh))
+    assert planned(scene, looking(1, 0)).gaussians.capacity == 19
+
+
 @pytest.mark.usefixtures("as_fitting")
 def test_lens_and_outputs_are_those_asked_for():
     made = planned(fog(20, opacity=(0.3, 0.9)), looking(1, 0), outputs=("depth",))

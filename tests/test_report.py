@@ -1,11 +1,13 @@
 """What a run says of itself as it goes."""
 
+import math
+
 import jax.numpy as jnp
 import pytest
 
 from gsjax.train.config import Level, TrainConfig
 from gsjax.train.fit import Progress
-from gsjax.train.report import Reporter
+from gsjax.train.report import Reporter, _smoothed
 from gsjax.train.state import Metrics
 
 CONFIG = TrainConfig(steps=100, levels=(Level(0.0, 4), Level(0.5, 2), Level(0.8, 1)))
@@ -31,6 +33,16 @@ def test_the_time_left_knows_of_larger_pictures_and_of_compiling(monkeypatch, ca
     *_, before, last = capsys.readouterr().err.splitlines()
     assert "step 60/100: loss 0.0000, 0.00 dB, 0 Gaussians, 0.8 steps/s" in before
     assert last.endswith("3:20 gone, 0:00 left")
+
+
+def test_what_is_no_number_is_not_in_the_mean():
+    """The PSNR of a photograph that is masked altogether."""
+    mean = float("nan")
+    for value, wanted in ((float("inf"), None), (20.0, 20.0), (float("inf"), 20.0)):
+        mean = _smoothed(mean, value)
+        assert mean == wanted if wanted else math.isnan(mean)
+    assert 20 < _smoothed(mean, 30.0) < 30
+    assert _smoothed(mean, float("nan")) == mean
 
 
 def test_of_the_first_steps_nothing_is_foretold(monkeypatch, capsys):

@@ -41,7 +41,7 @@ from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Batch, draw, make_frames, views_of_step
 from gsjax.train.state import gradients_like, init_state
 from gsjax.train.step import background_of, make_stages, make_train_step, targets
-from gsjax.train.tuning import tuned_camera
+from gsjax.train.tuning import Tuning, exposed, tuned_camera
 
 SLOTS = 96
 PLAIN = TrainConfig(
@@ -490,6 +490,40 @@ def test_corrections_go_the_right_way(wrong, report):
     report(f"{wrong}, error left", after / before, 0.4)
     assert before > 0.4
     assert after < 0.4 * before
+
+
+def test_what_shows_through_a_photograph_has_no_exposure():
+    """It is ours, and the same behind the picture: where both are nothing, a random
+    background tells nothing of the exposure."""
+    config = PLAIN.replace(exposure=True, ssim_weight=0.0)
+    state = init_state(rough_start(2, SLOTS), config, EXTENT, VIEWS)
+    nothing = state.gaussians.replace(active=jnp.zeros(SLOTS, bool))
+    rng = np.random.default_rng(0)
+    exposures = 0.3 * jnp.asarray(rng.normal(size=(VIEWS, 3, 4)))
+    state = state.replace(
+        gaussians=nothing, tuning=replace(state.tuning, exposures=exposures)
+    )
+    batch = plain_batch()
+    empty = batch._replace(pixels=batch.pixels.at[..., 3].set(0))
+    differentiate = jax.jit(make_stages(config, EXTENT).differentiate)
+    found = differentiate(state, empty)
+    assert float(found.loss) < 1e-12
+    by = found.by_tuning.exposures
+    assert float(jnp.abs(by).max()) == 0
+    assert float(differentiate(state, batch).loss) > 0.01
+
+
+def test_exposures_of_what_is_half_there():
+    """An affine map of its colour, whatever share of it shows."""
+    rng = np.random.default_rng(0)
+    affine, colours = rng.normal(size=(2, 3, 4)), rng.uniform(size=(1, 5, 4, 3))
+    alphas = rng.uniform(size=(1, 5, 4))
+    tuning, index = Tuning(exposures=jnp.asarray(affine)), jnp.asarray([1])
+    found = exposed(jnp.asarray(colours * alphas[..., None]), tuning, index, alphas)
+    mapped = colours + colours @ affine[1, :, :3].T + affine[1, :, 3]
+    np.testing.assert_allclose(found, mapped * alphas[..., None], atol=1e-12)
+    whole = exposed(jnp.asarray(colours), tuning, index)
+    np.testing.assert_allclose(whole, mapped, atol=1e-12)
 
 
 def test_an_overflow_changes_nothing_and_says_so():

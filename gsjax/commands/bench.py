@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from gsjax.commands.common import (
-    Command,
+    HeavyCommand,
     UsageError,
     parse_budget,
     parse_size,
@@ -17,7 +17,7 @@ from gsjax.console import note, say
 
 
 @dataclass(kw_only=True)
-class BenchCommand(Command):
+class BenchCommand(HeavyCommand):
     """Measure run time against error: every knob of accuracy and size, one at a time.
 
     Minutes, most of them compiling: of the built-in knot on two cores five or so, of

@@ -98,7 +98,7 @@ def parse_budget(text: str) -> float:
 
 def view_hint(run: Path) -> str:
     """How to look at a run, and what that needs if it is not installed."""
-    needs = "" if find_spec("viser") else "  (needs pip install 'gsjax[viewer]')"
+    needs = "" if find_spec("viser") else "  # needs pip install 'gsjax[viewer]'"
     return command_line("view", run) + needs
 
 

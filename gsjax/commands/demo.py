@@ -7,7 +7,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from gsjax.commands.common import (
-    Command,
+    HeavyCommand,
     UsageError,
     command_line,
     parse_size,
@@ -18,7 +18,7 @@ from gsjax.console import decibels, note, say
 
 
 @dataclass(kw_only=True)
-class DemoCommand(Command):
+class DemoCommand(HeavyCommand):
     """Take photographs of a made-up still life, train a scene on them, and show it."""
 
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")] = Path("gsjax-demo")
@@ -50,7 +50,7 @@ class DemoCommand(Command):
         settings = DemoSettings(self.photos, width, height, self.steps, self.seed)
         files, result = run_demo(self.out, settings, overwrite=self.overwrite)
         if not result.finished:
-            again = f"gsjax train {files.dataset} -o {files.run} --resume"
+            again = command_line("train", files.dataset, "-o", files.run, "--resume")
             note(f"stopped after step {result.step}; go on with {again}")
             return 130
         summary = result.summary

@@ -6,12 +6,12 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.commands.common import Command, UsageError, start_jax
+from gsjax.commands.common import HeavyCommand, UsageError, start_jax
 from gsjax.console import say
 
 
 @dataclass(kw_only=True)
-class ExportCommand(Command):
+class ExportCommand(HeavyCommand):
     """Write a scene as a standard PLY, in the coordinates of its dataset."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]

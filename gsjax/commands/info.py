@@ -7,12 +7,12 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from gsjax.commands.common import Command, UsageError, start_jax
+from gsjax.commands.common import HeavyCommand, UsageError, start_jax
 from gsjax.console import say
 
 
 @dataclass(kw_only=True)
-class InfoCommand(Command):
+class InfoCommand(HeavyCommand):
     """Say what a scene consists of, and how a run went."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]

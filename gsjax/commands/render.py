@@ -73,6 +73,7 @@ class RenderCommand(HeavyCommand):
         path = self._path()
         start_jax()
         from gsjax.flights import path_entries, write_flight
+        from gsjax.movies import played_rate
         from gsjax.scene.dataset import load_dataset
         from gsjax.scene.transforms import load_near_transforms
         from gsjax.subjects import open_subject
@@ -117,6 +118,7 @@ class RenderCommand(HeavyCommand):
                 subject, entries, self.out, kind=kinds[0], fps=rate,
                 overwrite=self.overwrite,
             )  # fmt: skip
+            rate = played_rate(self.out.suffix.lower(), rate)
             note(f"{count} frames, a movie of {count / rate:.1f} s")
             say(str(self.out))
         else:

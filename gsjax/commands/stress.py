@@ -33,6 +33,8 @@ class StressCommand(Command):
                 [self.json], self.overwrite, "another name with --json"
             )
         if self.markdown is not None:
+            if self.only:
+                raise UsageError("--markdown and --only exclude each other")
             stress.around_marks(self.markdown)  # before minutes go by
         cases = [c for c in stress.chosen(self.full) if self.only in c.name]
         if not cases:

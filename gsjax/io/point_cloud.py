@@ -25,7 +25,7 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
 
     Raises:
       InputError: if the file cannot be read, is no PLY, is truncated, has no x y z,
-        or values that are not finite.
+        or values that are not finite, or floating-point colours beyond 1.
       CapacityError: if the memory would not hold it, before it is read.
     """
     path = Path(path)
@@ -49,7 +49,7 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
         points = np.empty((header.vertex.rows, 3))
         colors = np.full((header.vertex.rows, 3), _GREY, np.uint8)
         wild = np.zeros(header.vertex.rows, bool)
-        start = 0
+        start, brightest = 0, 0.0
         for size, columns in read_rows(file, header):
             rows = slice(start, start + size)
             for axis, name in enumerate("xyz"):
@@ -58,7 +58,9 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
             for axis, name in enumerate(names):
                 values = columns[name].astype(np.float64)
                 wild[rows] |= ~np.isfinite(values)
-                values = np.rint(np.nan_to_num(values) * (255 if unit else 1))
+                values = np.nan_to_num(values)
+                brightest = max(brightest, values.max(initial=0.0))
+                values = np.rint(values * (255 if unit else 1))
                 colors[rows, axis] = np.clip(values, 0, 255)
             start += size
     if wild.any():
@@ -66,5 +68,10 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
             f"{path}: {wild.sum()} of {len(points)} points have values that are no "
             f"finite numbers, the first: {np.flatnonzero(wild)[:5].tolist()}; remove "
             "them"
+        )
+    if unit and brightest > 1.01:
+        raise InputError(
+            f"{path}: colours are floating-point, and up to {brightest:g}; 0 to 1 is "
+            "wanted of such, or whole numbers of type uchar"
         )
     return points, colors

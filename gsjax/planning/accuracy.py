@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.cameras import Camera
+from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.planning import bounds
 from gsjax.planning.types import Reason
@@ -28,7 +29,11 @@ def within_budget(
     background: Sequence[float],
     budget: float,
 ) -> tuple[RasterConfig, list[Reason], float | None]:
-    """``config`` with the coarsest cut and stop that keep within ``budget``."""
+    """``config`` with the coarsest cut and stop that keep within ``budget``.
+
+    Raises:
+      InputError: if colours are so far apart that not even the finest do.
+    """
     spread = bounds.color_range(gaussians, background)
     share = _STOP_SHARE * budget
     stop = float(np.clip(share / max(spread, 1e-9), _REFERENCE_STOP, 1e-2))
@@ -49,7 +54,14 @@ def within_budget(
     single = gaussians.params.means.dtype == jnp.float32
     if single:
         told.append(Reason("rounding", "float32", ROUNDING, "rounding"))
-    budget -= stopping + capping + ROUNDING * single
+    fixed = stopping + capping + ROUNDING * single
+    if not fixed < budget:
+        raise InputError(
+            f"{budget:.2g} is left of the budget, and where to stop, the cap and "
+            f"rounding alone may come to {fixed:.2g}: colours span {spread:.3g}, in "
+            "some direction; ask for more, or drop what is so bright"
+        )
+    budget -= fixed
     cut = _bounded_cut(gaussians, spread, budget)
     if cut is not None:
         error = bounds.cut_error(gaussians, cut, spread)

@@ -21,7 +21,7 @@ from gsjax.planning.accuracy import ROUNDING, within_budget
 from gsjax.planning.sizes import shown, tuned, with_capacities
 from gsjax.planning.types import Plan, Reason
 from gsjax.raster.render import DEFAULT_CONFIG
-from gsjax.raster.types import RasterConfig
+from gsjax.raster.types import COLOR_LIMIT, RasterConfig
 
 _CAMERAS = 12  # to measure on, at most
 _SH_SHARE = 0.25
@@ -60,7 +60,7 @@ def plan(
 
     Raises:
       InputError: if there is no camera, or the budget is not above 0, or is below what
-        float32 rounding allows.
+        float32 rounding allows, or colours span too much for it.
       CapacityError: as `render_exact`.
     """
     views = _sampled(cameras)
@@ -150,14 +150,17 @@ def _lens_reason(views: list[Camera]) -> Reason:
 
 
 def _drawn(gaussians: Gaussians) -> Gaussians:
-    """Without what has a number that is not finite; the renderer leaves it out.
+    """Without what has a number that is not finite, or a colour that counts as none;
+    the renderer leaves it out.
 
     Before bands are cut: that could take the number away and bring it in.
     """
-    finite = np.ones(gaussians.capacity, bool)
+    drawn = np.ones(gaussians.capacity, bool)
     for leaf in jax.tree.leaves(gaussians.params):
-        finite &= np.isfinite(np.asarray(leaf)).reshape(len(finite), -1).all(axis=1)
-    return select(gaussians, jnp.asarray(finite))
+        drawn &= np.isfinite(np.asarray(leaf)).reshape(len(drawn), -1).all(axis=1)
+    colors = np.abs(np.asarray(gaussians.params.sh)) < COLOR_LIMIT
+    drawn &= colors.all(axis=(1, 2))
+    return select(gaussians, jnp.asarray(drawn))
 
 
 def _without_bands(

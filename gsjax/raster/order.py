@@ -46,7 +46,10 @@ class _InView(NamedTuple):
 
 
 def depth_order(
-    gaussians: Gaussians, camera: Camera, config: RasterConfig
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RasterConfig,
+    features: Array | None = None,
 ) -> tuple[Array, Array]:
     """Slots front to back, and how many there are that may be visible.
 
@@ -58,7 +61,8 @@ def depth_order(
         last. If more than R are visible, those of the lowest slots are kept.
       count: [] int32, not limited to R.
     """
-    gaussians, camera = lax.stop_gradient((gaussians, camera))
+    inputs = (gaussians, camera, features)
+    gaussians, camera, features = lax.stop_gradient(inputs)
     params, active = gaussians.params, gaussians.active
 
     def look(active: Array, inputs) -> _InView:
@@ -74,17 +78,21 @@ def depth_order(
     z = seen.z
     if config.occlusion and config.stop > 0:
         some = any_of_batch(jnp.any(seen.wide))
-        search = partial(_unhidden, gaussians, camera, config)
+        search = partial(_unhidden, gaussians, camera, config, features)
         z = lax.cond(some, search, lambda seen: seen.z, seen)
     return _compact_and_sort(z, params.means, camera.viewmat, config)
 
 
 def _unhidden(
-    gaussians: Gaussians, camera: Camera, config: RasterConfig, seen: _InView
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RasterConfig,
+    features: Array | None,
+    seen: _InView,
 ) -> Array:
     """``seen.z`` [N], infinity for what lies behind pixels that have all stopped."""
     slots, count = _front_most(seen.wide, seen.z)
-    front = ellipses(gaussians, camera, config, slots, count)
+    front = ellipses(gaussians, camera, config, slots, count, features)
     size = camera.width, camera.height
     closed = occlude.closed_from(front, _z_of(seen.z, slots), count, *size, config)
 

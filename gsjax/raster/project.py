@@ -19,11 +19,10 @@ from gsjax.gaussians import Gaussians
 from gsjax.numerics import exp_log_scale, near_one, safe_normalize
 from gsjax.raster.batches import any_of_batch
 from gsjax.raster.ladder import on_ladder
-from gsjax.raster.types import Array, Projected, RasterConfig
+from gsjax.raster.types import COLOR_LIMIT, Array, Projected, RasterConfig
 
 # What keeps squares of squares within float32, far beyond what any image shows.
 _LONGEST = 1e9  # px, σ along an axis: a longer one is drawn as long as this
-COLOR_LIMIT = 1e32  # a coefficient or feature from there on counts as infinite
 
 
 def transform_point(viewmat: Array, point):
@@ -138,12 +137,18 @@ def project(
 
 
 def ellipses(
-    gaussians: Gaussians, camera: Camera, config: RasterConfig, slots: Array, count
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RasterConfig,
+    slots: Array,
+    count: Array,
+    features: Array | None,
 ) -> tuple[Array, ...]:
     """u, v, inv_sx, slope, inv_sy, opacity [R] of slots, of which the first ``count``
     are there; see `Projected`.
 
-    Without colours, and quick to compile: for a few. No derivative is taken here.
+    Of colours only whether they can be drawn, and quick to compile: for a few. No
+    derivative is taken here.
     """
     params = gaussians.params
     rows = jax.tree.map(
@@ -160,6 +165,9 @@ def ellipses(
         shift=None,
     )
     live = lax.iota(jnp.int32, slots.shape[0]) < count
+    colors = params.sh if features is None else features
+    rows = colors.at[slots].get(mode="clip").reshape(slots.shape[0], -1)
+    live &= jnp.all(jnp.abs(rows) < COLOR_LIMIT, axis=1)
     p = _project_components(components, camera, config, live, harmonic=False)
     return p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity
 
@@ -228,6 +236,8 @@ def _project_components(
     means = tuple(jnp.where(live, m, 0) for m in rows.means)
     scales = tuple(exp_log_scale(jnp.where(live, s, 0)) for s in rows.log_scales)
     x, y, z = transform_point(camera.viewmat, means)
+    # Where the world is far away it is off by as much as that: not at the lens.
+    live &= z > 0.5 * camera.near
     # A dead rank's mean is the origin, which may lie anywhere: park it at z = 1.
     x, y, z = jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1)
     u, v = camera.model.project_point(camera.K, (x, y, z))

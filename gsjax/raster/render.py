@@ -30,10 +30,10 @@ from gsjax.raster.inputs import (
     with_batch,
 )
 from gsjax.raster.order import depth_order
-from gsjax.raster.project import COLOR_LIMIT, project
+from gsjax.raster.project import project
 from gsjax.raster.rasterise import device_count as device_count
 from gsjax.raster.rasterise import rasterise
-from gsjax.raster.types import Array, Demand, RasterConfig, Render
+from gsjax.raster.types import COLOR_LIMIT, Array, Demand, RasterConfig, Render
 
 DEFAULT_CONFIG = RasterConfig()
 _LEAST_ROOM = 1024  # slots
@@ -144,7 +144,7 @@ def _render_one(
     size: Array | None,
 ) -> tuple[dict[str, Array], Array, Demand, Array]:
     """One camera: images before the background, radii [N], demand, overflowed."""
-    order, visible = depth_order(gaussians, camera, config)
+    order, visible = depth_order(gaussians, camera, config, features)
     out = project(gaussians, camera, config, order, visible, features, probe, abs_probe)
     radii = jnp.zeros(gaussians.capacity, out.u.dtype)
     width, height = camera.width, camera.height

@@ -12,6 +12,7 @@ import jax
 from gsjax.settings import require_ranges, settle
 
 Array = jax.Array
+COLOR_LIMIT = 1e32  # a coefficient or feature from there on counts as infinite
 
 OUTPUTS = ("rgb", "alpha", "depth", "median_depth")
 STOP_RULES = ("before", "after")

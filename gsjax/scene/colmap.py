@@ -93,6 +93,32 @@ def _no_points() -> ColmapPoints:
     )
 
 
+def _warn_of_larger(place: Path, count: int) -> None:
+    """Tell of another model beside the one that is read, if it has more images: COLMAP
+    writes several where it could not join them."""
+    if place.name != "0":
+        return
+    counts = {path: _declared(path) for path in place.parent.glob("*/images.bin")}
+    path = max(counts, key=lambda path: counts[path], default=place)
+    if counts.get(path, 0) > count:
+        warnings.warn(
+            f"{place}: {count} images are in this model, and {counts[path]} in "
+            f"{path.parent}; to take that, put it in the place of the first",
+            UserWarning,
+            stacklevel=3,
+        )
+
+
+def _declared(path: Path) -> int:
+    """How many images an images.bin says it has; 0 if there is no room for so many."""
+    try:
+        with path.open("rb") as file:
+            count = int.from_bytes(file.read(8), "little")
+        return count if 64 * count <= path.stat().st_size else 0
+    except OSError:
+        return 0
+
+
 def load_colmap(
     folder: Path,
     *,
@@ -106,6 +132,7 @@ def load_colmap(
     if place is None:
         raise InputError(f"{folder}: no cameras.bin or cameras.txt in {_PLACES}")
     model = read_colmap(place)
+    _warn_of_larger(place, len(model.images))
     root = image_folder(folder, images, factor, poses_only=poses_only)
     names = [image.name for image in model.images]
     files = find_files(

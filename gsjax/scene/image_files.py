@@ -208,8 +208,22 @@ def _in_order(whole: Path, root: Path, found: dict[str, Path]) -> dict[str, Path
 
 def _photographs(folder: Path) -> list[Path]:
     """All photographs in a folder and in those within, in the order of their names."""
-    files = [p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES]
+    files = [p for p in folder.rglob("*") if is_photograph(p)]
     return sorted(files, key=lambda path: path.relative_to(folder).as_posix())
+
+
+def is_photograph(path: Path) -> bool:
+    """By its name; what is hidden, as macOS has it beside each file, is none."""
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+
+
+def find_file(root: Path, name: str) -> Path | None:
+    """The photograph ``name`` of a list in ``root``, if it is there, see
+    `find_files`; what leads out of it is not."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    if path.is_absolute() or ".." in path.parts:
+        return None
+    return _file_at(root / path, _stems)
 
 
 def _file_at(path: Path, stems: Callable[[Path], dict[str, Path]]) -> Path | None:
@@ -230,7 +244,7 @@ def _stems(folder: Path) -> dict[str, Path]:
 
 def short_names(names: Sequence[str]) -> list[str]:
     """Of photographs: without suffixes, unless two of them then had one name."""
-    short = [str(Path(name).with_suffix("")) for name in names]
+    short = [PurePosixPath(name).with_suffix("").as_posix() for name in names]
     clear = len({name.casefold() for name in short}) == len(short)
     return short if clear else list(names)
 
@@ -263,7 +277,7 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """
     if not folder.is_dir():
         return {}
-    listing = cache(_by_suffix_of_either_case)
+    listing = cache(by_suffix_of_either_case)
     masks = {name: find_mask(folder, name, listing) for name in names}
     found = {name: mask for name, mask in masks.items() if mask is not None}
     lacking = [name for name in masks if name not in found]
@@ -283,7 +297,7 @@ def _lowered(name: str) -> str:
     return _ENDING.sub(lambda ending: ending[0].lower(), name)
 
 
-def _by_suffix_of_either_case(folder: Path) -> dict[str, Path]:
+def by_suffix_of_either_case(folder: Path) -> dict[str, Path]:
     """What is in a folder, which need not exist, by `_lowered` names."""
     entries = sorted(folder.iterdir()) if folder.is_dir() else ()
     return {_lowered(entry.name): entry for entry in entries}
@@ -292,7 +306,7 @@ def _by_suffix_of_either_case(folder: Path) -> dict[str, Path]:
 def find_mask(
     folder: Path,
     name: str,
-    listing: Callable[[Path], dict[str, Path]] = _by_suffix_of_either_case,
+    listing: Callable[[Path], dict[str, Path]] = by_suffix_of_either_case,
 ) -> Path | None:
     """The mask of a photograph, if there is one.
 

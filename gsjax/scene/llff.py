@@ -14,7 +14,7 @@ from gsjax.errors import InputError
 from gsjax.files import read_bytes
 from gsjax.io.npy import read_npy
 from gsjax.scene.colmap_model import MAX_COORDINATE, MAX_SIDE
-from gsjax.scene.image_files import SUFFIXES, check_name, image_folder
+from gsjax.scene.image_files import check_name, image_folder, is_photograph
 from gsjax.scene.transforms_fields import rigid
 from gsjax.scene.types import Scene, View, intrinsic_matrix
 
@@ -37,7 +37,7 @@ def load_llff(
     table = read_poses(path)
     root = image_folder(path.parent, images, factor, poses_only=poses_only)
     there = root.iterdir() if root.is_dir() else ()
-    files = sorted(p for p in there if p.suffix.lower() in SUFFIXES)
+    files = sorted(p for p in there if is_photograph(p))
     if poses_only and len(files) != len(table):
         files = [root / f"row_{index:04d}.png" for index in range(len(table))]
     if len(files) != len(table):

@@ -5,8 +5,9 @@ poses and points already, so that both are in one frame as they stand.
 """
 
 import os
+import warnings
 from os import PathLike
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from gsjax.errors import InputError
 from gsjax.io.point_cloud import read_point_cloud
 from gsjax.scene.image_files import (
     check_factor,
+    find_file,
     find_files,
     image_folder,
     inside,
@@ -38,6 +40,7 @@ _PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 _FISHEYE = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
 # The order of nerfstudio's distortion_params, which a frame may have.
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_IN_PIXELS = ("fl_x", "fl_y", "cx", "cy")
 _UNUSED = "unused"
 _SPLITS = {"transforms_train": "train", "transforms_test": "test"}
 
@@ -97,7 +100,9 @@ def load_nerf(
             file = files[name]
             called = _name(file, folder, root)
             mask = None if poses_only else _mask(frame, folder)
-            views.append(_view(frame, file, called, viewmat, mask, splits[index]))
+            size = size_of(frame) or _size_of_file(frame, folder, root, file, factor)
+            split = splits[index]
+            views.append(_view(frame, file, called, viewmat, mask, size, split))
         warn_of_scaled(path, scaled)
     points, colors = _points(lists[0][0], folder)
     source = paths[0] if len(paths) == 1 else folder
@@ -124,17 +129,56 @@ def _name(file: Path, folder: Path, root: Path) -> str:
 
 
 def _splits(path: Path, frames: list[Frame], default: str | None) -> list[str | None]:
-    """The split of each frame: by nerfstudio's lists of names, or that of the file."""
-    named: dict[str, str] = {}
-    top = frames[0].sources[1]
+    """The split of each frame: by nerfstudio's lists of names, or that of the file.
+
+    What is in two lists is held out; of what is in none, nothing is learnt where there
+    is a list to train with.
+    """
+    listed = {key: _listed(path, frames, key) for key in ("val", "train", "test")}
     # Validation views stand in for test views where there are none, else are unused.
-    val = _UNUSED if top.get("test_filenames") else "test"
-    for key, split in (("val", val), ("train", "train"), ("test", "test")):
-        names = top.get(f"{key}_filenames")
-        if names is not None and not isinstance(names, list):
-            raise InputError(f"{path}: {key}_filenames is {shown(names)}; a list")
-        named |= {str(name): split for name in names or ()}
-    return [named.get(str(text_of(frame, "file_path")), default) for frame in frames]
+    held_out = listed["test"] or listed["val"]
+    both = listed["train"] & held_out
+    if both:
+        warnings.warn(
+            f"{path}: {len(both)} of {len(frames)} frames are listed to train and to "
+            f"test with, {min(both)} first; they are held out",
+            UserWarning,
+            stacklevel=3,
+        )
+    named = dict.fromkeys(listed["val"], _UNUSED)
+    named |= dict.fromkeys(listed["train"], "train")
+    named |= dict.fromkeys(held_out, "test")
+    names = [_spelt(str(text_of(frame, "file_path"))) for frame in frames]
+    others = [name for name in names if name not in named]
+    if listed["train"] and others:
+        default = _UNUSED
+        warnings.warn(
+            f"{path}: {len(others)} of {len(names)} frames are in none of its lists, "
+            f"{others[0]} first; they are left out, as nerfstudio leaves them",
+            UserWarning,
+            stacklevel=3,
+        )
+    return [named.get(name, default) for name in names]
+
+
+def _listed(path: Path, frames: list[Frame], split: str) -> set[str]:
+    """The frames that a list of nerfstudio's names, each of which is one."""
+    names = frames[0].sources[1].get(f"{split}_filenames")
+    if names is not None and not isinstance(names, list):
+        raise InputError(f"{path}: {split}_filenames is {shown(names)}; a list")
+    found = {_spelt(str(name)) for name in names or ()}
+    strange = found - {_spelt(str(text_of(frame, "file_path"))) for frame in frames}
+    if strange:
+        raise InputError(
+            f"{path}: {len(strange)} of {len(found)} names of {split}_filenames are of "
+            f"no frame, {min(strange)!r} first; file_path of the frames are wanted"
+        )
+    return found
+
+
+def _spelt(name: str) -> str:
+    """A path as all ways to spell it come to."""
+    return PurePosixPath(name.replace("\\", "/")).as_posix()
 
 
 def _view(
@@ -143,11 +187,11 @@ def _view(
     name: str,
     viewmat: np.ndarray,
     mask: Path | None,
+    size: tuple[int, int],
     split: str | None,
 ) -> View:
     lens = _lens(frame)
-    # The size of the file is that of the camera unless the list says otherwise.
-    width, height = size_of(frame) or _size_of_file(frame, file)
+    width, height = size
     model = "fisheye" if lens is not None and lens.kind == "fisheye" else "pinhole"
     fx, fy = focal_lengths(frame, width, height, model)
     cx, cy = first_number(frame, "cx"), first_number(frame, "cy")
@@ -165,7 +209,25 @@ def _view(
     )
 
 
-def _size_of_file(frame: Frame, file: Path) -> tuple[int, int]:
+def _size_of_file(
+    frame: Frame, folder: Path, root: Path, file: Path, factor: int | None
+) -> tuple[int, int]:
+    """That of the photograph which the camera is for, where the list does not say.
+
+    An angle of view is one of any copy; what is in px is of the original.
+    """
+    if any(first_number(frame, key) is not None for key in _IN_PIXELS):
+        original = find_file(folder, str(text_of(frame, "file_path")))
+        if original is None and factor is not None and factor > 1:
+            whole = root.with_name(root.name.removesuffix(f"_{factor}"))
+            original = find_file(whole, file.relative_to(root).as_posix())
+            if original is None:
+                raise InputError(
+                    f"{frame.where}: no image size: w and h are missing, and the "
+                    f"photograph of which {file} is a smaller copy is not there; give "
+                    "w and h in the file, of what fl_x, cx and cy are in px of"
+                )
+        file = original or file
     if not file.exists():  # where poses are all that is wanted
         raise InputError(
             f"{frame.where}: no image size: w and h are missing, and {file} is not "

@@ -22,6 +22,7 @@ from gsjax.scene.types import View
 # that they agree on most, at which they say how far the scene is: spread over 2°.
 _PARALLEL = np.sin(np.radians(2.0)) ** 2
 _STEEPEST = np.radians(85.0)
+_ALIKE = np.cos(np.radians(45.0))  # of directions that face one side of a scene
 _SAMPLES = 512  # of a path between two keyframes, to measure its length
 
 
@@ -153,7 +154,8 @@ def spiral(
 
     About the mean pose, as wide as 90 % of the cameras are off it (at least 3 % of
     the distance of the focus, which is what one camera or equal ones get), looking at
-    the focus. Cameras that face each other have no mean pose: the first one counts.
+    the focus. Cameras all around a scene have no mean pose: of those the ones count
+    that look as the first does, within 45°.
 
     Args:
       viewmats: [B, 4, 4].
@@ -165,7 +167,13 @@ def spiral(
       InputError: as `focus_point`, or if ``frames`` is below 1.
     """
     _check_frames(frames)
+    viewmats = np.asarray(viewmats, np.float64)
     centres, axes = _centres_and_axes(viewmats)
+    # Of a ring that looks down the mean is straight down, and so is that of the ups.
+    upward = _mean_direction(-axes[:, 1]) @ _mean_direction(axes[:, 2])
+    if np.linalg.norm(axes[:, 2].mean(axis=0)) < _ALIKE or abs(upward) > _ALIKE:
+        alike = axes[:, 2] @ axes[0, 2] >= _ALIKE
+        viewmats, centres, axes = viewmats[alike], centres[alike], axes[alike]
     middle = centres.mean(axis=0)
     ahead = _mean_direction(axes[:, 2])
     focus = focus_point(viewmats, depth)

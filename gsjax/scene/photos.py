@@ -5,10 +5,11 @@ COLMAP ignores it: the camera is that of the pixels as they are stored.
 """
 
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from gsjax.errors import InputError
 from gsjax.images import opencv
 from gsjax.machine import all_of, usable_cores
 from gsjax.scene.decode import decode, telling_of_damage
+from gsjax.scene.image_header import image_size
 from gsjax.scene.types import Lens, Photo, View
 from gsjax.scene.undistort import undistortion_maps
 
@@ -159,6 +161,14 @@ def _ratio(view: View, width: int, height: int) -> tuple[float, float]:
     return sx, sy
 
 
+def stored_size(view: View) -> tuple[int, int]:
+    """Width and height, px, of a photograph as its file has it, by the header; where
+    that is not there, as the camera is for."""
+    if view.image.exists():
+        return image_size(view.image)
+    return view.width, view.height
+
+
 def size_within(width: int, height: int, longest: int | None) -> tuple[int, int]:
     """Width and height, px, of a photograph whose longest side is made that long, if
     it is longer; None for as it is."""
@@ -211,12 +221,30 @@ def _filtered(
     return clipped, np.clip(np.rint(mean[..., 0]), 0, 255).astype(np.uint8)
 
 
+_KEPT = 2  # cameras whose maps are kept: those of a photograph take several of it
 _maps_lock = threading.Lock()
+_maps_of: OrderedDict[tuple, Future] = OrderedDict()
 
 
-@lru_cache(maxsize=2)
-def _maps(lens: Lens, values: tuple[float, ...], width: int, height: int):
-    return undistortion_maps(lens, np.reshape(values, (3, 3)), width, height)
+def _maps(lens: Lens, K: np.ndarray, width: int, height: int):
+    """`undistortion_maps`: made by one thread of those that want the same."""
+    key = (lens, tuple(K.ravel().tolist()), width, height)
+    with _maps_lock:
+        found = _maps_of.get(key)
+        made = found if found is not None else Future()
+        _maps_of[key] = made
+        _maps_of.move_to_end(key)
+        while len(_maps_of) > _KEPT:
+            _maps_of.popitem(last=False)
+    if found is None:
+        try:
+            made.set_result(undistortion_maps(lens, K, width, height))
+        except BaseException as error:
+            made.set_exception(error)
+            with _maps_lock:
+                if _maps_of.get(key) is made:
+                    del _maps_of[key]
+    return made.result()
 
 
 def _undistorted(
@@ -228,8 +256,7 @@ def _undistorted(
     invalid: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     height, width = pixels.shape[:2]
-    with _maps_lock:  # one thread computes what the others then find
-        map_x, map_y, seen = _maps(lens, tuple(K.ravel().tolist()), width, height)
+    map_x, map_y, seen = _maps(lens, K, width, height)
     if seen.mean() < _LEAST_SEEN:
         told = ", ".join(f"{value:g}" for value in lens.coefficients)
         raise InputError(

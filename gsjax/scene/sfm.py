@@ -315,14 +315,10 @@ def _report(
     best, *others = models
     seen = {image.name: image.num_points3D for image in best.images.values()}
     names = {photo.shot.file: photo.name for photo in photographs}
-    registered, unregistered = {}, {}
-    for photo in photographs:
-        file = photo.shot.file
-        if file in seen:
-            registered[photo.name] = int(seen[file])
-        else:
-            why = why_not(_database(work), file, names, set(seen))
-            unregistered[photo.name] = why
+    registered = {names[file]: int(seen[file]) for file in names if file in seen}
+    lost = set(names) - set(seen)
+    why = why_not(_database(work), names, set(seen)) if lost else {}
+    unregistered = {names[file]: reason for file, reason in why.items()}
     settings["masks"] = None if settings["masks"] is None else str(settings["masks"])
     return SfmReport(
         source=str(source),

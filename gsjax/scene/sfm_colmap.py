@@ -250,23 +250,37 @@ def _verified(opened: Any) -> list[tuple[int, tuple[int, int]]]:
     return [(int(n), colmap().pair_id_to_image_pair(pair)) for pair, n in pairs if n]
 
 
-def why_not(database: Path, file: str, names: dict[str, str], placed: set[str]) -> str:
-    """Why an image was not placed, as far as its features and matches tell.
+def why_not(database: Path, names: dict[str, str], placed: set[str]) -> dict[str, str]:
+    """Why images were not placed, as far as their features and matches tell.
 
     Args:
-      file: the image.
       names: what users call each file.
       placed: the files that were.
+
+    Returns:
+      A reason for each file of ``names`` that was not.
     """
     with closing(colmap().Database.open(database)) as opened:
         files = {image.image_id: image.name for image in opened.read_all_images()}
-        own = next((i for i, name in files.items() if name == file), None)
-        features = 0 if own is None else opened.num_keypoints_for_image(own)
-        matches = {
-            files[ends[ends[0] == own]]: count
-            for count, ends in _verified(opened)
-            if own in ends
+        features = {
+            name: opened.num_keypoints_for_image(key) for key, name in files.items()
         }
+        matches: dict[str, dict[str, int]] = {}
+        for count, ends in _verified(opened):
+            first, second = (files[end] for end in ends)
+            matches.setdefault(first, {})[second] = count
+            matches.setdefault(second, {})[first] = count
+    return {
+        file: _reason(features.get(file, 0), matches.get(file, {}), names, placed)
+        for file in names
+        if file not in placed
+    }
+
+
+def _reason(
+    features: int, matches: dict[str, int], names: dict[str, str], placed: set[str]
+) -> str:
+    """Why an image of so many features and matches with others was not placed."""
     if features < _FEW_FEATURES:
         return f"only {features} features in it: blurred, dark or without texture"
     if not matches:

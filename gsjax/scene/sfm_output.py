@@ -7,6 +7,7 @@ pixel) from the working files, so that nothing is resampled or compressed twice.
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from gsjax.scene.sfm_photos import Photograph, Workshop, read_upright
 
 ENTRIES = ("images", "masks", "sparse", "sfm.json")  # the last says: made by us
 JPEG_QUALITY = 95
+_BAND = 256  # rows of a map at a time
 
 
 class _Lens(NamedTuple):
@@ -43,16 +45,16 @@ def write_dataset(
     by_file = {photo.shot.file: photo for photo in photographs}
     for folder in ("images", "sparse/0"):
         make_folder(dataset / folder)
-    lenses = {}
-    for image in model.images.values():
-        photo = by_file[image.name]
-        if image.camera_id not in lenses:
-            lenses[image.camera_id] = _lens(model.cameras[image.camera_id])
-        _write_pixels(photo, lenses[image.camera_id], work, dataset)
-        _move_points(image, model.cameras[image.camera_id], lenses[image.camera_id])
-        image.name = photo.name
-    for key, lens in lenses.items():
+    images = sorted(model.images.values(), key=lambda image: image.camera_id)
+    # Camera by camera: the maps of one take as much memory as a few photographs.
+    for key, of_camera in groupby(images, key=lambda image: image.camera_id):
         camera = model.cameras[key]
+        lens = _lens(camera)
+        for image in of_camera:
+            photo = by_file[image.name]
+            _write_pixels(photo, lens, work, dataset)
+            _move_points(image, camera, lens)
+            image.name = photo.name
         camera.model = lens.pinhole.model
         camera.width, camera.height = lens.pinhole.width, lens.pinhole.height
         camera.params = lens.pinhole.params
@@ -65,11 +67,14 @@ def _lens(camera: Any) -> _Lens:
     options = pycolmap.UndistortCameraOptions()
     options.max_image_size = max(camera.width, camera.height)
     pinhole = pycolmap.undistort_camera(options, camera)
-    y, x = np.mgrid[: pinhole.height, : pinhole.width] + 0.5  # centres of pixels
-    rays = pinhole.cam_from_img(np.stack([x.ravel(), y.ravel()], -1))
-    seen = camera.img_from_cam(np.concatenate([rays, np.ones((len(rays), 1))], 1))
-    seen = (seen - 0.5).reshape(*x.shape, 2).astype(np.float32)
-    return _Lens(pinhole, seen[..., 0], seen[..., 1])
+    maps = np.empty((2, pinhole.height, pinhole.width), np.float32)
+    for top in range(0, pinhole.height, _BAND):
+        rows = np.arange(top, min(top + _BAND, pinhole.height))
+        y, x = np.meshgrid(rows + 0.5, np.arange(pinhole.width) + 0.5, indexing="ij")
+        rays = pinhole.cam_from_img(np.stack([x.ravel(), y.ravel()], -1))
+        seen = camera.img_from_cam(np.concatenate([rays, np.ones((len(rays), 1))], 1))
+        maps[:, rows] = (seen - 0.5).T.reshape(2, *x.shape)
+    return _Lens(pinhole, *maps)
 
 
 def _write_pixels(photo: Photograph, lens: _Lens, work: Workshop, dataset: Path):

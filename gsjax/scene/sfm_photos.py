@@ -6,6 +6,7 @@ Where a photograph is transparent is in its mask.
 """
 
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +16,12 @@ from gsjax.errors import InputError
 from gsjax.files import opened, write_file
 from gsjax.images import encode_png, opencv
 from gsjax.scene.decode import decode, libraries_heard, telling_of_damage
-from gsjax.scene.image_files import check_name, find_mask, natural_order
+from gsjax.scene.image_files import (
+    by_suffix_of_either_case,
+    check_name,
+    find_mask,
+    natural_order,
+)
 from gsjax.scene.sfm_colmap import Shot, exif_camera
 
 READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
@@ -226,9 +232,9 @@ def find_masks(folder: Path, photos: Sequence[Path]) -> dict[Path, Path]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of masks")
-    found = {}
+    found, listing = {}, cache(by_suffix_of_either_case)
     for photo in photos:
-        mask = find_mask(folder, photo.name)
+        mask = find_mask(folder, photo.name, listing)
         if mask is not None and not mask.samefile(photo):
             found[photo] = mask
     if not found:

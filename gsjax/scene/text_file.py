@@ -99,7 +99,7 @@ def open_text(path: Path, wanted: str) -> Iterator[TextFile]:
     """
     text = None
     try:
-        with reading(path, wanted), path.open(encoding="utf-8") as file:
+        with reading(path, wanted), path.open(encoding="utf-8-sig") as file:
             text = TextFile(path, file)
             yield text
     except UnicodeDecodeError as error:

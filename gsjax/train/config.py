@@ -43,7 +43,8 @@ class TrainConfig:
     Attributes:
       steps: how many, of ``batch`` views each.
       seed: of all that is random.
-      strategy: "adaptive" or "mcmc", with the settings of that name.
+      strategy: "adaptive" or "mcmc", with the settings of that name; no slot is
+        edited behind the last step.
       max_size: px, longest side that photographs are scaled down to; None: as is.
       levels: coarse to fine.
       sh_degree: of the scene; bands join one by one, every ``sh_every`` steps.
@@ -152,14 +153,17 @@ class TrainConfig:
 
     def densifier(self, extent: float) -> Densifier:
         """The strategy, for a scene of this extent."""
-        if self.strategy == "mcmc":
-            return mcmc(self.mcmc, extent)
-        return adaptive(self.adaptive, extent)
+        settings = self.chosen
+        if isinstance(settings, McmcSettings):
+            return mcmc(settings, extent)
+        return adaptive(settings, extent)
 
     @property
     def chosen(self) -> AdaptiveSettings | McmcSettings:
-        """The settings of the strategy."""
-        return self.mcmc if self.strategy == "mcmc" else self.adaptive
+        """The settings of the strategy, which edits nothing behind the last step:
+        that would not be learnt any more."""
+        settings = self.mcmc if self.strategy == "mcmc" else self.adaptive
+        return replace(settings, stop=min(settings.stop, self.steps - 1))
 
     @property
     def max_gaussians(self) -> int:

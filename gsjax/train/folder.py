@@ -265,10 +265,11 @@ def saved_splat(folder: Path) -> Path:
         settings = load_settings(folder)
         lines = read_metrics(files.metrics)
         done = lines[-1]["step"] if lines else 0
+        words = ["gsjax", "train", settings.dataset, "-o", folder, "--resume"]
         raise InputError(
             f"{folder}: no scene yet, at step {done:,} of {settings.config.steps:,}: "
-            "wait for its end; or, if it was stopped, go on with gsjax train "
-            f"{settings.dataset} -o {folder} --resume"
+            "wait for its end; or, if it was stopped, go on with "
+            f"{shlex.join(map(str, words))}"
         )
     return files.splat
 

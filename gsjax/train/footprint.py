@@ -14,7 +14,7 @@ from gsjax.gaussians import capacity_bucket
 from gsjax.memory import Estimate, available, require, size_text
 from gsjax.raster.render import render_estimate
 from gsjax.raster.types import RasterConfig
-from gsjax.scene.photos import size_within
+from gsjax.scene.photos import size_within, stored_size
 from gsjax.scene.types import Scene
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
@@ -81,7 +81,7 @@ def run_estimate(
       count: Gaussians, and ``slots`` for them.
       begins: whether they are those that it begins with.
     """
-    sizes = [size_within(v.width, v.height, config.max_size) for v in scene.views]
+    sizes = [size_within(*stored_size(v), config.max_size) for v in scene.views]
     size = max(w for w, _ in sizes), max(h for _, h in sizes)
     photos = 3 * sum(w * h for w, h in sizes)
     frames = 3 * size[0] * size[1] * len(sizes)

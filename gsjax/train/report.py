@@ -1,5 +1,6 @@
 """What a run says as it goes: a bar on a terminal, lines elsewhere; all on stderr."""
 
+import math
 import sys
 import time
 from typing import Any
@@ -105,7 +106,11 @@ class Reporter:
 
 
 def _smoothed(mean: float, value: float) -> float:
-    return value if mean != mean else (1 - _SMOOTH) * mean + _SMOOTH * value
+    """The running mean, over what is a number: of a photograph that is masked
+    altogether the PSNR is none."""
+    if not math.isfinite(value):
+        return mean
+    return value if math.isnan(mean) else (1 - _SMOOTH) * mean + _SMOOTH * value
 
 
 def _clock(seconds: float) -> str:

@@ -127,6 +127,7 @@ def roomy_pairs(wanted: int, state: TrainState, config: TrainConfig) -> int:
             f"a view wants {wanted:,} or more pairs, above the limit of {2**30 - 1:,}; "
             "train with smaller images, fewer Gaussians, or larger tiles"
         )
+    wanted = max(1, wanted)  # a view of nothing wants none
     step, margin = int(state.step), _PAIR_MARGIN
     if step < config.chosen.stop:
         # Room until the next program is due anyway, at the price of one.

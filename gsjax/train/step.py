@@ -96,9 +96,18 @@ def make_stages(
         name = "abs_probe" if densifier.absgrad else "probe"
         mask = batch.valid if config.skip_masked else None
         given = {"mask": mask, "size": batch.size, name: probe}
-        view = render(gaussians, camera, raster, background, **given)
-        assert view.rgb is not None
-        image = exposed(view.rgb, tuning, batch.view)
+        if config.exposure and _transparent(batch):
+            # Of such photographs the background is ours, and has no exposure.
+            outputs = raster.replace(outputs=("rgb", "alpha"))
+            view = render(gaussians, camera, outputs, **given)
+            assert view.rgb is not None
+            assert view.alpha is not None
+            image = exposed(view.rgb, tuning, batch.view, view.alpha)
+            image += (1 - view.alpha[..., None]) * background
+        else:
+            view = render(gaussians, camera, raster, background, **given)
+            assert view.rgb is not None
+            image = exposed(view.rgb, tuning, batch.view)
         target, weight = targets(batch, background, image.dtype)
         loss = photometric_spread(
             image, target, weight, config.ssim_weight, device_count(raster)
@@ -118,9 +127,8 @@ def make_stages(
     def differentiate(state: TrainState, batch: Batch) -> Gradients:
         params, count = state.gaussians.params, batch.view.shape[0]
         dtype = params.means.dtype
-        transparent = batch.pixels.shape[-1] == 4
         by_background, *_ = _keys(state.key, state.step)
-        background = background_of(config, transparent, by_background, dtype)
+        background = background_of(config, _transparent(batch), by_background, dtype)
         probe = jnp.zeros((count, state.gaussians.capacity, 2), dtype)
         (loss, (quality, view)), by = slopes(
             params, state.tuning, probe, state, batch, background
@@ -190,6 +198,11 @@ def make_stages(
     return Stages(differentiate, advance, edit)
 
 
+def _transparent(batch: Batch) -> bool:
+    """Whether something shows through the photographs."""
+    return batch.pixels.shape[-1] == 4
+
+
 def _keys(key: Array, step: Array) -> Array:
     """[3] of the step behind ``step`` others: background, noise and edit."""
     return jax.random.split(jax.random.fold_in(key, step), 3)
@@ -206,7 +219,7 @@ def targets(batch: Batch, background: Array, dtype) -> tuple[Array, Array | None
     """What to learn, [B, H, W, 3] in [0, 1], and the weights [B, H, W] or None."""
     values = batch.pixels.astype(dtype) / 255
     rgb = values[..., :3]
-    if values.shape[-1] == 4:
+    if _transparent(batch):
         alpha = values[..., 3:]
         rgb = rgb * alpha + background * (1 - alpha)
     return rgb, None if batch.valid is None else batch.valid.astype(dtype)

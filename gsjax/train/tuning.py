@@ -88,10 +88,21 @@ def tuned_camera(camera: Camera, tuning: Tuning, index: Array, extent: float) ->
                   camera.model)  # fmt: skip
 
 
-def exposed(images: Array, tuning: Tuning, index: Array) -> Array:
-    """Renders [B, H, W, 3] as the photographs' exposures would show them."""
+def exposed(
+    images: Array, tuning: Tuning, index: Array, alphas: Array | None = None
+) -> Array:
+    """Renders as the photographs' exposures would show them.
+
+    Args:
+      images: [B, H, W, 3].
+      tuning: with the exposures.
+      index: [B], which views they are.
+      alphas: [B, H, W] opacities of images over black; None where nothing shows
+        through.
+    """
     if tuning.exposures is None:
         return images
     affine = tuning.exposures[index]
     colour = jnp.einsum("bij,bhwj->bhwi", affine[:, :, :3], images, precision="highest")
-    return images + colour + affine[:, None, None, :, 3]
+    added = affine[:, None, None, :, 3]
+    return images + colour + (added if alphas is None else alphas[..., None] * added)

@@ -13,7 +13,6 @@ import numpy as np
 
 from gsjax.cameras import NEAR
 from gsjax.console import note, one_line
-from gsjax.errors import GsjaxError
 from gsjax.gaussians import Gaussians, select
 from gsjax.viewer.exact import KINDS, ExactRenderer, camera_of, picture
 from gsjax.viewer.splats import (
@@ -87,7 +86,8 @@ class Session:
         self.client, self.exhibit = client, exhibit
         self.splats: Any = None
         self.shown = np.zeros(0, bool)
-        self.scene_shown: Gaussians | None = None
+        # With what is shown of it: another thread takes both, of one time.
+        self.scene_shown: tuple[Gaussians, np.ndarray] | None = None
         self.closed = False
         self.covered = False  # by an exact picture, over the view
         self.cameras: list[Any] = []
@@ -219,7 +219,8 @@ class Session:
         if self.scale.value < 100 and len(longest):
             limit = float(np.percentile(longest, self.scale.value))
         shown = within(gaussians, Cut(self.opacity.value, limit))
-        self.scene_shown, self.shown = gaussians, shown
+        self.shown = shown
+        self.scene_shown = gaussians, shown
         if exhibit.max_gaussians is not None:
             shown = most_important(gaussians, shown, exhibit.max_gaussians)
         splats = pack(gaussians, shown)
@@ -248,16 +249,16 @@ class Session:
 
     def _render(self) -> None:
         """The picture for where the camera is now; what goes wrong is told there."""
-        gaussians = self.scene_shown
-        if gaussians is None or self.closed:
+        if self.scene_shown is None or self.closed:
             return
+        gaussians, shown = self.scene_shown
         self.told.content = "rendering; the first of a size compiles for some seconds"
         camera, height = self.client.camera, int(self.height.value)
         width = max(1, round(height * camera.aspect))
         begun, seen_from = time.perf_counter(), camera.update_timestamp
         try:
             view = self.exhibit.renderer(
-                select(gaussians, self.shown),  # pyright: ignore
+                select(gaussians, shown),  # pyright: ignore
                 camera_of(
                     camera.wxyz,
                     camera.position,
@@ -267,7 +268,7 @@ class Session:
                     near=min(NEAR, self.exhibit.eye.near),
                 ),
             )
-        except GsjaxError as error:
+        except Exception as error:  # of XLA too, as where memory is short
             self.told.content = f"not rendered: {one_line(error)}"
             note(f"warning: {one_line(error)}")
             return
