@@ -10,12 +10,13 @@ import jax
 import numpy as np
 
 from gsjax.console import note
+from gsjax.errors import InputError
 from gsjax.gaussians import capacity_bucket
 from gsjax.memory import Estimate, available, require, size_text
 from gsjax.raster.render import render_estimate
 from gsjax.raster.types import RasterConfig
 from gsjax.scene.photos import size_within, stored_size
-from gsjax.scene.types import Scene
+from gsjax.scene.types import Scene, View
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
 from gsjax.train.room import slots_for
@@ -81,7 +82,7 @@ def run_estimate(
       count: Gaussians, and ``slots`` for them.
       begins: whether they are those that it begins with.
     """
-    sizes = [size_within(*stored_size(v), config.max_size) for v in scene.views]
+    sizes = [size_within(*_size_of(v), config.max_size) for v in scene.views]
     size = max(w for w, _ in sizes), max(h for _, h in sizes)
     photos = 3 * sum(w * h for w, h in sizes)
     frames = 3 * size[0] * size[1] * len(sizes)
@@ -101,6 +102,14 @@ def run_estimate(
         "of Gaussians and their moments": state_bytes(slots, config),
     }
     return Estimate({**held, **step.parts, "to compile": compiling})
+
+
+def _size_of(view: View) -> tuple[int, int]:
+    """Of its photograph; of one that is damaged as its camera has it: loading tells."""
+    try:
+        return stored_size(view)
+    except InputError:
+        return view.width, view.height
 
 
 def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) -> None:
