@@ -21,7 +21,7 @@ from gsjax.memory import Estimate, require, size_text, system_available, unlimit
 from gsjax.raster.render import render_estimate
 from gsjax.raster.types import Demand
 from gsjax.train.config import preset
-from gsjax.train.footprint import check_memory, run_estimate
+from gsjax.train.footprint import check_memory, run_estimate, trained_sizes
 from gsjax.train.room import slots_for
 
 GB = 10**9
@@ -217,7 +217,8 @@ def test_the_estimate_of_a_run_is_what_runs_took(name, changes, measured, report
     slots = slots_for(count, 0, config)
     if name == "quality":  # it was run with --max-gaussians 100000
         slots = 131_072
-    found = run_estimate(replace(made, views=views), config, count, slots, begins=True)
+    sizes = trained_sizes(replace(made, views=views), config)
+    found = run_estimate(sizes, config, count, slots, begins=True)
     report(f"memory of {name}", abs(np.log(found.total / 1e6 / measured)), np.log(1.5))
     assert 1 / 1.5 < found.total / 1e6 / measured < 1.5
 
@@ -234,7 +235,8 @@ def test_photographs_count_as_their_files_have_them(tmp_path):
             for view in made.views
         ]
         scene = replace(made, views=tuple(views))
-        return run_estimate(scene, config, 1000, 1024).parts["of photographs"]
+        sizes = trained_sizes(scene, config)
+        return run_estimate(sizes, config, 1000, 1024).parts["of photographs"]
 
     small, large = bytes_of(320, 240, (320, 240)), bytes_of(640, 480, (640, 480))
     assert bytes_of(320, 240, (640, 480)) == small

@@ -105,8 +105,9 @@ class RenderCommand(HeavyCommand):
             )
             origin = data.scene.origin
         if not entries:
-            of_run = "this run holds none out" if self.cameras is None else ""
-            none = of_run or f"{self.cameras} names none; train has all of its views"
+            none = f"{self.cameras} names none; train has all of its views"
+            if self.cameras is None:
+                none = "this run holds none out"
             raise UsageError(f"--path {path}: there are no such views: {none}")
         subject = open_subject(
             self.scene, origin=origin, preset=self.preset, background=background

@@ -5,6 +5,7 @@ beside its state and its photographs.
 """
 
 import math
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -68,8 +69,26 @@ def step_estimate(
     return Estimate({**inside.parts, **more})
 
 
+def trained_sizes(scene: Scene, config: TrainConfig) -> list[tuple[int, int]]:
+    """Width and height, px, of each photograph as it is trained on, by its header; of
+    one that is damaged as its camera has it: loading tells."""
+
+    def stored(view: View) -> tuple[int, int]:
+        try:
+            return stored_size(view)
+        except InputError:
+            return view.width, view.height
+
+    return [size_within(*stored(view), config.max_size) for view in scene.views]
+
+
 def run_estimate(
-    scene: Scene, config: TrainConfig, count: int, slots: int, *, begins: bool = False
+    sizes: Sequence[tuple[int, int]],
+    config: TrainConfig,
+    count: int,
+    slots: int,
+    *,
+    begins: bool = False,
 ) -> Estimate:
     """What a run takes in all, from its photographs on.
 
@@ -77,12 +96,11 @@ def run_estimate(
     are is guessed here, and found out before a step is compiled.
 
     Args:
-      scene: the views to train on.
+      sizes: of the photographs, from `trained_sizes`.
       config: of the run.
       count: Gaussians, and ``slots`` for them.
       begins: whether they are those that it begins with.
     """
-    sizes = [size_within(*_size_of(v), config.max_size) for v in scene.views]
     size = max(w for w, _ in sizes), max(h for _, h in sizes)
     photos = 3 * sum(w * h for w, h in sizes)
     frames = 3 * size[0] * size[1] * len(sizes)
@@ -102,14 +120,6 @@ def run_estimate(
         "of Gaussians and their moments": state_bytes(slots, config),
     }
     return Estimate({**held, **step.parts, "to compile": compiling})
-
-
-def _size_of(view: View) -> tuple[int, int]:
-    """Of its photograph; of one that is damaged as its camera has it: loading tells."""
-    try:
-        return stored_size(view)
-    except InputError:
-        return view.width, view.height
 
 
 def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) -> None:
@@ -135,9 +145,10 @@ def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) ->
         slots = slots_for(count, 0, config)
     else:
         count, slots = int(np.sum(state.gaussians.active)), state.gaussians.capacity
-    now = run_estimate(scene, config, count, slots, begins=state is None)
+    sizes = trained_sizes(scene, config)
+    now = run_estimate(sizes, config, count, slots, begins=state is None)
     most = max(config.max_gaussians, count)
-    then = run_estimate(scene, config, most, capacity_bucket(most)).total
+    then = run_estimate(sizes, config, most, capacity_bucket(most)).total
     free = available()
     told = "" if free is None else f"; {size_text(free)} is free"
     note(

@@ -85,7 +85,6 @@ class Session:
     def __init__(self, client: Any, exhibit: Exhibit):
         self.client, self.exhibit = client, exhibit
         self.splats: Any = None
-        self.shown = np.zeros(0, bool)
         # With what is shown of it: another thread takes both, of one time.
         self.scene_shown: tuple[Gaussians, np.ndarray] | None = None
         self.closed = False
@@ -219,11 +218,11 @@ class Session:
         if self.scale.value < 100 and len(longest):
             limit = float(np.percentile(longest, self.scale.value))
         shown = within(gaussians, Cut(self.opacity.value, limit))
-        self.shown = shown
         self.scene_shown = gaussians, shown
+        sent = shown
         if exhibit.max_gaussians is not None:
-            shown = most_important(gaussians, shown, exhibit.max_gaussians)
-        splats = pack(gaussians, shown)
+            sent = most_important(gaussians, shown, exhibit.max_gaussians)
+        splats = pack(gaussians, sent)
         if len(splats.centers):
             self.splats = self.client.scene.add_gaussian_splats(
                 "/splats", **splats._asdict(), visible=not self.covered
@@ -232,7 +231,7 @@ class Session:
             self.splats.remove()
             self.splats = None
         found = np.count_nonzero(np.asarray(gaussians.active))
-        faint = np.count_nonzero(opacities_of(gaussians)[self.shown] < LEAST_OPACITY)
+        faint = np.count_nonzero(opacities_of(gaussians)[shown] < LEAST_OPACITY)
         lines = [f"**{len(splats.centers):,}** of {found:,} Gaussians"]
         if faint:
             told = f"{faint:,} of opacity below {LEAST_OPACITY} in exact pictures only"
