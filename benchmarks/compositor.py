@@ -42,7 +42,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     gaussians, camera = case.gaussians, case.camera
     devices = jax.local_device_count()
     grid = bins.make_grid(camera.width, camera.height, config.tile_size, devices)
-    group = schedules.tiles_per_step(config, grid, jax.default_backend())
+    group = schedules.tiles_per_step(config, grid)
     pairs, chunk = -(-config.pair_capacity // devices), config.chunk_size
     steps = schedules.step_capacity(pairs, grid, group, chunk)
     mesh = Mesh(np.array(jax.local_devices()), ("tiles",))

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+
 from gsjax import files
 from gsjax.timing import interleaved as interleaved
 from gsjax.timing import machine as machine
@@ -24,9 +26,16 @@ def run_cold(arguments: list[str], code: Path | None = None) -> None:
     subprocess.run(command, check=True, cwd=code, env={**os.environ, **changes})
 
 
+def here(name: str) -> str:
+    """``name``, of an accelerator with what that is: "_gpu"."""
+    backend = jax.default_backend()
+    return name if backend == "cpu" else f"{name}_{backend}"
+
+
 def save(name: str, rows: list[dict], **more) -> None:
-    """Write ``results/name.json`` and print the rows as a table."""
+    """Write ``results/name.json``, see `here`, and print the rows as a table."""
     RESULTS.mkdir(exist_ok=True)
+    name = here(name)
     content = {"machine": machine(), **more, "rows": rows}
     path = RESULTS / f"{name}.json"
     files.write_json(path, content)

@@ -52,7 +52,7 @@ def main() -> int:
             size=[trial.camera.width, trial.camera.height], reasons=made.lines(),
         )  # fmt: skip
         picture = front_picture(rows, trial.name)
-        path = measure.RESULTS / f"pareto_{trial.name}.png"
+        path = measure.RESULTS / (measure.here(f"pareto_{trial.name}") + ".png")
         files.write_file(path, images.encode_png(picture))
         inside &= all(row["inside"] for row in rows)
         # Each kernel is mapped by itself, and Linux lets a process have 65,530 maps:

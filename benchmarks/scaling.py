@@ -216,8 +216,7 @@ def main() -> None:
             raise SystemExit(f"{values} failed:\n{done.stderr}")
         rows.append(json.loads(done.stdout.splitlines()[-1]))
         print(rows[-1], flush=True)
-    name = "scaling_gpu" if options.gpu else "scaling"
-    measure.save(name, rows, claim=__doc__, slopes=slopes(rows))
+    measure.save("scaling", rows, claim=__doc__, slopes=slopes(rows))
     if not options.gpu:
         plot(rows, measure.RESULTS / "scaling.png")
 

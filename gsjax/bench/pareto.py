@@ -7,6 +7,7 @@ dense one. Capacities are fitted to the view; programs are compiled at one size.
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +17,7 @@ import numpy as np
 from gsjax.bench import pixelwise
 from gsjax.console import progress
 from gsjax.gaussians import Gaussians, with_sh_degree
+from gsjax.machine import usable_cores
 from gsjax.numerics import in_float64
 from gsjax.planning.types import Plan
 from gsjax.raster.render import exact_config, render
@@ -107,10 +109,7 @@ def pareto(trial: Trial, settings: Sequence[Point], repeats: int = 5) -> list[di
     rng = np.random.default_rng(0)
     shape = (trial.camera.height, trial.camera.width, 3)
     weights = rng.normal(size=shape)
-    with jax.enable_x64(True):
-        exact = _run(trial, Point("exact", "", _EXACT, double=True), weights, {})
-    fits: dict[tuple, RasterConfig] = {}
-    runs = [_run(trial, p, weights, fits) for p in progress(settings, "points")]
+    exact, *runs = _ready_runs(trial, settings, weights)
     errors = [np.abs(run.rgb - exact.rgb).max(axis=-1) for run in runs]
     worst = [divmod(int(error.argmax()), shape[1])[::-1] for error in errors]
     others = rng.integers(0, shape[1::-1], (_PIXELS, 2))
@@ -138,6 +137,29 @@ def pareto(trial: Trial, settings: Sequence[Point], repeats: int = 5) -> list[di
             }
         )
     return rows
+
+
+def _ready_runs(
+    trial: Trial, settings: Sequence[Point], weights: np.ndarray
+) -> list[_Runs]:
+    """Of the exact picture, and of each point; all that will be timed is compiled."""
+    exact = Point("exact", "", _EXACT, double=True)
+    fits: dict[tuple, RasterConfig] = {}
+
+    def ready(point: Point) -> _Runs:
+        if point is exact:
+            return _run(trial, point, weights, {})
+        run = _run(trial, point, weights, fits)
+        with jax.enable_x64(point.double):
+            jax.block_until_ready(run.forward())
+        return run
+
+    # An accelerator is idle while this compiles, on one core for each program. On a CPU
+    # all cores compile one, and the programs, which take them all, would meet.
+    workers = 1 if jax.default_backend() == "cpu" else usable_cores()
+    with ThreadPoolExecutor(workers) as pool:
+        made = [pool.submit(ready, point) for point in (exact, *settings)]
+        return [one.result() for one in progress(made, "points")]
 
 
 def _run(

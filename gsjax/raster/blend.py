@@ -239,6 +239,16 @@ def blend_alphas(
     carried: Array, alpha: Array, parts: Parts, config: RasterConfig
 ) -> tuple[Array, dict[str, Array]]:
     """`blend_chunk` of Gaussians whose ``alpha`` [G, K, P] is known."""
+    total, out = sums_behind(carried, alpha, parts, config)
+    # What is carried stands outside: its derivative then needs no sum over Gaussians.
+    return carried * total, {**out, "sums": carried[:, None] * out["sums"]}
+
+
+def sums_behind(
+    carried: Array, alpha: Array, parts: Parts, config: RasterConfig
+) -> tuple[Array, dict[str, Array]]:
+    """As `blend_alphas`, but what is returned is of the chunk by itself: ``carried``
+    tells who stops, and has no part in the transmittance or in "sums"."""
     # A cap of 1, as α has it, needs the rule that does not divide.
     apart = np.asarray(config.alpha_cap, alpha.dtype) < 1
     product = transmittance if apart else running_product
@@ -246,10 +256,8 @@ def blend_alphas(
     reached = carried[:, None] * before
     behind = reached * (1 - alpha)
     blended = (behind if config.stop_rule == "before" else reached) > config.stop
-    # What is carried stands outside: its derivative then needs no sum over Gaussians.
     weight = jnp.where(blended, alpha * before, 0)
-    sums = _sums_as_of(config.chunk_size, weight, parts.channels)
-    out = {"sums": carried[:, None] * sums}
+    out = {"sums": _sums_as_of(config.chunk_size, weight, parts.channels)}
     if parts.depth is not None:
         # The last that more than half reaches, if less is left behind all. By their
         # number: rounding may let more reach one than the one before it.
@@ -257,4 +265,4 @@ def blend_alphas(
         last = lax.broadcasted_iota(jnp.int32, reached.shape, 1) == number - 1
         half = last & (carried * total <= 0.5)[:, None] & blended
         out["median"] = jnp.sum(jnp.where(half, parts.depth, 0), axis=1)
-    return carried * total, out
+    return total, out

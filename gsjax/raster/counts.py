@@ -38,9 +38,17 @@ def owners(ends: Array, room: int, start: Array | int = 0) -> Array:
     Returns:
       [room] int32, rising; n past the last.
     """
-    passed = jnp.zeros(room, jnp.int32)
-    passed = passed.at[jnp.maximum(ends - start, 0)].add(1, mode="drop")
-    return running_total(passed)
+    place = jnp.maximum(ends - start, 0)
+    if jax.default_backend() == "cpu":
+        passed = jnp.zeros(room, jnp.int32).at[place].add(1, mode="drop")
+        return running_total(passed)
+    # Here whoever writes to one place waits for the others: so each owner that has
+    # items is put where they begin, one to a place. It is the last that ends there.
+    following = jnp.append(place[1:], jnp.int32(2**31 - 1))
+    place = jnp.where(place < following, place, room)
+    owner = lax.iota(jnp.int32, ends.shape[0]) + 1
+    passed = jnp.zeros(room, jnp.int32).at[place].set(owner, mode="drop")
+    return lax.cummax(passed)
 
 
 def squeeze(chosen: Array, room: int) -> tuple[Array, Array]:

@@ -59,7 +59,7 @@ def render_estimate(
     grid = bins.make_grid(*size, config.tile_size, devices)
     seen = min(slots, config.visible_capacity or slots)
     capacity = config.pair_capacity or default_pair_capacity(seen, grid)
-    group = schedules.tiles_per_step(config, grid, jax.default_backend())
+    group = schedules.tiles_per_step(config, grid)
     share = -(-capacity // devices)
     rows = group * schedules.step_capacity(share, grid, group, config.chunk_size)
     channels = 1 + 3 * ("rgb" in config.outputs) + ("depth" in config.outputs)

@@ -17,6 +17,7 @@ from gsjax.gaussians import capacity_bucket
 from gsjax.raster import bins, schedules
 from gsjax.raster.composite import composite
 from gsjax.raster.counts import COUNT_LIMIT
+from gsjax.raster.flat import composite_flat
 from gsjax.raster.types import Array, Demand, Projected, RasterConfig
 
 
@@ -91,21 +92,38 @@ def _rasterise_local(
 ):
     """One device's tiles; ``device`` is [1]. Results gain a leading device axis."""
     device = device[0]
-    chunk = config.chunk_size
-    group = schedules.tiles_per_step(config, grid, jax.default_backend())
     geometry = lax.stop_gradient(projected)
-    spans = bins.row_spans(geometry, grid, device)
-    tiles = None if mask is None else bins.wanted_tiles(mask, grid, device)
-    lists = bins.make_lists(
-        geometry, spans, grid, device, capacity, config.rungs, tiles
-    )
+    with jax.named_scope("lists"):
+        spans = bins.row_spans(geometry, grid, device)
+        tiles = None if mask is None else bins.wanted_tiles(mask, grid, device)
+        lists = bins.make_lists(
+            geometry, spans, grid, device, capacity, config.rungs, tiles
+        )
+    with jax.named_scope("composite"):
+        if jax.default_backend() == "cpu":
+            images, wanted = _composite_by_turns(projected, lists, device, grid, config)
+        else:
+            images = composite_flat(projected, lists, device, grid, config)
+            wanted = lists.pairs
+    images = {name: image[None] for name, image in images.items()}
+    return images, lists.pairs[None], wanted[None]
+
+
+def _composite_by_turns(
+    projected: Projected,
+    lists: bins.Lists,
+    device: Array,
+    grid: bins.Grid,
+    config: RasterConfig,
+) -> tuple[dict[str, Array], Array]:
+    """`composite`, and the pair capacity that would have been enough for it."""
+    capacity, chunk = lists.ranks.shape[0], config.chunk_size
+    group = schedules.tiles_per_step(config, grid)
     room = schedules.step_capacity(capacity, grid, group, chunk)
     schedule = schedules.make_schedule(lists, grid, group, chunk, room)
     images = composite(projected, lists, schedule, device, grid, room, config)
     for_steps = schedules.pairs_for_steps(schedule.steps, grid, group, chunk)
-    wanted = jnp.maximum(lists.pairs, for_steps)
-    images = {name: image[None] for name, image in images.items()}
-    return images, lists.pairs[None], wanted[None]
+    return images, jnp.maximum(lists.pairs, for_steps)
 
 
 def _untile(image: Array, grid: bins.Grid) -> Array:

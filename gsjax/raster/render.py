@@ -144,8 +144,13 @@ def _render_one(
     size: Array | None,
 ) -> tuple[dict[str, Array], Array, Demand, Array]:
     """One camera: images before the background, radii [N], demand, overflowed."""
-    order, visible = depth_order(gaussians, camera, config, features)
-    out = project(gaussians, camera, config, order, visible, features, probe, abs_probe)
+    # The names that a profile shows.
+    with jax.named_scope("order"):
+        order, visible = depth_order(gaussians, camera, config, features)
+    with jax.named_scope("project"):
+        out = project(
+            gaussians, camera, config, order, visible, features, probe, abs_probe
+        )
     radii = jnp.zeros(gaussians.capacity, out.u.dtype)
     width, height = camera.width, camera.height
     if size is not None:

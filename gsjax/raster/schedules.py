@@ -60,12 +60,9 @@ class Work(NamedTuple):
     live: Array
 
 
-def tiles_per_step(config: RasterConfig, grid: Grid, platform: str) -> int:
-    """G: small keeps a CPU's caches, large keeps launches on accelerators rare."""
-    chosen = config.tiles_per_step
-    if chosen is None:
-        chosen = 16 if platform == "cpu" else 2048
-    return max(1, min(chosen, grid.tiles))
+def tiles_per_step(config: RasterConfig, grid: Grid) -> int:
+    """G: few keep to a CPU's caches."""
+    return max(1, min(config.tiles_per_step or 16, grid.tiles))
 
 
 def make_schedule(

@@ -109,9 +109,10 @@ def make_stages(
             assert view.rgb is not None
             image = exposed(view.rgb, tuning, batch.view)
         target, weight = targets(batch, background, image.dtype)
-        loss = photometric_spread(
-            image, target, weight, config.ssim_weight, device_count(raster)
-        )
+        with jax.named_scope("loss"):
+            loss = photometric_spread(
+                image, target, weight, config.ssim_weight, device_count(raster)
+            )
         total = jnp.mean(loss)
         if densifier.penalty is not None:
             total += densifier.penalty(gaussians)
@@ -166,10 +167,12 @@ def make_stages(
             return state.replace(step=state.step + 1), jnp.asarray(True)
 
         def update():
-            moved, good = _optimise(state, found, config, extent)
+            with jax.named_scope("optimise"):
+                moved, good = _optimise(state, found, config, extent)
             _, by_noise, _ = _keys(state.key, state.step)
             rate = means_rate(config.rates, moved.step / config.steps, extent)
-            return _observe(moved, found, by_noise, densifier, rate), good
+            with jax.named_scope("observe"):
+                return _observe(moved, found, by_noise, densifier, rate), good
 
         after, good = lax.cond(
             found.overflowed, keep, lambda: lax.cond(finite, update, skip)
