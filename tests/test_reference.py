@@ -31,6 +31,7 @@ from conftest import (
     render,
     scene_of,
 )
+from pictures import errors_of
 
 import gsjax
 from gsjax.raster.reference import reference_colors
@@ -39,21 +40,6 @@ from gsjax.rotations import quaternion_to_matrix
 BAR = {jnp.float64: 1e-10, jnp.float32: 1e-5}
 BAND = {jnp.float64: 1e-9, jnp.float32: 1e-4}
 NEEDLES = ("needles_1000", "needles_10000")
-
-
-def errors_of(out, wanted, band):
-    """Largest error of each output outside the band, depths relative to 1 or more."""
-    clear = np.asarray(wanted["margin"]) > band
-    assert clear.mean() > 0.97
-    errors = {}
-    for name in ALL:
-        found, target = np.asarray(getattr(out, name)), np.asarray(wanted[name])
-        assert np.isfinite(found).all(), name
-        error = np.abs(found - target)
-        if "depth" in name:
-            error = error / np.maximum(1, np.abs(target))
-        errors[name] = error.reshape(*clear.shape, -1).max(-1)[clear]
-    return {name: error.max() for name, error in errors.items()}, errors
 
 
 def compare(gaussians, camera, config, dtype, background=BACKGROUND, **kwargs):
