@@ -53,7 +53,7 @@ def main(
     dataset: Path, held_out: list[str], strategies: list[str], changes: dict[str, str]
 ) -> None:
     """Measure, save and draw; ``changes`` to the preset "fast", by their options."""
-    path = measure.RESULTS / f"training_{dataset.name}.json"
+    path = measure.RESULTS / (measure.here(f"training_{dataset.name}") + ".json")
     more = "".join(f", {name} {value}" for name, value in changes.items())
     changes = {"preset": "fast", **changes}
     other = [text for name, value in changes.items() for text in (f"--{name}", value)]

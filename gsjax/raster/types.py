@@ -43,7 +43,8 @@ class RasterConfig:
     Attributes:
       tile_size: pixels along the side of a tile.
       chunk_size: Gaussians of a tile composited in one go.
-      tiles_per_step: tiles composited side by side; None chooses by platform.
+      tiles_per_step: chunks of tiles composited side by side; None chooses by
+        platform.
       pair_capacity: room for (tile, Gaussian) pairs of a camera; None chooses from
         the sizes. If it is too small, `Render.overflowed` is set and `Render.demand`
         says what was wanted; `render_exact` regrows. Unused room costs memory, and
@@ -55,9 +56,9 @@ class RasterConfig:
       rungs: how many sizes, each a quarter of the one before, sorting by depth is
         compiled for; the smallest that fits is run. Sorting pairs, on accelerators,
         has sizes between them; from 2 on there is a small size of projecting, and from
-        4 on the gradient of compositing has sizes too, two fewer. Each takes seconds
-        to compile, and saves time where a view needs a quarter of its capacity or
-        less.
+        4 on the gradient of compositing has sizes too, two fewer (on accelerators, all
+        of compositing, one fewer). Each takes seconds to compile, and saves time where
+        a view needs a quarter of its capacity or less.
       devices: how many devices share the tiles; None means all local ones. Within a
         `jax.shard_map` of your own: 1, and ``check_vma=False`` there.
 
