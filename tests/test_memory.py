@@ -179,6 +179,32 @@ def test_the_estimate_of_gradients_is_what_xla_reserves(cameras, slots, pairs, r
 
 
 @pytest.mark.new_emitters
+@pytest.mark.parametrize(("slots", "pairs"), [(4096, 2**18), (2**16, 2**14)])
+@pytest.mark.parametrize("gradients", [False, True])
+def test_so_is_that_of_accelerators(slots, pairs, gradients, monkeypatch, report):
+    """Within 1.5 times of what XLA would reserve here for what they run."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    config = RasterConfig(**{**LIGHT, "pair_capacity": pairs}, occlusion=False)
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
+    scene = {name: np.zeros((slots, *shape)) for name, shape in shapes.items()}
+    gaussians = gsjax.make_gaussians(**scene, sh=np.zeros((slots, 4, 3)))
+    camera = camera_of(128, 96)
+
+    def picture(params):
+        return gsjax.render(gaussians.replace(params=params), camera, config)
+
+    learnt = jax.grad(lambda params: jnp.sum(picture(params).rgb))
+    lowered = jax.jit(learnt if gradients else picture).lower(gaussians.params)
+    sizes = lowered.compile().memory_analysis()
+    found = sizes.temp_size_in_bytes + sizes.output_size_in_bytes
+    estimate = render_estimate(
+        slots, 4, (128, 96), config, gradients=gradients, width=8
+    ).total
+    report("memory of accelerators", abs(np.log(estimate / found)), np.log(1.5))
+    assert 1 / 1.5 < estimate / found < 1.5
+
+
+@pytest.mark.new_emitters
 @pytest.mark.parametrize("devices", [1, 2])
 def test_the_estimate_of_pictures_is_what_the_loss_reserves(devices, report):
     """Within 1.5 times, and not less: the picture itself comes on top."""
