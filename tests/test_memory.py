@@ -179,8 +179,9 @@ def test_the_estimate_of_gradients_is_what_xla_reserves(cameras, slots, pairs, r
 
 
 @pytest.mark.new_emitters
-@pytest.mark.parametrize(("slots", "pairs"), [(4096, 2**18), (2**16, 2**14)])
-@pytest.mark.parametrize("gradients", [False, True])
+@pytest.mark.parametrize(
+    ("slots", "pairs", "gradients"), [(4096, 2**18, True), (2**16, 2**14, False)]
+)
 def test_so_is_that_of_accelerators(slots, pairs, gradients, monkeypatch, report):
     """Within 1.5 times of what XLA would reserve here for what they run."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
