@@ -4,10 +4,12 @@
 the default settings: guitar and garden where their data are, and synthetic shells of
 0.1, 1 and 3 M Gaussians at 1920 × 1080. Of every stage: microseconds, launches, bytes
 and operations (`kernels`), their shares of what the device was seen to do at most, and
-what bounds it: bytes, arithmetic, or launches (where kernels are so short that the next
-comes late). What no kernel fills, the device waited for the host. It tells, too,
-how each sort and each product of matrices was compiled. There is nothing to see on a
-CPU.
+what bounds it: bytes, arithmetic, launches (where kernels are so short that the next
+comes late), or none of them (where it does less than half of each: look-ups that wait
+for memory, threads that wait for one another). Bytes are counted as if nothing stayed
+in the caches, so a share may be above 1. What no kernel fills, the device waited for
+the host. It tells, too, how each sort and each product of matrices was compiled. There
+is nothing to see on a CPU.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from gsjax.console import note
 
 COUNTS = (100_000, 1_000_000, 3_000_000)
 _TURNS = 32
+_HALF = 0.5  # of the most: less does not bound
 _SHORT = 5  # µs: shorter kernels are over before the next is launched
 
 
@@ -62,8 +65,8 @@ def ceilings() -> dict[str, float]:
 
 
 def programs(case: scenes.Case):
-    """Compiled: (name, what to call, its text) of a render and its gradient; and the
-    demand."""
+    """A render and its gradient, compiled: (name, what to call, its text, seconds) of
+    each; and the settings, with capacities that fit."""
     gaussians, camera = case.gaussians, case.camera
     config = gsjax.exact_config(gaussians, camera)
     shape = (camera.height, camera.width, 3)
@@ -136,6 +139,8 @@ def measured(case: scenes.Case, made, limits: dict[str, float]) -> list[dict]:
             bound = max(shares, key=lambda key: shares[key])
             if row["us"] < _SHORT * row["launches"]:
                 bound = "launches"
+            elif shares[bound] < _HALF:
+                bound = "none"
             rows.append(
                 {
                     **common, "stage": stage, "us": row["us"],

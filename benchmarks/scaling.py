@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -20,6 +21,9 @@ from collections.abc import Callable
 
 import measure
 import numpy as np
+
+# This process asks JAX what there is, and leaves the memory to those it starts.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 COUNTS = (1_000, 10_000, 100_000, 1_000_000)
 SIZES = ((320, 180), (640, 360), (1280, 720), (1920, 1080))
@@ -201,6 +205,10 @@ def main() -> None:
     if options.point:
         print(json.dumps(point(*options.point)))
         return
+    import jax
+
+    if options.gpu == (jax.default_backend() == "cpu"):
+        raise SystemExit("--gpu is for accelerators, and for them alone")
     if options.gpu:
         points = [(n, 1920, 1080, 1, 1) for n in (100_000, 1_000_000, 3_000_000)]
     else:

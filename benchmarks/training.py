@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +24,9 @@ from gsjax import files, images
 from gsjax.curves import Series, curves
 from gsjax.train.folder import run_files
 from gsjax.train.history import read_metrics
+
+# This process asks JAX what there is, and leaves the memory to those it starts.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 EVERY = 50
 STRATEGIES = ("mcmc", "adaptive")

@@ -19,6 +19,7 @@ from conftest import (
     FAST,
     LIGHT,
     assert_not_empty,
+    camera_of,
     cast,
     loss_and_gradients,
     reference,
@@ -98,6 +99,84 @@ def test_gradients_are_those_of_the_other_way(kind, monkeypatch, report):
     assert np.linalg.norm(jax.tree.leaves(wanted)[0]) > 0
 
 
+def _rich(gaussians, camera, features, probe, mask):
+    """A loss of every output, by parameters, features and the absolute probe."""
+    weight = np.random.default_rng(3).normal(size=(camera.height, camera.width))
+
+    def loss(params, features, probe):
+        scene = gaussians.replace(params=params)
+        more = {"features": features, "abs_probe": probe, "mask": mask}
+        out = gsjax.render(scene, camera, RICH, **more)
+        total = jnp.sum(jnp.where(mask, jnp.sum(out.rgb, -1) * weight, 0))
+        total += jnp.sum(jnp.where(mask, out.median_depth * weight, 0))
+        return total, jnp.where(mask, out.median_depth, 0)
+
+    arguments = gaussians.params, features, probe
+    return jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(*arguments)
+
+
+# Sizes to choose from, a cap that lets α be 1, and no stop.
+RICH = gsjax.RasterConfig(
+    **{**LIGHT, "rungs": 4},
+    alpha_cap=1.0,
+    stop=0.0,
+    absgrad=True,
+    outputs=ALL,
+    chunk_size=4,
+)
+
+
+@pytest.mark.long
+def test_features_masks_and_absolute_gradients(monkeypatch, report):
+    gaussians, camera = scene_of("random")
+    rng = np.random.default_rng(2)
+    mask = np.zeros((camera.height, camera.width), bool)
+    mask[3:20, 10:40] = True
+    features = rng.random((gaussians.capacity, 5))
+    given = gaussians, camera, features, np.zeros((gaussians.capacity, 2)), mask
+    found = jax.jit(lambda *a: _rich(*a))(*given)
+    monkeypatch.undo()
+    wanted = jax.jit(lambda *a: _rich(*a))(*given)
+    least = 1e-8 * max(map(np.linalg.norm, jax.tree.leaves(wanted[1])))
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted)):
+        error = np.linalg.norm(one - other) / max(np.linalg.norm(other), least)
+        report(f"mask, features, absgrad, of {other.shape}", error, 1e-9)
+        assert error <= 1e-9
+    assert np.linalg.norm(wanted[1][2]) > 0  # of the probe
+    assert np.count_nonzero(wanted[0][1]) > 50
+
+
+@pytest.mark.parametrize("count", [1, 7, 1000])
+def test_a_half_is_crossed_once(count):
+    """There is one median depth where less than half is left, and none elsewhere; also
+    with a chunk for each Gaussian, in float32, where every chunk rounds T."""
+    rng = np.random.default_rng(count)
+    depth = np.sort(rng.uniform(1, 2, count))
+    scene = gsjax.make_gaussians(
+        means=np.stack([0 * depth, 0 * depth, depth], -1),
+        quats=np.tile([1.0, 0, 0, 0], (count, 1)),
+        log_scales=np.full((count, 3), -1.0),
+        logit_opacities=rng.normal(1 - np.log(count), 0.1, count),
+        sh=np.zeros((count, 1, 3)),
+    )
+    camera = camera_of(viewmat=np.eye(4))
+    config = gsjax.RasterConfig(
+        **{**LIGHT, "pair_capacity": 32_768},
+        chunk_size=1,
+        alpha_cut=1e-6,
+        outputs=("alpha", "median_depth"),
+    )
+    found = renders(*cast((scene, camera), jnp.float32), None, config)
+    assert not found.overflowed
+    alpha, median = np.asarray(found.alpha), np.asarray(found.median_depth)
+    far = np.abs(alpha - 0.5) > 1e-5
+    assert (alpha[far] > 0.5).any()
+    assert (alpha[far] < 0.5).any()
+    np.testing.assert_array_equal((median > 0)[far], (alpha > 0.5)[far])
+    # The sum of two would lie beyond all.
+    assert ((median == 0) | (median < 2.001)).all()
+
+
 def _both_ways(gaussians, camera, direction, cotangent):
     """Derivative along ``direction``, forward and by the transpose, both weighted."""
 
@@ -173,6 +252,27 @@ def test_each_of_a_batch_is_as_it_is_alone():
     for place, scene in enumerate((one, other)):
         alone = renders(scene, camera, BACKGROUND, COMPAT).rgb
         np.testing.assert_allclose(found[place], alone, atol=1e-12)
+
+
+def test_batches_of_cameras_and_devices_make_the_same_pictures():
+    gaussians, camera = scene_of("random")
+    alone = renders(gaussians, camera, BACKGROUND, COMPAT).rgb
+    several = gsjax.stack_cameras([camera, camera])
+    both = renders(gaussians, several, BACKGROUND, COMPAT).rgb
+    np.testing.assert_allclose(both, [alone, alone], atol=1e-12)
+    if jax.local_device_count() > 1:
+        shared = renders(gaussians, camera, BACKGROUND, COMPAT.replace(devices=2))
+        np.testing.assert_allclose(shared.rgb, alone, atol=1e-12)
+
+
+def test_nothing_is_nothing():
+    gaussians, camera = scene_of("random")
+    none = gaussians.replace(active=np.zeros(gaussians.capacity, bool))
+    found = renders(none, camera, BACKGROUND, COMPAT)
+    assert not np.any(found.alpha)
+    assert not np.any(found.median_depth)
+    behind = np.broadcast_to(BACKGROUND, found.rgb.shape)
+    np.testing.assert_array_equal(found.rgb, behind)
 
 
 @pytest.mark.parametrize("start", [0, 1, 4, 6, 9])

@@ -8,6 +8,7 @@ dense one. Capacities are fitted to the view; programs are compiled at one size.
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
@@ -15,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.bench import pixelwise
+from gsjax.cameras import Camera
 from gsjax.console import progress
 from gsjax.gaussians import Gaussians, with_sh_degree
-from gsjax.machine import usable_cores
+from gsjax.machine import all_of, usable_cores
 from gsjax.numerics import in_float64
 from gsjax.planning.types import Plan
 from gsjax.raster.render import exact_config, render
@@ -144,43 +146,54 @@ def _ready_runs(
 ) -> list[_Runs]:
     """Of the exact picture, and of each point; all that will be timed is compiled."""
     exact = Point("exact", "", _EXACT, double=True)
-    fits: dict[tuple, RasterConfig] = {}
+    fits = _Fits()
 
     def ready(point: Point) -> _Runs:
-        if point is exact:
-            return _run(trial, point, weights, {})
         run = _run(trial, point, weights, fits)
-        with jax.enable_x64(point.double):
-            jax.block_until_ready(run.forward())
+        if point is not exact:
+            with jax.enable_x64(point.double):
+                jax.block_until_ready(run.forward())
         return run
 
-    # An accelerator is idle while this compiles, on one core for each program. On a CPU
-    # all cores compile one, and the programs, which take them all, would meet.
-    workers = 1 if jax.default_backend() == "cpu" else usable_cores()
-    with ThreadPoolExecutor(workers) as pool:
-        made = [pool.submit(ready, point) for point in (exact, *settings)]
-        return [one.result() for one in progress(made, "points")]
+    every = [exact, *settings]
+    if jax.default_backend() == "cpu":
+        # All cores compile one, and the programs, which take them all, would meet.
+        return [ready(point) for point in progress(every, "pictures")]
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        # One core for each; an accelerator is idle meanwhile.
+        return all_of(pool, ready, every)
 
 
-def _run(
-    trial: Trial, point: Point, weights: np.ndarray, fits: dict[tuple, RasterConfig]
-) -> _Runs:
+class _Fits:
+    """Capacities that fit a view, found once for all points of equal sizes."""
+
+    def __init__(self):
+        self.found: dict[tuple, RasterConfig] = {}
+        self.locks: dict[tuple, Lock] = {}
+
+    def __call__(self, point: Point, scene: Gaussians, camera: Camera) -> RasterConfig:
+        """The point's settings, with capacities; its own where it has them."""
+        config = point.config
+        if config.pair_capacity is not None:
+            return config
+        sizes = config.alpha_cut, config.tile_size, config.chunk_size, point.double
+        with self.locks.setdefault(sizes, Lock()):
+            if sizes not in self.found:
+                self.found[sizes] = exact_config(scene, camera, config)
+        fit = self.found[sizes]
+        return config.replace(
+            pair_capacity=fit.pair_capacity, visible_capacity=fit.visible_capacity
+        )
+
+
+def _run(trial: Trial, point: Point, weights: np.ndarray, fits: _Fits) -> _Runs:
     """Compile, run once, and hand out what to time; ``fits`` keeps the capacities."""
     with jax.enable_x64(point.double):
         scene, camera = trial.gaussians, trial.camera
         if point.double:
             scene, camera = in_float64((scene, camera))
         degree = scene.sh_degree if point.degree is None else point.degree
-        config, sizes = point.config, point.config
-        sizes = (sizes.alpha_cut, sizes.tile_size, sizes.chunk_size)
-        if config.pair_capacity is not None:
-            fits[sizes] = config
-        if sizes not in fits:
-            fits[sizes] = exact_config(scene, camera, config)
-        config = config.replace(
-            pair_capacity=fits[sizes].pair_capacity,
-            visible_capacity=fits[sizes].visible_capacity,
-        )
+        config = fits(point, scene, camera)
         dtype = scene.params.means.dtype
         behind = jnp.asarray(trial.background, dtype)
         weigh = jnp.asarray(weights, dtype)

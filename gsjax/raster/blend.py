@@ -245,10 +245,18 @@ def blend_alphas(
 
 
 def sums_behind(
-    carried: Array, alpha: Array, parts: Parts, config: RasterConfig
+    carried: Array,
+    alpha: Array,
+    parts: Parts,
+    config: RasterConfig,
+    left: Array | None = None,
 ) -> tuple[Array, dict[str, Array]]:
     """As `blend_alphas`, but what is returned is of the chunk by itself: ``carried``
-    tells who stops, and has no part in the transmittance or in "sums"."""
+    tells who stops, and has no part in the transmittance or in "sums".
+
+    ``left`` [G, P] is what the chunk behind this one is told is carried; None for the
+    product.
+    """
     # A cap of 1, as α has it, needs the rule that does not divide.
     apart = np.asarray(config.alpha_cap, alpha.dtype) < 1
     product = transmittance if apart else running_product
@@ -263,6 +271,7 @@ def sums_behind(
         # number: rounding may let more reach one than the one before it.
         number = jnp.sum(reached > 0.5, axis=1, dtype=jnp.int32, keepdims=True)
         last = lax.broadcasted_iota(jnp.int32, reached.shape, 1) == number - 1
-        half = last & (carried * total <= 0.5)[:, None] & blended
+        left = carried * total if left is None else left
+        half = last & (left <= 0.5)[:, None] & blended
         out["median"] = jnp.sum(jnp.where(half, parts.depth, 0), axis=1)
     return total, out

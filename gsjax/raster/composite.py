@@ -1,4 +1,5 @@
-"""Front-to-back compositing of sorted tile lists, chunk by chunk.
+"""Front-to-back compositing of sorted tile lists, chunk by chunk, on a CPU; see
+`gsjax.raster.flat` for accelerators.
 
 Axis legend: S steps, G tiles of a step, K Gaussians of a chunk, P pixels of a tile,
 C channels, R ranks.

@@ -35,7 +35,7 @@ from gsjax.raster.types import Array, Projected, RasterConfig
 
 T = TypeVar("T")
 
-_BATCH = 16_384  # entries, of half a gigabyte at work: launches are then few
+_BATCH = 2**25  # Gaussians at pixels, half a gigabyte at work: launches are then few
 
 
 class Entries(NamedTuple):
@@ -56,8 +56,9 @@ def entry_capacity(capacity: int, grid: Grid, chunk: int) -> int:
 
 
 def batch_size(config: RasterConfig) -> int:
-    """B."""
-    return config.tiles_per_step or _BATCH
+    """B: 16,384 with 8 × 8 pixels and 32 Gaussians."""
+    each = config.chunk_size * config.tile_size**2
+    return config.tiles_per_step or max(1, _BATCH // each)
 
 
 def composite_flat(
@@ -86,7 +87,8 @@ def composite_flat(
     columns = columns_of(projected, config)
     tables = Parts(**{name: jnp.stack(some, -1) for name, some in columns.items()})
     chunk_of = partial(_chunk_of, lists=lists, device=device, grid=grid, config=config)
-    carried = _carried(lax.stop_gradient(tables), entries, chunk_of, grid, config)
+    bare = lax.stop_gradient(tables)
+    carried, left = _transmittances(bare, entries, chunk_of, grid, config)
     live = jnp.any(carried > config.stop, axis=1) & (tile < grid.tiles)
     index, count = squeeze(live, room)
     # The last of each tile that is live: the first is, wherever there is one.
@@ -95,14 +97,14 @@ def composite_flat(
     def of_size(size: int) -> dict[str, Array]:
         some = index[:size]
         there = lax.iota(jnp.int32, size) < count
-        mine = Entries(
-            jnp.where(there, tile.at[some].get(mode="clip"), grid.tiles),
-            take(level, some),
-        )
-        added = _blended(tables, mine, take(carried, some), chunk_of, grid, config)
-        return {
-            name: take(_along_lists(mine, value), last) for name, value in added.items()
-        }
+        tile_of = jnp.where(there, tile.at[some].get(mode="clip"), grid.tiles)
+        mine = Entries(tile_of, take(level, some))
+        through = take(carried, some), take(left, some)
+        added = _blended(tables, mine, through, chunk_of, grid, config)
+        sums = {"sums": _along_lists(jnp.add, mine, added["sums"])}
+        if "median" in added:
+            sums["median"] = _along_lists(_first, mine, added["median"])
+        return {name: take(value, last) for name, value in sums.items()}
 
     return on_ladder(count, room, max(1, config.rungs - 1), of_size)
 
@@ -125,14 +127,15 @@ def _chunk_of(
     return Chunk(parts, corner.astype(tables.splats.dtype))
 
 
-def _carried(
+def _transmittances(
     tables: Parts,
     entries: Entries,
     chunk_of: Callable[[Parts, Entries], Chunk],
     grid: Grid,
     config: RasterConfig,
-) -> Array:
-    """Transmittance [E, P] in front of each entry.
+) -> tuple[Array, Array]:
+    """Transmittance [E, P] in front of each entry, and that behind it: what is behind
+    one is, bit for bit, in front of the next.
 
     By logarithms: their sums, in whatever order, are off by less than products of 1 − α
     where there are many faint Gaussians.
@@ -146,33 +149,35 @@ def _carried(
 
     there = entries.tile < grid.tiles
     log_total = _in_batches(through, there, entries, batch_size(config))
-    carried = jnp.exp(_before(entries, _along_lists(entries, log_total)))
+    left = jnp.exp(_along_lists(jnp.add, entries, log_total))
     # Else what is asked of it would be computed anew from the steps of the sum.
-    return lax.optimization_barrier(carried)
+    left = lax.optimization_barrier(left)
+    return _before(entries, left, 1), left
 
 
 def _blended(
     tables: Parts,
     entries: Entries,
-    carried: Array,
+    through: tuple[Array, Array],
     chunk_of: Callable[[Parts, Entries], Chunk],
     grid: Grid,
     config: RasterConfig,
 ) -> dict[str, Array]:
-    """What each entry adds to its tile's image, [E, …]."""
+    """What each entry adds to its tile's image, [E, …]; ``through`` as of
+    `_transmittances`."""
     pixels = pixel_centres(grid.tile, tables.splats.dtype)
 
     @jax.checkpoint
-    def blend(inputs: tuple[Array, Chunk]) -> tuple[Array, dict[str, Array]]:
-        carried, chunk = inputs
+    def blend(inputs) -> tuple[Array, dict[str, Array]]:
+        (carried, left), chunk = inputs
         alpha = alphas_of(chunk, pixels, config)
-        return sums_behind(carried, alpha, chunk.parts, config)
+        return sums_behind(carried, alpha, chunk.parts, config, left)
 
     # Ahead of the loop, so that the transpose is one scatter-add and not one a batch.
-    inputs = carried, chunk_of(tables, entries)
+    inputs = through, chunk_of(tables, entries)
     there = entries.tile < grid.tiles
     total, out = _in_batches(blend, there, inputs, batch_size(config))
-    front = _in_front(total, carried, entries)
+    front = _in_front(total, through[0], entries)
     return {**out, "sums": front[:, None] * out["sums"]}
 
 
@@ -193,7 +198,7 @@ def _in_front_jvp(primals, tangents):
     total, _, entries = primals
     front = _in_front(*primals)
     rate = tangents[0] / jnp.where(total > 0, total, 1)
-    return front, front * _before(entries, _along_lists(entries, rate))
+    return front, front * _before(entries, _along_lists(jnp.add, entries, rate), 0)
 
 
 def _in_batches(run: Callable[[Any], T], needed: Array, inputs: Any, size: int) -> T:
@@ -223,17 +228,25 @@ def _in_batches(run: Callable[[Any], T], needed: Array, inputs: Any, size: int) 
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:count], out)
 
 
-def _along_lists(entries: Entries, values: Array) -> Array:
-    """Sums of the values [E, …] along each list, of each with those before it."""
+def _along_lists(
+    join: Callable[[Array, Array], Array], entries: Entries, values: Array
+) -> Array:
+    """What the values [E, …] come to along each list, each with those before it."""
     first = (entries.level == 0).reshape(-1, *[1] * (values.ndim - 1))
 
-    def add(a, b):
-        return a[0] | b[0], jnp.where(b[0], b[1], a[1] + b[1])
+    def both(a, b):
+        return a[0] | b[0], jnp.where(b[0], b[1], join(a[1], b[1]))
 
-    return lax.associative_scan(add, (first, values))[1]
+    return lax.associative_scan(both, (first, values))[1]
 
 
-def _before(entries: Entries, sums: Array) -> Array:
-    """Of sums [E, P] along the lists that of those before each; 0 at the first."""
-    moved = jnp.concatenate([jnp.zeros_like(sums[:1]), sums[:-1]])
-    return jnp.where((entries.level == 0)[:, None], 0, moved)
+def _first(one: Array, other: Array) -> Array:
+    """Of two the first that there is. Where T rises by rounding, it falls through a
+    half once more."""
+    return jnp.where(one != 0, one, other)
+
+
+def _before(entries: Entries, values: Array, none: float) -> Array:
+    """Of values [E, P] those of the entry before; ``none`` at the first of a list."""
+    moved = jnp.concatenate([jnp.zeros_like(values[:1]), values[:-1]])
+    return jnp.where((entries.level == 0)[:, None], none, moved)

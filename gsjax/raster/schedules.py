@@ -1,4 +1,5 @@
-"""The list of work that the lists of tiles come to: which chunk of which tiles, when.
+"""The list of work that the lists of tiles come to on a CPU: which chunk of which
+tiles, when.
 
 A step is one chunk of K Gaussians for each of G tiles. Tiles are taken in order of list
 length, so the G tiles of a block need nearly the same number of steps and no tile waits

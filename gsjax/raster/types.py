@@ -52,13 +52,13 @@ class RasterConfig:
       visible_capacity: room for Gaussians in view (of each camera); None means all
         slots. Reported and regrown like ``pair_capacity``.
       occlusion: leave out, before sorting, what lies behind pixels that have all
-        stopped. Bit-equal; pays where something opaque fills part of the view.
+        stopped. Bit-equal on a CPU; pays where something opaque fills part of the view.
       rungs: how many sizes, each a quarter of the one before, sorting by depth is
         compiled for; the smallest that fits is run. Sorting pairs, on accelerators,
-        has sizes between them; from 2 on there is a small size of projecting, and from
-        4 on the gradient of compositing has sizes too, two fewer (on accelerators, all
-        of compositing, one fewer). Each takes seconds to compile, and saves time where
-        a view needs a quarter of its capacity or less.
+        has sizes between them; from 2 on there is a small size of projecting, from 4 on
+        the gradient of compositing has sizes too, two fewer, and on accelerators from 3
+        on all of compositing, one fewer. Each takes seconds to compile, and saves time
+        where a view needs a quarter of its capacity or less.
       devices: how many devices share the tiles; None means all local ones. Within a
         `jax.shard_map` of your own: 1, and ``check_vma=False`` there.
 
