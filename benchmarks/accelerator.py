@@ -153,15 +153,12 @@ def measured(case: scenes.Case, made, limits: dict[str, float]) -> list[dict]:
 
 
 def main() -> None:
-    """Compile side by side, then profile one after another."""
+    """Compile side by side, profile one after another, and save."""
+    if jax.default_backend() == "cpu":
+        raise SystemExit("there is no accelerator: nothing to profile")
     cases = [*scenes.real_cases(), *(scenes.shell(n, 1920, 1080) for n in COUNTS)]
     with ThreadPoolExecutor(8) as pool:
         made = list(pool.map(programs, cases))
-    save_measured(cases, made)
-
-
-def save_measured(cases: list[scenes.Case], made: list) -> None:
-    """Profile what `programs` made, and save."""
     limits = ceilings()
     note(f"at most: {limits}")
     rows, compiled = [], {}

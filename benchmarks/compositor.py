@@ -32,7 +32,7 @@ from gsjax.raster.blend import (
     splats_of,
     tables_of,
 )
-from gsjax.raster.composite import composite, corners, take_rows
+from gsjax.raster.composite import composite, take_rows
 from gsjax.raster.order import depth_order
 from gsjax.raster.project import conics_of, project
 
@@ -89,7 +89,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
 
         def step(carried, inputs):
             first, live, block, ranks = inputs
-            corner = corners(schedule.tiles[block], grid, device, pixels.dtype)
+            corner = bins.corners(schedule.tiles[block], grid, device, pixels.dtype)
             splats = take_rows(tables.splats, ranks)
             carried = jnp.where(first, 1, carried)
             go = live & jnp.any(carried > config.stop)

@@ -132,14 +132,19 @@ def test_huge_images_are_refused_at_once(monkeypatch):
         gsjax.render_exact(scene, camera_of(60_000, 60_000))
 
 
+def zeros(slots):
+    """So many Gaussians of degree 1."""
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
+    scene = {name: np.zeros((slots, *shape)) for name, shape in shapes.items()}
+    return gsjax.make_gaussians(**scene, sh=np.zeros((slots, 4, 3)))
+
+
 @pytest.mark.new_emitters
 @pytest.mark.parametrize(("slots", "pairs"), [(4096, 2**18), (2**16, 2**14)])
 def test_the_estimate_is_what_xla_reserves(slots, pairs, report):
     """Within 1.5 times; where pairs decide, and where Gaussians do."""
     config = RasterConfig(**{**LIGHT, "pair_capacity": pairs}, occlusion=False)
-    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
-    scene = {name: np.zeros((slots, *shape)) for name, shape in shapes.items()}
-    gaussians = gsjax.make_gaussians(**scene, sh=np.zeros((slots, 4, 3)))
+    gaussians = zeros(slots)
     camera = camera_of(128, 96)
     lowered = jax.jit(gsjax.render, static_argnames="config").lower(
         gaussians, camera, config
@@ -159,9 +164,7 @@ def test_the_estimate_is_what_xla_reserves(slots, pairs, report):
 def test_the_estimate_of_gradients_is_what_xla_reserves(cameras, slots, pairs, report):
     """Within 1.5 times; of one camera, and of some in one call."""
     config = RasterConfig(**{**LIGHT, "pair_capacity": pairs}, occlusion=False)
-    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
-    scene = {name: np.zeros((slots, *shape)) for name, shape in shapes.items()}
-    gaussians = gsjax.make_gaussians(**scene, sh=np.zeros((slots, 4, 3)))
+    gaussians = zeros(slots)
     camera = gsjax.stack_cameras([camera_of(128, 96)] * cameras)
 
     def brightness(params, camera):
@@ -186,9 +189,7 @@ def test_so_is_that_of_accelerators(slots, pairs, gradients, monkeypatch, report
     """Within 1.5 times of what XLA would reserve here for what they run."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     config = RasterConfig(**{**LIGHT, "pair_capacity": pairs}, occlusion=False)
-    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
-    scene = {name: np.zeros((slots, *shape)) for name, shape in shapes.items()}
-    gaussians = gsjax.make_gaussians(**scene, sh=np.zeros((slots, 4, 3)))
+    gaussians = zeros(slots)
     camera = camera_of(128, 96)
 
     def picture(params):

@@ -57,6 +57,11 @@ def tile_origins(grid: Grid, tile: Array, device: Array) -> tuple[Array, Array]:
     return col * grid.tile, (row * grid.stride + device) * grid.tile
 
 
+def corners(tile: Array, grid: Grid, device: Array, dtype) -> Array:
+    """[..., 2] upper left corners of the tiles, px."""
+    return jnp.stack(tile_origins(grid, tile, device), -1).astype(dtype)
+
+
 class Spans(NamedTuple):
     """``rows`` local rows of tiles from ``first``, [R] each."""
 

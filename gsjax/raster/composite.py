@@ -25,7 +25,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from gsjax.raster.alpha import pixel_centres
 from gsjax.raster.batches import any_of_batch
-from gsjax.raster.bins import Grid, Lists, tile_origins
+from gsjax.raster.bins import Grid, Lists, corners
 from gsjax.raster.blend import (
     Chunk,
     Parts,
@@ -270,11 +270,6 @@ def _scan(
 def take_rows(rows: T, index: Array) -> T:
     """Of every array those rows; all there."""
     return jax.tree.map(lambda a: a.at[index].get(mode="promise_in_bounds"), rows)
-
-
-def corners(tile: Array, grid: Grid, device: Array, dtype) -> Array:
-    """[..., 2] upper left corners of the tiles, px."""
-    return jnp.stack(tile_origins(grid, tile, device), -1).astype(dtype)
 
 
 def _nothing(tables: Parts, group: int, pixels: int) -> dict[str, Array]:

@@ -26,7 +26,7 @@ from jax import lax
 
 from gsjax.raster.alpha import pixel_centres
 from gsjax.raster.batches import any_of_batch
-from gsjax.raster.bins import Grid, Lists, tile_origins
+from gsjax.raster.bins import Grid, Lists, corners
 from gsjax.raster.blend import Chunk, Parts, alphas_of, columns_of, sums_behind
 from gsjax.raster.counts import owners, running_total, squeeze, take
 from gsjax.raster.ladder import on_ladder
@@ -122,9 +122,8 @@ def _chunk_of(
     none = tables.splats.shape[0]
     tile = entries.tile[:, None]
     ranks = ranks_at(lists, tile, entries.level, config.chunk_size, none)[:, 0]
-    corner = jnp.stack(tile_origins(grid, entries.tile, device), -1)
     parts = jax.tree.map(lambda table: take(table, ranks), tables)
-    return Chunk(parts, corner.astype(tables.splats.dtype))
+    return Chunk(parts, corners(entries.tile, grid, device, tables.splats.dtype))
 
 
 def _transmittances(

@@ -15,8 +15,6 @@ from gsjax.cameras import Camera
 from gsjax.errors import CapacityError, InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.memory import require
-from gsjax.numerics import safe_divide
-from gsjax.raster import bins
 from gsjax.raster.counts import total_count
 from gsjax.raster.footprint import render_estimate as render_estimate
 from gsjax.raster.inputs import (
@@ -24,16 +22,13 @@ from gsjax.raster.inputs import (
     check_config,
     check_features,
     check_gaussians,
-    check_real,
     checked_mask,
     checked_size,
     with_batch,
 )
-from gsjax.raster.order import depth_order
-from gsjax.raster.project import project
+from gsjax.raster.picture import draw, finish
 from gsjax.raster.rasterise import device_count as device_count
-from gsjax.raster.rasterise import rasterise
-from gsjax.raster.types import COLOR_LIMIT, Array, Demand, RasterConfig, Render
+from gsjax.raster.types import Array, Demand, RasterConfig, Render
 
 DEFAULT_CONFIG = RasterConfig()
 _LEAST_ROOM = 1024  # slots
@@ -101,7 +96,7 @@ def render(
     mask, size = checked_mask(mask, camera), checked_size(size, camera)
 
     def render_one(inputs):
-        return _render_one(gaussians, config, features, *inputs)
+        return draw(gaussians, config, features, *inputs)
 
     # One after another: no more at a time than one camera takes (a gradient keeps what
     # it needs of each), and the program of one.
@@ -118,7 +113,7 @@ def render(
     )
     overflowed = jnp.any(overflowed)
     colors = 3 if features is None else features.shape[1]
-    images = _finish(sums, config, background, count, colors)
+    images = finish(sums, config, background, count, colors)
     if not camera.batched:
         images = {name: image[0] for name, image in images.items()}
         radii = radii[0]
@@ -131,73 +126,6 @@ def render(
         demand=demand,
         overflowed=overflowed,
     )
-
-
-def _render_one(
-    gaussians: Gaussians,
-    config: RasterConfig,
-    features: Array | None,
-    camera: Camera,
-    probe: Array | None,
-    abs_probe: Array | None,
-    mask: Array | None,
-    size: Array | None,
-) -> tuple[dict[str, Array], Array, Demand, Array]:
-    """One camera: images before the background, radii [N], demand, overflowed."""
-    # The names that a profile shows.
-    with jax.named_scope("order"):
-        order, visible = depth_order(gaussians, camera, config, features)
-    with jax.named_scope("project"):
-        out = project(
-            gaussians, camera, config, order, visible, features, probe, abs_probe
-        )
-    radii = jnp.zeros(gaussians.capacity, out.u.dtype)
-    width, height = camera.width, camera.height
-    if size is not None:
-        width, height = size.astype(out.u.dtype)
-    seen = bins.radii(lax.stop_gradient(out), width, height)
-    sums, demand, overflowed = rasterise(out, camera.width, camera.height, config, mask)
-    room = min(config.visible_capacity or gaussians.capacity, gaussians.capacity)
-    return (
-        sums,
-        radii.at[order].set(seen, mode="drop"),
-        demand._replace(visible=visible),
-        overflowed | (visible > room),
-    )
-
-
-def _finish(
-    sums: dict[str, Array], config: RasterConfig, background, cameras: int, colors: int
-) -> dict[str, Array]:
-    """Background and normalisation: sums [B, H, W, C] to named images."""
-    total = sums["sums"]
-    alpha = total[..., -1]
-    out = {}
-    if "rgb" in config.outputs:
-        rgb = total[..., :colors]
-        if background is not None:
-            check_real("background", background)
-            background = jnp.asarray(background, rgb.dtype)
-            if background.shape not in ((colors,), (cameras, colors)):
-                raise InputError(
-                    f"background has shape {background.shape}; ({colors},) or "
-                    f"({cameras}, {colors}) is wanted"
-                )
-            # What is not finite would show through wherever the scene is not opaque.
-            background = jnp.where(jnp.abs(background) < COLOR_LIMIT, background, 0)
-            background = jnp.broadcast_to(background, (cameras, colors))
-            # As a product: its transpose is one too, not a sum over few channels.
-            rgb = rgb + jnp.einsum(
-                "bhw,bc->bhwc", 1 - alpha, background, precision="highest"
-            )
-        out["rgb"] = rgb
-    if "alpha" in config.outputs:
-        out["alpha"] = alpha
-    if "depth" in config.outputs:
-        out["depth"] = safe_divide(total[..., -2], alpha, alpha > 1e-10)
-    if "median_depth" in config.outputs:
-        out["median_depth"] = sums["median"]
-    return out
 
 
 _render_jit = jax.jit(render, static_argnames="config")

@@ -62,7 +62,7 @@ class Work(NamedTuple):
 
 
 def tiles_per_step(config: RasterConfig, grid: Grid) -> int:
-    """G: few keep to a CPU's caches."""
+    """G: few stay in a CPU's caches."""
     return max(1, min(config.tiles_per_step or 16, grid.tiles))
 
 
