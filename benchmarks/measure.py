@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -30,6 +31,19 @@ def here(name: str) -> str:
     """``name``, of an accelerator with what that is: "_gpu"."""
     backend = jax.default_backend()
     return name if backend == "cpu" else f"{name}_{backend}"
+
+
+def elsewhere(name: str) -> list[tuple[str, list[dict]]]:
+    """(Device, rows) of what is kept of that name from other kinds of device."""
+    found = []
+    for path in (RESULTS / f"{name}.json", RESULTS / f"{name}_gpu.json"):
+        if path.stem != here(name) and path.exists():
+            told = json.loads(path.read_text())
+            machine = told["machine"]
+            device = machine["devices"].split(" × ")[1]
+            device = machine["cpu"] if device == "cpu" else device
+            found.append((device, told["rows"]))
+    return found
 
 
 def save(name: str, rows: list[dict], **more) -> None:

@@ -5,7 +5,8 @@ and its rule, SH degree, tile, chunk, dtype), with a plan for 1/255 beside them,
 scenes that are built in, and guitar and garden where their data are, or on those named:
 milliseconds forward, and of value and gradient, against the errors of the picture and
 of the gradient. It exits with 1 if an error is beyond its bound at any pixel looked
-at. ``gsjax bench`` does one scene.
+at. Fronts that are kept of another kind of device are drawn beside. ``gsjax bench``
+does one scene.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ def main() -> int:
             f"pareto_{trial.name}", rows, claim=__doc__, stages=stages(trial),
             size=[trial.camera.width, trial.camera.height], reasons=made.lines(),
         )  # fmt: skip
-        picture = front_picture(rows, trial.name)
+        others = measure.elsewhere(f"pareto_{trial.name}")
+        picture = front_picture(rows, trial.name, others)
         path = measure.RESULTS / (measure.here(f"pareto_{trial.name}") + ".png")
         files.write_file(path, images.encode_png(picture))
         inside &= all(row["inside"] for row in rows)

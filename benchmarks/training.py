@@ -6,7 +6,8 @@ out (else every 8th), in a process that has nothing compiled; with ``--steps N``
 steps, ``--max-gaussians N`` no more Gaussians, ``--preset NAME`` another preset. Kept
 are PSNR and SSIM of the held-out views over seconds; compiling counts, measuring does
 not. What was kept of other runs of that dataset stays. Drawn are PSNR over seconds,
-and that of the ends over Gaussians where runs differ in these alone.
+with the runs that are kept of another kind of device, and that of the ends over
+Gaussians where runs differ in these alone; with ``--draw`` of what is kept.
 """
 
 from __future__ import annotations
@@ -72,15 +73,11 @@ def main(
             last = {key: logged[key] for key in ("compilations", "compile_seconds")}
             rows += [{"strategy": strategy + more, **record} for record in found]
             rows[-1] |= {**last, "date": machine["date"]}
-    measure.RESULTS.mkdir(exist_ok=True)
     content = {"machine": machine, "claim": __doc__, "held out": held_out}
     files.write_json(path, {**content, "rows": rows})
-    title = f"{dataset.name}: PSNR of what was held out, dB"
-    draw(path.with_suffix(".png"), over_seconds(rows), title, "seconds")
-    sizes = path.with_name(f"{path.stem}_gaussians.png")
-    draw(sizes, over_gaussians(rows), f"{title}, at the end", "thousand Gaussians")
     for row in rows:
         print(row)
+    draw(dataset.name)
 
 
 def by(rows: list[dict], key: Callable[[dict], str]) -> dict[str, list[dict]]:
@@ -89,6 +86,24 @@ def by(rows: list[dict], key: Callable[[dict], str]) -> dict[str, list[dict]]:
     for row in rows:
         found.setdefault(key(row), []).append(row)
     return found
+
+
+def draw(name: str) -> None:
+    """Pictures of what is kept of a dataset."""
+    stem = f"training_{name}"
+    path = measure.RESULTS / f"{measure.here(stem)}.json"
+    rows = json.loads(path.read_text())["rows"]
+    others = [
+        {**row, "strategy": f"{row['strategy']}, {device}"}
+        for device, found in measure.elsewhere(stem)
+        for row in found
+    ]
+    title = f"{name}: PSNR of what was held out, dB"
+    series = over_seconds([*rows, *others])
+    write(path.with_suffix(".png"), series, title, "seconds", log_x=True)
+    sizes = path.with_name(f"{path.stem}_gaussians.png")
+    ends = over_gaussians(rows)
+    write(sizes, ends, f"{title}, at the end", "thousand Gaussians", log_x=False)
 
 
 def over_seconds(rows: list[dict]) -> list[Series]:
@@ -112,12 +127,14 @@ def line(name: str, rows: list[dict], over: str, unit: float) -> Series:
     return Series(name, [unit * r[over] for r in rows], [r["psnr"] for r in rows])
 
 
-def draw(path: Path, series: list[Series], title: str, x_label: str) -> None:
+def write(
+    path: Path, series: list[Series], title: str, x_label: str, log_x: bool
+) -> None:
     """Write a picture of the lines, if there are any."""
     if series:
         # The names of the lines stand beside the title.
         size = (720 if len(series) < 4 else 1200, 420)
-        picture = curves(series, title=title, x_label=x_label, size=size)
+        picture = curves(series, title=title, x_label=x_label, size=size, log_x=log_x)
         files.write_file(path, images.encode_png(picture))
 
 
@@ -128,9 +145,13 @@ if __name__ == "__main__":
     parser.add_argument("--strategy", action="append", choices=STRATEGIES)
     for option in CHANGES:
         parser.add_argument(f"--{option}", dest=option)
+    parser.add_argument("--draw", action="store_true")
     given = parser.parse_args()
     chosen = given.strategy or list(STRATEGIES)
     changed = {name: getattr(given, name) for name in CHANGES if getattr(given, name)}
     if changed.get("preset") == "fast":
         del changed["preset"]
-    main(given.dataset, given.images, chosen, changed)
+    if given.draw:
+        draw(given.dataset.name)
+    else:
+        main(given.dataset, given.images, chosen, changed)

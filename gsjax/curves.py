@@ -64,6 +64,7 @@ def curves(
     x_label: str = "step",
     size: tuple[int, int] = (720, 420),
     marks: Sequence[Mark] = (),
+    log_x: bool = False,
 ) -> np.ndarray:
     """A plot [H, W, 3] uint8 of all series in one frame, with a legend.
 
@@ -73,16 +74,26 @@ def curves(
       x_label: below it.
       size: (width, height) in px, at least 200 × 120.
       marks: by ``x``; those that lie within the frame are drawn, behind the series.
+      log_x: whether ``x`` is logarithmic; what is not above 0 is left out then.
 
     Raises:
       InputError: if ``x`` and ``y`` differ in length, or the size is too small.
     """
+
+    def along(x) -> np.ndarray:
+        x = np.asarray(x, float)
+        return np.log10(x, out=np.full(x.shape, np.nan), where=x > 0) if log_x else x
+
     lines = [_points(line) for line in series]
+    lines = [np.stack([along(line[:, 0]), line[:, 1]], axis=1) for line in lines]
+    marks = [mark._replace(x=float(along(mark.x))) for mark in marks]
     finite = np.concatenate(
         [np.zeros((0, 2)), *(p[np.isfinite(p).all(axis=1)] for p in lines)]
     )
     ranges = _range(finite[:, 0], 0.0), _range(finite[:, 1], 0.06)
-    plot, place = axes(*ranges, title=title, x_label=x_label, size=size)
+    plot, place = axes(
+        *ranges, title=title, x_label=x_label, size=size, log=(log_x, False)
+    )
     inside = [m for m in marks if ranges[0][0] <= m.x <= ranges[0][1]]
     at = place(np.asarray([(mark.x, ranges[1][0]) for mark in inside]).reshape(-1, 2))
     _draw_marks(plot, inside, np.rint(at[:, 0]).astype(int).tolist())

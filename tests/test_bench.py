@@ -10,7 +10,7 @@ from conftest import camera_of, frustum_points, gaussians_at
 
 import gsjax
 from gsjax import RasterConfig, cli
-from gsjax.bench import pixelwise
+from gsjax.bench import pixelwise, sheet
 from gsjax.bench.fronts import Box, Mark, label_boxes, scatter
 from gsjax.bench.pareto import Point, front, pareto, points
 from gsjax.bench.scenes import facing, open_trial
@@ -132,6 +132,24 @@ def test_table_and_plot():
     picture = front_picture(rows, "x")
     assert picture.dtype == np.uint8
     assert picture.shape == (1120, 860, 3)
+
+
+def test_of_other_devices_the_fronts_are_drawn(monkeypatch):
+    drawn = []
+
+    def keep(marks, fronts, **words):
+        drawn.append((marks, [[marks[i].x for i in front] for front in fronts]))
+        return scatter(marks, fronts, **words)
+
+    monkeypatch.setattr(sheet, "scatter", keep)
+    mine = [row(30, 1e-1), row(20, 1e-2), row(40, 1e-3)]
+    other = [row(1, 1e-1), row(3, 1e-1, "slower"), row(2, 1e-2)]
+    assert front_picture(mine, "x", [("chip", other)]).shape == (1120, 860, 3)
+    assert len(drawn) == 2
+    marks, fronts = drawn[0]
+    assert fronts == [[20, 40], [1, 2]]
+    assert [mark.x for mark in marks if "chip" not in mark.label] == [30, 20, 40]
+    assert [mark.x for mark in marks if "chip" in mark.label] == [1, 2]
 
 
 def test_marks_are_where_their_values_are():

@@ -165,6 +165,17 @@ def test_a_curve_goes_where_its_values_are():
     assert gap.sum() > 0.6 * ink.sum()
 
 
+def test_a_logarithmic_axis_takes_powers_for_steps():
+    """10^x over such an axis is x over a plain one; what is not above 0 is left out."""
+    x = np.arange(1, 50)
+    y = np.sqrt(x)
+    plain = inked(curves([Series("up", x, y)], size=(400, 300)))
+    powers = Series("up", [-1.0, 0.0, *10.0**x], [0.0, 9.0, *y])
+    found = inked(curves([powers], size=(400, 300), log_x=True))
+    # But for pixels where one has a line of the grid, and the other none.
+    assert (found != plain).sum() < 0.02 * plain.sum()
+
+
 @pytest.mark.parametrize(
     "series",
     [

@@ -1,4 +1,4 @@
-"""A scatter plot on two logarithmic axes, with the Pareto front; drawn by OpenCV."""
+"""A scatter plot on two logarithmic axes, with Pareto fronts; drawn by OpenCV."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -25,7 +25,7 @@ class Mark(NamedTuple):
 
 def scatter(
     marks: Sequence[Mark],
-    front: Sequence[int] = (),
+    fronts: Sequence[Sequence[int]] = (),
     *,
     title: str = "",
     x_label: str = "",
@@ -36,7 +36,7 @@ def scatter(
 
     Args:
       marks: values above 0; at least one.
-      front: indices of the marks that the front goes through, in order; drawn as the
+      fronts: indices of the marks that each front goes through, in order; drawn as the
         steps that it has.
       title, x_label, y_label: words.
       size: (width, height) in px.
@@ -51,7 +51,8 @@ def scatter(
         size=size, log=(True, True),
     )  # fmt: skip
     places = place(values)
-    _draw_front(plot, places[list(front)])
+    for front in fronts:
+        _draw_front(plot, places[list(front)])
     _draw_marks(plot, places, marks)
     return plot
 

@@ -38,23 +38,35 @@ def table(rows: Sequence[dict], on_front: Sequence[int]) -> str:
     return "\n".join(lines)
 
 
-def front_picture(rows: Sequence[dict], name: str) -> np.ndarray:
+def front_picture(
+    rows: Sequence[dict],
+    name: str,
+    elsewhere: Sequence[tuple[str, Sequence[dict]]] = (),
+) -> np.ndarray:
     """Two plots [H, W, 3], one above the other: forward time against the largest
-    error, and that of value and gradient against the gradient's."""
+    error, and that of value and gradient against the gradient's.
+
+    Args:
+      rows: all of them are drawn, and their front.
+      name: of the scene.
+      elsewhere: (device, rows) of which the fronts are drawn too.
+    """
     plots = []
     for time, error, title in (
         ("forward ms", "max", f"{name}: forward, largest error of rgb"),
         ("gradient ms", "gradient", f"{name}: value and gradient, relative L2"),
     ):
-        marks = [
-            Mark(
-                row[time],
-                max(row[error], _LEAST),
-                f"{row['knob']} {row['value']}".strip(),
-                row["knob"],
-            )
-            for row in rows
-        ]
         best = front(rows, time, error)
-        plots.append(scatter(marks, best, title=title, x_label="ms", y_label="error"))
+        marks = [_mark(row, time, error) for row in rows]
+        fronts: list[Sequence[int]] = [best]
+        for device, others in elsewhere:
+            best = front(others, time, error)
+            fronts.append(range(len(marks), len(marks) + len(best)))
+            marks += [_mark(others[i], time, error, f"{device}: ") for i in best]
+        plots.append(scatter(marks, fronts, title=title, x_label="ms", y_label="error"))
     return np.concatenate(plots)
+
+
+def _mark(row: dict, time: str, error: str, device: str = "") -> Mark:
+    label = f"{device}{row['knob']} {row['value']}".strip()
+    return Mark(row[time], max(row[error], _LEAST), label, row["knob"])
