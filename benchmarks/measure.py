@@ -33,15 +33,19 @@ def here(name: str) -> str:
     return name if backend == "cpu" else f"{name}_{backend}"
 
 
-def elsewhere(name: str) -> list[tuple[str, list[dict]]]:
-    """(Device, rows) of what is kept of that name from other kinds of device."""
+def elsewhere(name: str, **same) -> list[tuple[str, list[dict]]]:
+    """(Device, rows) of what is kept of that name from other kinds of device, where
+    it says the ``same``."""
     found = []
-    for path in (RESULTS / f"{name}.json", RESULTS / f"{name}_gpu.json"):
-        if path.stem != here(name) and path.exists():
-            told = json.loads(path.read_text())
-            machine = told["machine"]
-            device = machine["devices"].split(" × ")[1]
-            device = machine["cpu"] if device == "cpu" else device
+    for kind in ("", "_gpu", "_tpu"):
+        path = RESULTS / f"{name}{kind}.json"
+        if path.stem == here(name) or not path.exists():
+            continue
+        told = json.loads(path.read_text())
+        machine = told["machine"]
+        device = machine["devices"].split(" × ")[1]
+        device = machine["cpu"] if device == "cpu" else device
+        if all(told[key] == value for key, value in same.items()):
             found.append((device, told["rows"]))
     return found
 

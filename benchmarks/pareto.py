@@ -48,11 +48,12 @@ def main() -> int:
         rows = pareto(trial, points(trial.gaussians, made))
         print(f"{trial.name}, {trial.camera.width} × {trial.camera.height}")
         print(table(rows, front(rows)))
+        size = [trial.camera.width, trial.camera.height]
         measure.save(
             f"pareto_{trial.name}", rows, claim=__doc__, stages=stages(trial),
-            size=[trial.camera.width, trial.camera.height], reasons=made.lines(),
+            size=size, reasons=made.lines(),
         )  # fmt: skip
-        others = measure.elsewhere(f"pareto_{trial.name}")
+        others = measure.elsewhere(f"pareto_{trial.name}", size=size)
         picture = front_picture(rows, trial.name, others)
         path = measure.RESULTS / (measure.here(f"pareto_{trial.name}") + ".png")
         files.write_file(path, images.encode_png(picture))

@@ -92,10 +92,11 @@ def draw(name: str) -> None:
     """Pictures of what is kept of a dataset."""
     stem = f"training_{name}"
     path = measure.RESULTS / f"{measure.here(stem)}.json"
-    rows = json.loads(path.read_text())["rows"]
+    told = json.loads(path.read_text())
+    rows, held_out = told["rows"], {"held out": told["held out"]}
     others = [
         {**row, "strategy": f"{row['strategy']}, {device}"}
-        for device, found in measure.elsewhere(stem)
+        for device, found in measure.elsewhere(stem, **held_out)
         for row in found
     ]
     title = f"{name}: PSNR of what was held out, dB"

@@ -57,5 +57,5 @@ def test_counts_are_caught_before_they_wrap(extra):
     total, safe = jax.jit(lambda c: total_count(c))(counts)
     assert not safe
     assert int(total) == 2**31 - 1
-    total, safe = jax.jit(total_count)(counts[:100])
+    total, safe = jax.jit(lambda c: total_count(c))(counts[:100])
     assert bool(safe) == (int(counts[:100].astype(np.int64).sum()) < 2**30)

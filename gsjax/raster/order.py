@@ -17,16 +17,10 @@ from gsjax.raster import occlude
 from gsjax.raster.batches import any_of_batch
 from gsjax.raster.blocks import by_blocks
 from gsjax.raster.counts import squeeze
+from gsjax.raster.ewa import ewa_jacobian, transform_point
 from gsjax.raster.ladder import on_ladder
 from gsjax.raster.occlude import Box
-from gsjax.raster.project import (
-    ellipses,
-    ewa_jacobian,
-    in_depth_range,
-    reach_of,
-    transform_point,
-    usable,
-)
+from gsjax.raster.project import ellipses, in_depth_range, reach_of, usable
 from gsjax.raster.sorting import argsort_float, split_float
 from gsjax.raster.types import Array, RasterConfig
 

@@ -210,11 +210,14 @@ def interpolate(
     Raises:
       InputError: as `focus_point`, or if ``frames`` is below 1.
     """
+    from scipy.interpolate import CubicHermiteSpline
+    from scipy.spatial.transform import Rotation
+
     _check_frames(frames)
     centres, axes = _centres_and_axes(viewmats)
     away = focus_point(viewmats, depth) - centres
     scale = np.median(np.linalg.norm(away, axis=1)) or 1.0
-    keys = np.concatenate([centres, _quats(axes)], axis=1)
+    keys = np.concatenate([centres, Rotation.from_matrix(axes).as_quat()], axis=1)
     keys = _aligned(keys[[*range(len(keys)), 0]] if closed else keys)
     steps = _steps(keys, scale)
     apart = steps > 1e-9 * max(steps.sum(), scale)
@@ -222,14 +225,14 @@ def interpolate(
     if len(keys) == 1:
         return np.tile(_matrices(keys), (frames, 1, 1))
     knots = np.concatenate([[0], np.cumsum(np.sqrt(steps[apart]))])
-    tangents = _tangents(keys, knots, closed)
+    path = CubicHermiteSpline(knots, keys, _tangents(keys, knots, closed))
     pieces = len(keys) - 1
     places = np.linspace(0, pieces, pieces * _SAMPLES + 1)
     dense = np.interp(places, np.arange(pieces + 1), knots)
-    lengths = _steps(_hermite(keys, knots, tangents, dense), scale)
+    lengths = _steps(path(dense), scale)
     lengths = np.concatenate([[0], np.cumsum(lengths)])
     wanted = np.linspace(0, lengths[-1], frames, endpoint=not closed)
-    return _matrices(_hermite(keys, knots, tangents, np.interp(wanted, lengths, dense)))
+    return _matrices(path(np.interp(wanted, lengths, dense)))
 
 
 def _check_frames(frames: int) -> None:
@@ -306,47 +309,11 @@ def _between(before, after, gap_before, gap_after):
     return (before * gap_after + after * gap_before) / (gap_before + gap_after)
 
 
-def _hermite(keys, knots, tangents, at: np.ndarray) -> np.ndarray:
-    """Keys [S, 7] of the cubic pieces at parameters ``at`` [S]."""
-    piece = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
-    gap = (knots[piece + 1] - knots[piece])[:, None]
-    s = (at - knots[piece])[:, None] / gap
-    start, end = keys[piece], keys[piece + 1]
-    smooth = s * s * (3 - 2 * s)
-    out = gap * s * (1 - s) ** 2 * tangents[piece]
-    into = gap * s * s * (1 - s) * tangents[piece + 1]
-    return start + smooth * (end - start) + out - into
-
-
-def _quats(axes: np.ndarray) -> np.ndarray:
-    """Unit quaternions [B, 4] (wxyz) nearest to rotations [B, 3, 3].
-
-    Greatest eigenvectors of a symmetric matrix (Bar-Itzhack 2000): no case of a small
-    w, and rotations that are a little off are as well as they can be.
-    """
-    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(axes, 0, -1)
-    symmetric = np.asarray(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, b + d, c + g],
-            [c - g, b + d, e - a - i, f + h],
-            [d - b, c + g, f + h, i - a - e],
-        ]
-    )
-    _, vectors = np.linalg.eigh(np.moveaxis(symmetric, -1, 0))
-    return vectors[:, :, 3]
-
-
 def _matrices(keys: np.ndarray) -> np.ndarray:
     """viewmats [S, 4, 4] of keys."""
-    quats = keys[:, 3:]
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    from scipy.spatial.transform import Rotation
+
     viewmats = np.tile(np.eye(4), (len(keys), 1, 1))
-    viewmats[:, :3, :3] = np.moveaxis(np.asarray(rows), -1, 0)
+    viewmats[:, :3, :3] = Rotation.from_quat(keys[:, 3:]).as_matrix()
     viewmats[:, :3, 3] = -np.einsum("bij,bj->bi", viewmats[:, :3, :3], keys[:, :3])
     return viewmats
