@@ -42,12 +42,15 @@ def elsewhere(name: str, **same) -> list[tuple[str, list[dict]]]:
         if path.stem == here(name) or not path.exists():
             continue
         told = json.loads(path.read_text())
-        machine = told["machine"]
-        device = machine["devices"].split(" × ")[1]
-        device = machine["cpu"] if device == "cpu" else device
         if all(told[key] == value for key, value in same.items()):
-            found.append((device, told["rows"]))
+            found.append((device_of(told["machine"]), told["rows"]))
     return found
+
+
+def device_of(machine: dict[str, str]) -> str:
+    """What a kept result was measured on."""
+    device = machine["devices"].split(" × ")[1]
+    return machine["cpu"] if device == "cpu" else device
 
 
 def save(name: str, rows: list[dict], **more) -> None:

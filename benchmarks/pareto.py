@@ -1,16 +1,19 @@
 """Claim: every setting errs by no more than theory allows, and what each costs.
 
 ``python benchmarks/pareto.py [NAME|RUN|PLY …]`` turns one knob at a time (α cut, stop
-and its rule, SH degree, tile, chunk, dtype), with a plan for 1/255 beside them, on the
-scenes that are built in, and guitar and garden where their data are, or on those named:
-milliseconds forward, and of value and gradient, against the errors of the picture and
-of the gradient. It exits with 1 if an error is beyond its bound at any pixel looked
-at. Fronts that are kept of another kind of device are drawn beside. ``gsjax bench``
-does one scene.
+and its rule, SH degree, tile, chunk, dtype), with a plan for 1/255 beside them (unless
+``--without-plan``), on the scenes that are built in, and guitar and garden where their
+data are, or on those named: milliseconds forward, and of value and gradient, against
+the errors of the picture and of the gradient. It exits with 1 if an error is beyond its
+bound at any pixel looked at. Fronts that are kept of another kind of device are drawn
+beside; with ``--draw NAME …`` nothing is measured, and what is kept is drawn. ``gsjax
+bench`` does one scene.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import sys
 from pathlib import Path
 
@@ -36,28 +39,49 @@ def trial_of(name: str) -> Trial:
     return open_trial(name)
 
 
+def measured(trial: Trial, planned: bool) -> bool:
+    """Measure and save; whether all are inside. ``planned``: with a plan's point."""
+    made = None
+    if planned:
+        behind = trial.background
+        made = gsjax.plan(
+            trial.gaussians, trial.camera, budget=1 / 255, background=behind
+        )
+    rows = pareto(trial, points(trial.gaussians, made))
+    print(f"{trial.name}, {trial.camera.width} × {trial.camera.height}")
+    print(table(rows, front(rows)))
+    measure.save(
+        f"pareto_{trial.name}", rows, claim=__doc__, stages=stages(trial),
+        size=[trial.camera.width, trial.camera.height],
+        reasons=made.lines() if made else [],
+    )  # fmt: skip
+    return all(row["inside"] for row in rows)
+
+
+def draw(name: str) -> None:
+    """The picture of what is kept of a scene."""
+    path = measure.RESULTS / f"{measure.here(f'pareto_{name}')}.json"
+    told = json.loads(path.read_text())
+    others = measure.elsewhere(f"pareto_{name}", size=told["size"])
+    picture = front_picture(told["rows"], name, others)
+    files.write_file(path.with_suffix(".png"), images.encode_png(picture))
+
+
 def main() -> int:
     """Measure, save and draw; a scene that is measured again replaces its rows."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME|RUN|PLY")
+    parser.add_argument("--without-plan", action="store_true")
+    parser.add_argument("--draw", action="store_true")
+    options = parser.parse_args()
     real = [name for name in REAL if (scenes.DATA / name).is_dir()]
     inside = True
-    for name in sys.argv[1:] or [*TRIALS, *real]:
-        trial = trial_of(name)
-        made = gsjax.plan(
-            trial.gaussians, trial.camera, budget=1 / 255, background=trial.background
-        )
-        rows = pareto(trial, points(trial.gaussians, made))
-        print(f"{trial.name}, {trial.camera.width} × {trial.camera.height}")
-        print(table(rows, front(rows)))
-        size = [trial.camera.width, trial.camera.height]
-        measure.save(
-            f"pareto_{trial.name}", rows, claim=__doc__, stages=stages(trial),
-            size=size, reasons=made.lines(),
-        )  # fmt: skip
-        others = measure.elsewhere(f"pareto_{trial.name}", size=size)
-        picture = front_picture(rows, trial.name, others)
-        path = measure.RESULTS / (measure.here(f"pareto_{trial.name}") + ".png")
-        files.write_file(path, images.encode_png(picture))
-        inside &= all(row["inside"] for row in rows)
+    for name in options.names or [*TRIALS, *real]:
+        if not options.draw:
+            trial = trial_of(name)
+            inside &= measured(trial, not options.without_plan)
+            name = trial.name
+        draw(name)
         # Each kernel is mapped by itself, and Linux lets a process have 65,530 maps:
         # those of three scenes are more.
         jax.clear_caches()

@@ -3,8 +3,10 @@
 ``python benchmarks/scaling.py`` renders synthetic shells of 1 k … 1 M Gaussians, at
 sizes from 320 × 180 to 1920 × 1080, with room for up to 8 times as many, and up to 8
 cameras in a call; forward and gradient, each point in a process of its own so that its
-peak of resident memory can be read; fits slopes, and plots. With a GPU, ``--gpu``
-measures 0.1, 1 and 3 M Gaussians at 1920 × 1080 instead.
+peak of memory can be read; fits slopes, and plots, with what is kept of another kind of
+device. On an accelerator there are fewer sizes, and up to 3 M Gaussians. With
+``--side-by-side N`` so many compile at once before anything is timed; first calls are
+then longer, by what they share the cores.
 """
 
 from __future__ import annotations
@@ -16,8 +18,10 @@ import os
 import resource
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import measure
 import numpy as np
@@ -104,6 +108,52 @@ def _peak_gb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
 
 
+def points(accelerator: bool) -> list[tuple[int, int, int, int, int]]:
+    """What is measured, each as `point` takes it: one thing at a time varies."""
+    counts = (*COUNTS, 3_000_000) if accelerator else COUNTS
+    found = [(n, 1280, 720, 1, 1) for n in counts]
+    sizes = SIZES[::3] if accelerator else SIZES
+    found += [(100_000, *size, 1, 1) for size in sizes if size != (1280, 720)]
+    more = (8,) if accelerator else (2, 4, 8)
+    found += [(100_000, 320, 180, n, 1) for n in more]
+    return found + [(100_000, 320, 180, 1, n) for n in more]
+
+
+def measured(values: tuple[int, ...], compiled: str | None = None) -> dict:
+    """`point`, in a process of its own; ``compiled`` keeps what one compiles for the
+    next.
+
+    Raises:
+      SystemExit: if that failed.
+    """
+    more = {}
+    if compiled:
+        more = {
+            "JAX_COMPILATION_CACHE_DIR": compiled,
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        }
+    command = [sys.executable, __file__, "--point", *map(str, values)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, env={**os.environ, **more}
+    )
+    if done.returncode:
+        raise SystemExit(f"{values} failed:\n{done.stderr}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def compiled_before(wanted: list[tuple[int, ...]], at_once: int) -> list[dict]:
+    """Rows, of which the first calls are from when ``at_once`` compiled at a time."""
+    with tempfile.TemporaryDirectory() as folder:
+        with ThreadPoolExecutor(at_once) as pool:
+            first = list(pool.map(lambda values: measured(values, folder), wanted))
+        rows = []
+        for values, begun in zip(wanted, first):
+            cold = {key: begun[key] for key in begun if key.endswith(" s")}
+            rows.append({**measured(values, folder), **cold})
+            print(rows[-1], flush=True)
+    return rows
+
+
 def series(rows: list[dict]) -> dict[str, tuple[list[dict], Callable[[dict], float]]]:
     """The rows in which one thing alone varies, and that thing, by its name."""
     plain = [row for row in rows if row["room"] == row["cameras"] == 1]
@@ -143,15 +193,13 @@ def slopes(rows: list[dict]) -> dict[str, dict[str, float]]:
     }  # fmt: skip
 
 
-def plot(rows: list[dict], path) -> None:
-    """Time and memory against Gaussians and against pixels."""
+def plot(kept: list[tuple[str, list[dict]]], path) -> None:
+    """Time and memory against each thing, a line for each device in ``kept``."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
     from matplotlib import ticker
-
-    figure, axes = plt.subplots(1, 5, figsize=(20, 4))
 
     labels = {
         "Gaussians": "Gaussians (1280 × 720)",
@@ -159,30 +207,19 @@ def plot(rows: list[dict], path) -> None:
         "cameras": "cameras (100 k, 320 × 180)",
         "capacity / active": "capacity / active (100 k, 320 × 180)",
     }
-    found = series(rows)
-    panels = [
-        (axis, *found[name], label) for axis, (name, label) in zip(axes, labels.items())
-    ]
-    by_count = found["Gaussians"][0]
-    for axis, chosen, x, label in panels:
-        for key in ("forward ms", "v+g ms"):
-            axis.loglog(
-                [x(r) for r in chosen], [r[key] for r in chosen], "o-", label=key
-            )
+    panels = [(name, label, "ms") for name, label in labels.items()]
+    panels.append(("Gaussians", labels["Gaussians"], "GB"))
+    figure, axes = plt.subplots(1, 5, figsize=(22, 4.4))
+    for axis, (name, label, unit) in zip(axes, panels):
+        for place, (device, rows) in enumerate(kept):
+            chosen, x = series(rows)[name]
+            for key, marks in (("forward", "o--"), ("v+g", "o-")):
+                values = [row[f"{key} {unit}"] for row in chosen]
+                label_of = f"{key}, {device}"
+                at = [x(row) for row in chosen]
+                axis.loglog(at, values, marks, color=f"C{place}", label=label_of)
         axis.set_xlabel(label)
-        axis.set_ylabel("ms")
-        axis.legend()
-    for key in ("forward GB", "v+g GB"):
-        axes[4].loglog(
-            [r["Gaussians"] for r in by_count],
-            [r[key] for r in by_count],
-            "o-",
-            label=key,
-        )
-    axes[4].set_xlabel("Gaussians (1280 × 720)")
-    axes[4].set_ylabel("peak memory, GB")
-    axes[4].legend()
-    for axis in axes:
+        axis.set_ylabel(unit if unit == "ms" else "peak memory, GB")
         axis.grid(True, which="both", alpha=0.3)
         low, high = axis.get_ylim()
         if high < 100 * low:  # powers of ten alone would be too few
@@ -192,41 +229,42 @@ def plot(rows: list[dict], path) -> None:
     for axis in axes[2:4]:
         axis.set_xticks([1, 2, 4, 8], labels=["1", "2", "4", "8"])
         axis.minorticks_off()
-    figure.tight_layout()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="upper center", ncols=4)
+    figure.tight_layout(rect=(0, 0, 1, 0.92))
     figure.savefig(path, dpi=110)
+
+
+def draw() -> None:
+    """The plot of what is kept, of every kind of device."""
+    kept = measure.elsewhere("scaling")
+    told = json.loads((measure.RESULTS / f"{measure.here('scaling')}.json").read_text())
+    mine = measure.device_of(told["machine"]), told["rows"]
+    plot([mine, *kept], measure.RESULTS / f"{measure.here('scaling')}.png")
 
 
 def main() -> None:
     """Run every point in its own process, save, fit and plot."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--point", nargs=5, type=int, help="as of `point`")
-    parser.add_argument("--gpu", action="store_true")
+    parser.add_argument("--side-by-side", type=int, default=1)
+    parser.add_argument("--draw", action="store_true", help="what is kept")
     options = parser.parse_args()
     if options.point:
         print(json.dumps(point(*options.point)))
         return
-    import jax
+    if not options.draw:
+        import jax
 
-    if options.gpu == (jax.default_backend() == "cpu"):
-        raise SystemExit("--gpu is for accelerators, and for them alone")
-    if options.gpu:
-        points = [(n, 1920, 1080, 1, 1) for n in (100_000, 1_000_000, 3_000_000)]
-    else:
-        points = [(n, 1280, 720, 1, 1) for n in COUNTS]
-        points += [(100_000, *size, 1, 1) for size in SIZES if size != (1280, 720)]
-        points += [(100_000, 320, 180, n, 1) for n in (2, 4, 8)]
-        points += [(100_000, 320, 180, 1, n) for n in (2, 4, 8)]
-    rows = []
-    for values in points:
-        command = [sys.executable, __file__, "--point", *map(str, values)]
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            raise SystemExit(f"{values} failed:\n{done.stderr}")
-        rows.append(json.loads(done.stdout.splitlines()[-1]))
-        print(rows[-1], flush=True)
-    measure.save("scaling", rows, claim=__doc__, slopes=slopes(rows))
-    if not options.gpu:
-        plot(rows, measure.RESULTS / "scaling.png")
+        wanted = points(jax.default_backend() != "cpu")
+        rows = []
+        if options.side_by_side > 1:
+            rows = compiled_before(wanted, options.side_by_side)
+        else:
+            for values in wanted:
+                rows.append(measured(values))
+                print(rows[-1], flush=True)
+        measure.save("scaling", rows, claim=__doc__, slopes=slopes(rows))
+    draw()
 
 
 if __name__ == "__main__":
