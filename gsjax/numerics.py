@@ -80,6 +80,31 @@ def safe_sqrt(x: Array) -> Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
 
 
+def held(mask: Array) -> Array:
+    """``mask``, on a CPU worked out once.
+
+    By a division: XLA's CPU backend (jax 0.10.2) takes all that leads to a mask for so
+    cheap that it does it anew in each kernel that uses it.
+    """
+    if jax.default_backend() != "cpu":
+        return mask
+    one = np.float32(1)
+    return one / jnp.where(mask, one, np.float32(np.inf)) > 0
+
+
+def once(values: tuple[Array, ...], mask: Array) -> tuple[Array, ...]:
+    """``values``, and what is derived by them, on a CPU worked out once, as `held` is.
+
+    Args:
+      values: equally shaped arrays.
+      mask: what of them counts; the rest may come out as halves.
+    """
+    if jax.default_backend() != "cpu":
+        return values
+    one = jnp.where(mask, 1, 2).astype(values[0].dtype)
+    return tuple(value / one for value in values)
+
+
 def near_one(components: tuple[Array, ...], fallback: tuple[float, ...]):
     """A vector times the power of two that brings its largest number to 3/4 … 3/2.
 
@@ -100,10 +125,9 @@ def near_one(components: tuple[Array, ...], fallback: tuple[float, ...]):
     # A NaN fails both comparisons: guards are phrased positively.
     good = (size >= limits.tiny) & (size < jnp.inf)
     # The largest numbers would be rounded to infinity: those stay below 4. A division,
-    # not a product with the inverse: that, XLA's CPU backend (jax 0.10.2) takes for so
-    # cheap that it does all of this anew in every kernel that uses it.
-    held = jnp.minimum(jnp.where(good, size, 1), 2.0 ** (limits.maxexp - 2))
-    scale = jax.lax.reduce_precision(held, limits.nexp, 0)
+    # not a product with the inverse, for the reason that `held` gives.
+    below = jnp.minimum(jnp.where(good, size, 1), 2.0 ** (limits.maxexp - 2))
+    scale = jax.lax.reduce_precision(below, limits.nexp, 0)
     scaled = tuple(jnp.where(good, c, f) / scale for c, f in zip(components, fallback))
     return scaled, good
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.numerics import exp_negative, near_one, safe_normalize
+from gsjax.numerics import exp_negative, held, near_one, once, safe_normalize
 from gsjax.rotations import quaternion_to_matrix
 
 pytestmark = pytest.mark.as_users
@@ -112,3 +112,32 @@ def test_slopes_of_a_rotation_by_what_is_zero():
     found = slopes(quats)
     assert np.array_equal(found[:, 1:3], np.zeros((500, 2)))
     assert np.abs(found[:, ::3]).min(0).max() > 0
+
+
+def test_what_is_worked_out_once_stays_as_it_is():
+    values = jnp.float32([3e38, -1e-37, 1 / 3, 0.0, -0.0, np.inf, 5.0])
+    mask = jnp.asarray([True, True, True, True, True, True, False])
+    assert np.array_equal(jax.jit(held)(mask), mask)
+    (found,) = jax.jit(lambda v: once((v,), mask))(values)
+    assert found.dtype == values.dtype
+    assert np.array_equal(found[mask].view(np.int32), values[mask].view(np.int32))
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_what_is_worked_out_once_has_the_slope_of_what_it_is(double):
+    with jax.enable_x64(double):
+        values = jnp.linspace(-3.0, 3.0, 7)
+        mask = values > -2.5
+
+        def total(values):
+            return jnp.sum(jnp.where(mask, once((jnp.sin(values),), mask)[0], 0))
+
+        expected = np.where(mask, jnp.cos(values), 0)
+        assert np.array_equal(jax.jit(jax.grad(total))(values), expected)
+
+
+def test_elsewhere_nothing_is_done_for_it(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    mask, values = jnp.asarray([True, False]), (jnp.ones(2), jnp.zeros(2))
+    assert held(mask) is mask
+    assert once(values, mask) is values

@@ -13,7 +13,7 @@ from jax import lax
 from gsjax import sh as sh_lib
 from gsjax.cameras import LENS_RANGE, NEAREST, Camera, camera_centre
 from gsjax.gaussians import Gaussians
-from gsjax.numerics import exp_log_scale, near_one, safe_normalize
+from gsjax.numerics import exp_log_scale, held, near_one, once, safe_normalize
 from gsjax.raster.batches import any_of_batch
 from gsjax.raster.ewa import dilated, half_covariance, transform_point
 from gsjax.raster.ladder import on_ladder
@@ -204,7 +204,7 @@ def _project_components(
     quat, good = near_one(
         tuple(jnp.where(live, q, 1) for q in rows.quats), (1.0, 0.0, 0.0, 0.0)
     )
-    live = _held(live & good)
+    live = held(live & good)
     means = tuple(jnp.where(live, m, 0) for m in rows.means)
     scales = tuple(exp_log_scale(jnp.where(live, s, 0)) for s in rows.log_scales)
     x, y, z = transform_point(camera.viewmat, means)
@@ -212,16 +212,16 @@ def _project_components(
     live &= z > 0.5 * camera.near
     # A dead rank's mean is the origin, which may lie anywhere: park it at z = 1.
     x, y, z = jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1)
-    x, y, z = _once((x, y, z), live)
+    x, y, z = once((x, y, z), live)
     u, v = camera.model.project_point(camera.K, (x, y, z))
     if rows.shift is not None:
         u, v = (a + b.astype(a.dtype) for a, b in zip((u, v), rows.shift))
-    live = _held(live & (jnp.abs(u) < jnp.inf) & (jnp.abs(v) < jnp.inf))
+    live = held(live & (jnp.abs(u) < jnp.inf) & (jnp.abs(v) < jnp.inf))
 
     m1, m2 = half_covariance(camera, (x, y, z), quat, scales)
-    m1, m2 = _once(m1, live), _once(m2, live)
+    m1, m2 = once(m1, live), once(m2, live)
     a, b, c, det, det_sharp = dilated(m1, m2, config.dilation)
-    live = _held(live & (det > 0) & (det < jnp.inf) & (a < jnp.inf) & (c < jnp.inf))
+    live = held(live & (det > 0) & (det < jnp.inf) & (a < jnp.inf) & (c < jnp.inf))
     a, b, c = jnp.where(live, a, 1), jnp.where(live, b, 0), jnp.where(live, c, 1)
     det = jnp.where(live, det, 1)
     # sqrt(max(0.005², ratio)): the floor of Mip-Splatting and gsplat.
@@ -253,20 +253,6 @@ def _project_components(
         compensation=compensation,
         probe=None,
     )
-
-
-def _held(live: Array) -> Array:
-    """``live``, worked out once: by a division, which XLA's CPU backend does not do anew
-    in each kernel that uses it, as it does with all that leads to a mask (jax 0.10.2).
-    """
-    return 1 / jnp.where(live, 1, jnp.inf) > 0
-
-
-def _once(values: tuple[Array, ...], live: Array) -> tuple[Array, ...]:
-    """The values, and what is derived by them, worked out once, see `_held`; of what is
-    not live, half of them."""
-    one = jnp.where(live, 1, 2).astype(values[0].dtype)
-    return tuple(value / one for value in values)
 
 
 def _sh_colors(camera: Camera, means, coefficients, live: Array) -> Array:
