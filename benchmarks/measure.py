@@ -33,6 +33,16 @@ def here(name: str) -> str:
     return name if backend == "cpu" else f"{name}_{backend}"
 
 
+def path_of(name: str) -> Path:
+    """Where what is measured here by that name is kept; a picture lies beside it."""
+    return RESULTS / f"{here(name)}.json"
+
+
+def kept(name: str) -> dict:
+    """What was measured by that name on this kind of device."""
+    return json.loads(path_of(name).read_text())
+
+
 def elsewhere(name: str, **same) -> list[tuple[str, list[dict]]]:
     """(Device, rows) of what is kept of that name from other kinds of device, where
     it says the ``same``."""
@@ -56,9 +66,8 @@ def device_of(machine: dict[str, str]) -> str:
 def save(name: str, rows: list[dict], **more) -> None:
     """Write ``results/name.json``, see `here`, and print the rows as a table."""
     RESULTS.mkdir(exist_ok=True)
-    name = here(name)
     content = {"machine": machine(), **more, "rows": rows}
-    path = RESULTS / f"{name}.json"
+    path = path_of(name)
     files.write_json(path, content)
     print(table(rows))
     print(f"written to {path.name}: {content['machine']}")

@@ -13,7 +13,6 @@ bench`` does one scene.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
@@ -60,11 +59,12 @@ def measured(trial: Trial, planned: bool) -> bool:
 
 def draw(name: str) -> None:
     """The picture of what is kept of a scene."""
-    path = measure.RESULTS / f"{measure.here(f'pareto_{name}')}.json"
-    told = json.loads(path.read_text())
-    others = measure.elsewhere(f"pareto_{name}", size=told["size"])
+    stem = f"pareto_{name}"
+    told = measure.kept(stem)
+    others = measure.elsewhere(stem, size=told["size"])
     picture = front_picture(told["rows"], name, others)
-    files.write_file(path.with_suffix(".png"), images.encode_png(picture))
+    path = measure.path_of(stem).with_suffix(".png")
+    files.write_file(path, images.encode_png(picture))
 
 
 def main() -> int:

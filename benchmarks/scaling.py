@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import measure
@@ -111,12 +111,12 @@ def _peak_gb() -> float:
 def points(accelerator: bool) -> list[tuple[int, int, int, int, int]]:
     """What is measured, each as `point` takes it: one thing at a time varies."""
     counts = (*COUNTS, 3_000_000) if accelerator else COUNTS
-    found = [(n, 1280, 720, 1, 1) for n in counts]
     sizes = SIZES[::3] if accelerator else SIZES
-    found += [(100_000, *size, 1, 1) for size in sizes if size != (1280, 720)]
     more = (8,) if accelerator else (2, 4, 8)
+    found = [(100_000, *size, 1, 1) for size in sizes if size != (1280, 720)]
     found += [(100_000, 320, 180, n, 1) for n in more]
-    return found + [(100_000, 320, 180, 1, n) for n in more]
+    found += [(100_000, 320, 180, 1, n) for n in more]
+    return found + [(n, 1280, 720, 1, 1) for n in counts]  # the largest last
 
 
 def measured(values: tuple[int, ...], compiled: str | None = None) -> dict:
@@ -141,17 +141,21 @@ def measured(values: tuple[int, ...], compiled: str | None = None) -> dict:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def compiled_before(wanted: list[tuple[int, ...]], at_once: int) -> list[dict]:
+def compiled_before(wanted: list[tuple[int, ...]], at_once: int) -> Iterator[dict]:
     """Rows, of which the first calls are from when ``at_once`` compiled at a time."""
+
+    def begun(values: tuple[int, ...]) -> dict[str, float]:
+        try:
+            row = measured(values, folder)
+        except SystemExit:  # what fails beside others may have room alone
+            return {}
+        return {key: row[key] for key in row if key.endswith(" s")}
+
     with tempfile.TemporaryDirectory() as folder:
         with ThreadPoolExecutor(at_once) as pool:
-            first = list(pool.map(lambda values: measured(values, folder), wanted))
-        rows = []
-        for values, begun in zip(wanted, first):
-            cold = {key: begun[key] for key in begun if key.endswith(" s")}
-            rows.append({**measured(values, folder), **cold})
-            print(rows[-1], flush=True)
-    return rows
+            first = list(pool.map(begun, wanted))
+        for values, cold in zip(wanted, first):
+            yield {**measured(values, folder), **cold}
 
 
 def series(rows: list[dict]) -> dict[str, tuple[list[dict], Callable[[dict], float]]]:
@@ -236,10 +240,10 @@ def plot(kept: list[tuple[str, list[dict]]], path) -> None:
 
 def draw() -> None:
     """The plot of what is kept, of every kind of device."""
-    kept = measure.elsewhere("scaling")
-    told = json.loads((measure.RESULTS / f"{measure.here('scaling')}.json").read_text())
+    told = measure.kept("scaling")
     mine = measure.device_of(told["machine"]), told["rows"]
-    plot([mine, *kept], measure.RESULTS / f"{measure.here('scaling')}.png")
+    others = measure.elsewhere("scaling")
+    plot([mine, *others], measure.path_of("scaling").with_suffix(".png"))
 
 
 def main() -> None:
@@ -256,14 +260,13 @@ def main() -> None:
         import jax
 
         wanted = points(jax.default_backend() != "cpu")
-        rows = []
+        found = map(measured, wanted)
         if options.side_by_side > 1:
-            rows = compiled_before(wanted, options.side_by_side)
-        else:
-            for values in wanted:
-                rows.append(measured(values))
-                print(rows[-1], flush=True)
-        measure.save("scaling", rows, claim=__doc__, slopes=slopes(rows))
+            found = compiled_before(wanted, options.side_by_side)
+        rows = []
+        for row in found:
+            rows.append(row)
+            measure.save("scaling", rows, claim=__doc__, slopes=slopes(rows))
     draw()
 
 

@@ -58,7 +58,7 @@ def main(
     dataset: Path, held_out: list[str], strategies: list[str], changes: dict[str, str]
 ) -> None:
     """Measure, save and draw; ``changes`` to the preset "fast", by their options."""
-    path = measure.RESULTS / (measure.here(f"training_{dataset.name}") + ".json")
+    path = measure.path_of(f"training_{dataset.name}")
     more = "".join(f", {name} {value}" for name, value in changes.items())
     changes = {"preset": "fast", **changes}
     other = [text for name, value in changes.items() for text in (f"--{name}", value)]
@@ -91,8 +91,7 @@ def by(rows: list[dict], key: Callable[[dict], str]) -> dict[str, list[dict]]:
 def draw(name: str) -> None:
     """Pictures of what is kept of a dataset."""
     stem = f"training_{name}"
-    path = measure.RESULTS / f"{measure.here(stem)}.json"
-    told = json.loads(path.read_text())
+    path, told = measure.path_of(stem), measure.kept(stem)
     rows, held_out = told["rows"], {"held out": told["held out"]}
     others = [
         {**row, "strategy": f"{row['strategy']}, {device}"}
