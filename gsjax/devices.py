@@ -28,6 +28,8 @@ from gsjax.machine import usable_cores
 from gsjax.programs import drop_oldest, drop_torn
 from gsjax.settings import whole
 
+Array = jax.Array
+
 # Programs are a few hundred kB each; a folder of more than this loses its oldest.
 _MAX_KEPT_BYTES = 500_000_000
 
@@ -115,6 +117,24 @@ def spread(work: Callable[..., Any], count: int, *inputs: Any) -> Any:
         check_vma=False,
     )
     return shared(jnp.arange(count, dtype=jnp.int32), *inputs)
+
+
+def in_parts(values: Array, count: int, fill: float) -> Array:
+    """``values`` [n], each of ``count`` devices at work on an equal part.
+
+    What is made of them number by number then is shared, too, up to where something
+    takes all of it, as what is given to `spread` is. The same bits as without.
+
+    Args:
+      values: with more of ``fill`` at the end where they cannot be parted equally.
+      count: of local devices; 1 changes nothing.
+      fill: a number of their type.
+    """
+    if count == 1:
+        return values
+    values = jnp.pad(values, (0, -len(values) % count), constant_values=fill)
+    parts = NamedSharding(_mesh(count), PartitionSpec("devices"))
+    return jax.lax.with_sharding_constraint(values, parts)
 
 
 def on_all_devices(tree: Any) -> Any:

@@ -6,7 +6,9 @@ import sys
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
+from conftest import needs_two_devices
 
 from gsjax import InputError, devices
 
@@ -101,3 +103,13 @@ def test_calls_may_pile_up():
         [sys.executable, "-c", QUEUE], env=env, timeout=150, capture_output=True
     )
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+@needs_two_devices
+@pytest.mark.parametrize(("size", "wanted"), [(4, [0, 1, 2, 3]), (3, [0, 1, 2, -1])])
+def test_parts_are_equal_and_in_order(size, wanted):
+    values = np.arange(size, dtype=np.int32)
+    parts = jax.jit(lambda x: devices.in_parts(x, 2, fill=-1))(values)
+    np.testing.assert_array_equal(parts, wanted)
+    assert [part.data.shape for part in parts.addressable_shards] == [(2,), (2,)]
+    assert devices.in_parts(values, 1, fill=-1) is values

@@ -4,6 +4,7 @@ Bit-equal: capacities, order of the slots, contents of dead slots, number of dev
 repeated runs, tiles side by side, size of the ladder.
 """
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +14,7 @@ from conftest import (
     BACKGROUND,
     COMPAT,
     COUNT,
+    LIGHT,
     cast,
     loss_and_gradients,
     needs_two_devices,
@@ -23,6 +25,8 @@ from conftest import (
 from pictures import KINDS, assert_same, images
 
 import gsjax
+from gsjax import RasterConfig
+from gsjax.raster import picture
 
 pytestmark = pytest.mark.as_users
 
@@ -66,6 +70,36 @@ def test_slots_are_bit_equal():
         np.testing.assert_array_equal(out.radii[:COUNT], wanted.radii)
         assert (out.radii[COUNT:] == 0).all()
         assert out.demand == wanted.demand
+
+
+@on_cpu
+@needs_two_devices
+@pytest.mark.new_emitters
+def test_a_projection_in_parts_is_bit_equal(monkeypatch):
+    """Slots that two devices cannot share equally; pictures, and gradients."""
+    gaussians, camera = cast(scene_of("random"), jnp.float32)
+    gaussians = gsjax.grow(gaussians, COUNT + 9)
+    assert gaussians.sh_degree > 0
+    config = RasterConfig(**LIGHT, outputs=("rgb",)).replace(devices=2)
+    calls, usual = [], picture.in_parts
+
+    def total(params):
+        view = gsjax.render(gaussians.replace(params=params), camera, config)
+        return jnp.sum(jnp.sin(view.rgb)), (view.rgb, view.radii)
+
+    def found(shared: bool):
+        def in_parts(values, count, fill):
+            calls.append(count)
+            return usual(values, count, fill) if shared else values
+
+        monkeypatch.setattr(picture, "in_parts", in_parts)
+        traced_anew = jax.value_and_grad(lambda params: total(params), has_aux=True)
+        return jax.jit(traced_anew)(gaussians.params)
+
+    shared, whole = found(True), found(False)
+    assert calls == [2, 2]
+    chex.assert_trees_all_equal(shared, whole)
+    assert np.abs(shared[1].sh[:, 1:]).max() > 0
 
 
 @on_cpu

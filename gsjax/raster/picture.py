@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from gsjax.cameras import Camera
+from gsjax.devices import in_parts
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.numerics import safe_divide
@@ -15,7 +16,7 @@ from gsjax.raster import bins
 from gsjax.raster.inputs import check_real
 from gsjax.raster.order import depth_order
 from gsjax.raster.project import project
-from gsjax.raster.rasterise import rasterise
+from gsjax.raster.rasterise import device_count, rasterise
 from gsjax.raster.types import COLOR_LIMIT, Array, Demand, RasterConfig
 
 
@@ -33,6 +34,10 @@ def draw(
     # The names that a profile shows.
     with jax.named_scope("order"):
         order, visible = depth_order(gaussians, camera, config, features)
+    if features is None and gaussians.sh_degree > 0 and jax.default_backend() == "cpu":
+        # Colours that turn with the view are worth what it costs to bring the parts
+        # together again; a mean and a covariance alone are not.
+        order = in_parts(order, device_count(config), fill=gaussians.capacity)
     with jax.named_scope("project"):
         out = project(
             gaussians, camera, config, order, visible, features, probe, abs_probe

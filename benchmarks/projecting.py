@@ -1,0 +1,123 @@
+"""Claim: what the projection does once, and in parts, pays; and changes no bit that
+shows.
+
+``python benchmarks/projecting.py [RUN...]`` renders the real scenes, and those of runs'
+folders, and takes gradients, in turn: as it is; with masks and derivatives worked out
+anew wherever they are used (without `numerics.held` and `once`); and, where colours
+turn with the view, with every device projecting all ranks (without `devices.in_parts`).
+Where a scene has no bands beyond the first, so that nothing is in parts, it is taken a
+second time with random ones up to degree 3. Beside the times, the seconds of compiling,
+and how far the pictures and the gradients are from one another.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+from unittest import mock
+
+import as_cli  # noqa: F401
+import jax
+import jax.numpy as jnp
+import measure
+import numpy as np
+import scenes
+
+import gsjax
+from gsjax.devices import on_all_devices
+from gsjax.raster import picture, project
+
+
+def unchanged(values, *_, **__):
+    """What stands in the place of what is left out."""
+    return values
+
+
+WITHOUT = {
+    "as it is": [],
+    "not once": [(project, "held"), (project, "once")],
+    "not in parts": [(picture, "in_parts")],
+}
+
+
+def with_bands(case: scenes.Case, degree: int) -> scenes.Case:
+    """The scene with small random coefficients up to a degree."""
+    params = case.gaussians.params
+    count = (degree + 1) ** 2 - 1
+    shape = (case.gaussians.capacity, count, 3)
+    sh = 0.02 * jax.random.normal(jax.random.key(5), shape)
+    sh = jnp.concatenate([params.sh[:, :1], sh], axis=1)
+    gaussians = case.gaussians.replace(params=dataclasses.replace(params, sh=sh))
+    return case._replace(name=f"{case.name}, degree {degree}", gaussians=gaussians)
+
+
+def row(case: scenes.Case) -> dict:
+    """Times of one scene, as ratios to how it is."""
+    scene, camera = on_all_devices(case.gaussians), case.camera
+    config = gsjax.exact_config(scene, camera)
+    cotangent = jax.random.normal(jax.random.key(1), (camera.height, camera.width, 3))
+
+    def render(params):
+        return gsjax.render(scene.replace(params=params), camera, config).rgb
+
+    programs = {
+        "forward": render,
+        "v+g": jax.value_and_grad(lambda params: jnp.sum(render(params) * cotangent)),
+    }
+    functions, found, seconds = {}, {}, {}
+    for name, changes in WITHOUT.items():
+        jax.clear_caches()
+        patches = [mock.patch.object(*change, unchanged) for change in changes]
+        for patch in patches:
+            patch.start()
+        for key, function in programs.items():
+            lowered = jax.jit(function).lower(scene.params)
+            start = time.perf_counter()
+            compiled = lowered.compile()
+            seconds[key, name] = time.perf_counter() - start
+            functions[key, name] = lambda run=compiled: run(scene.params)
+            found[key, name] = jax.block_until_ready(compiled(scene.params))
+        for patch in patches:
+            patch.stop()
+    names = {f"{key}, {name}": (key, name) for key, name in functions}
+    ms = measure.interleaved({n: functions[at] for n, at in names.items()}, 21)
+    told = {
+        "scene": case.name,
+        "SH degree": scene.sh_degree,
+        "forward ms": ms["forward, as it is"],
+        "v+g ms": ms["v+g, as it is"],
+    }
+    for (key, name), took in seconds.items():
+        if name == "as it is":
+            continue
+        usual = found[key, "as it is"]
+        told[f"{key} as it is / {name}"] = ms[f"{key}, as it is"] / ms[f"{key}, {name}"]
+        told[f"{key} compiling as it is / {name}"] = seconds[key, "as it is"] / took
+        told[f"{key} differs from {name}"] = relative(usual, found[key, name])
+    return told
+
+
+def relative(a, b) -> float:
+    """L2 of what differs, of all leaves together, over that of all."""
+    pairs = zip(
+        map(np.asarray, jax.tree.leaves(a)), map(np.asarray, jax.tree.leaves(b))
+    )
+    squares = [(np.sum((x - y) ** 2), np.sum(x**2)) for x, y in pairs]
+    return float(np.sqrt(np.divide(*np.sum(squares, axis=0))))
+
+
+def main() -> None:
+    """Measure and save."""
+    rows = []
+    for case in scenes.real_cases(sys.argv[1:]):
+        cases = [case]
+        if case.gaussians.sh_degree == 0:
+            cases.append(with_bands(case, 3))
+        for one in cases:
+            rows.append(row(one))
+            measure.save("projecting", rows, claim=__doc__)
+
+
+if __name__ == "__main__":
+    main()
