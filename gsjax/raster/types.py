@@ -59,7 +59,8 @@ class RasterConfig:
         the gradient of compositing has sizes too, two fewer, and on accelerators from 3
         on all of compositing, one fewer. Each takes seconds to compile, and saves time
         where a view needs a quarter of its capacity or less.
-      devices: how many devices share the tiles; None means all local ones. Within a
+      devices: how many devices share the tiles (and on CPUs the projection, where
+        colours turn with the view); None means all local ones. Within a
         `jax.shard_map` of your own: 1, and ``check_vma=False`` there.
 
     Raises:
