@@ -4,10 +4,11 @@ shows.
 ``python benchmarks/projecting.py [RUN...]`` renders the real scenes, and those of runs'
 folders, and takes gradients, in turn: as it is; with masks and derivatives worked out
 anew wherever they are used (without `numerics.held` and `once`); and, where colours
-turn with the view, with every device projecting all ranks (without `devices.in_parts`).
-Where a scene has no bands beyond the first, so that nothing is in parts, it is taken a
-second time with random ones up to degree 3. Beside the times, the seconds of compiling,
-and how far the pictures and the gradients are from one another.
+turn with the view, with every device projecting all ranks (without `devices.in_parts`);
+and with parts always. Where a scene has no bands beyond the first, so that nothing is
+in parts, it is taken a second time with random ones up to degree 3. Beside the times,
+the seconds of compiling, and how far the pictures and the gradients are from one
+another.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
+from contextlib import ExitStack
 from unittest import mock
 
 import as_cli  # noqa: F401
@@ -25,8 +27,9 @@ import numpy as np
 import scenes
 
 import gsjax
-from gsjax.devices import on_all_devices
+from gsjax.devices import in_parts, on_all_devices
 from gsjax.raster import picture, project
+from gsjax.raster.order import depth_order
 
 
 def unchanged(values, *_, **__):
@@ -34,10 +37,19 @@ def unchanged(values, *_, **__):
     return values
 
 
-WITHOUT = {
+def order_in_parts(gaussians, *given):
+    """`depth_order`, in parts whatever the colours are."""
+    order, count = depth_order(gaussians, *given)
+    devices = jax.local_device_count()
+    return in_parts(order, devices, fill=gaussians.capacity), count
+
+
+# What is put in the place of what.
+WAYS = {
     "as it is": [],
-    "not once": [(project, "held"), (project, "once")],
-    "not in parts": [(picture, "in_parts")],
+    "not once": [(project, "held", unchanged), (project, "once", unchanged)],
+    "not in parts": [(picture, "in_parts", unchanged)],
+    "always in parts": [(picture, "depth_order", order_in_parts)],
 }
 
 
@@ -66,35 +78,32 @@ def row(case: scenes.Case) -> dict:
         "v+g": jax.value_and_grad(lambda params: jnp.sum(render(params) * cotangent)),
     }
     functions, found, seconds = {}, {}, {}
-    for name, changes in WITHOUT.items():
+    for way, changes in WAYS.items():
         jax.clear_caches()
-        patches = [mock.patch.object(*change, unchanged) for change in changes]
-        for patch in patches:
-            patch.start()
         for key, function in programs.items():
-            lowered = jax.jit(function).lower(scene.params)
+            with ExitStack() as patches:
+                for change in changes:
+                    patches.enter_context(mock.patch.object(*change))
+                lowered = jax.jit(function).lower(scene.params)
             start = time.perf_counter()
             compiled = lowered.compile()
-            seconds[key, name] = time.perf_counter() - start
-            functions[key, name] = lambda run=compiled: run(scene.params)
-            found[key, name] = jax.block_until_ready(compiled(scene.params))
-        for patch in patches:
-            patch.stop()
-    names = {f"{key}, {name}": (key, name) for key, name in functions}
-    ms = measure.interleaved({n: functions[at] for n, at in names.items()}, 21)
+            seconds[key, way] = time.perf_counter() - start
+            functions[f"{key}, {way}"] = lambda run=compiled: run(scene.params)
+            found[key, way] = compiled(scene.params)
+    ms = measure.interleaved(functions, 21)
     told = {
         "scene": case.name,
         "SH degree": scene.sh_degree,
         "forward ms": ms["forward, as it is"],
         "v+g ms": ms["v+g, as it is"],
     }
-    for (key, name), took in seconds.items():
-        if name == "as it is":
+    for key, way in seconds:
+        if way == "as it is":
             continue
-        usual = found[key, "as it is"]
-        told[f"{key} as it is / {name}"] = ms[f"{key}, as it is"] / ms[f"{key}, {name}"]
-        told[f"{key} compiling as it is / {name}"] = seconds[key, "as it is"] / took
-        told[f"{key} differs from {name}"] = relative(usual, found[key, name])
+        usual, changed = (key, "as it is"), (key, way)
+        told[f"{key} as it is / {way}"] = ms[f"{key}, as it is"] / ms[f"{key}, {way}"]
+        told[f"{key} compiling as it is / {way}"] = seconds[usual] / seconds[changed]
+        told[f"{key} differs from {way}"] = relative(found[usual], found[changed])
     return told
 
 

@@ -13,7 +13,6 @@ Gaussians where runs differ in these alone; with ``--draw`` of what is kept.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import tempfile
 from collections.abc import Callable
@@ -45,11 +44,11 @@ def train(
     measure.run_cold([*program, *options])
 
 
-def kept(path: Path, held_out: list[str], new: list[str]) -> list[dict]:
+def earlier(stem: str, held_out: list[str], new: list[str]) -> list[dict]:
     """Rows of an earlier result, of the same images, but for those measured anew."""
-    if not path.exists():
+    if not measure.path_of(stem).exists():
         return []
-    told = json.loads(path.read_text())
+    told = measure.kept(stem)
     same = told["held out"] == held_out
     return [row for row in told["rows"] if same and row["strategy"] not in new]
 
@@ -58,11 +57,11 @@ def main(
     dataset: Path, held_out: list[str], strategies: list[str], changes: dict[str, str]
 ) -> None:
     """Measure, save and draw; ``changes`` to the preset "fast", by their options."""
-    path = measure.path_of(f"training_{dataset.name}")
+    stem = f"training_{dataset.name}"
     more = "".join(f", {name} {value}" for name, value in changes.items())
     changes = {"preset": "fast", **changes}
     other = [text for name, value in changes.items() for text in (f"--{name}", value)]
-    rows = kept(path, held_out, [strategy + more for strategy in strategies])
+    rows = earlier(stem, held_out, [strategy + more for strategy in strategies])
     machine = measure.machine()
     with tempfile.TemporaryDirectory() as folder:
         for strategy in strategies:
@@ -74,7 +73,7 @@ def main(
             rows += [{"strategy": strategy + more, **record} for record in found]
             rows[-1] |= {**last, "date": machine["date"]}
     content = {"machine": machine, "claim": __doc__, "held out": held_out}
-    files.write_json(path, {**content, "rows": rows})
+    files.write_json(measure.path_of(stem), {**content, "rows": rows})
     for row in rows:
         print(row)
     draw(dataset.name)

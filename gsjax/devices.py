@@ -28,8 +28,6 @@ from gsjax.machine import usable_cores
 from gsjax.programs import drop_oldest, drop_torn
 from gsjax.settings import whole
 
-Array = jax.Array
-
 # Programs are a few hundred kB each; a folder of more than this loses its oldest.
 _MAX_KEPT_BYTES = 500_000_000
 
@@ -119,7 +117,7 @@ def spread(work: Callable[..., Any], count: int, *inputs: Any) -> Any:
     return shared(jnp.arange(count, dtype=jnp.int32), *inputs)
 
 
-def in_parts(values: Array, count: int, fill: float) -> Array:
+def in_parts(values: jax.Array, count: int, fill: float) -> jax.Array:
     """``values`` [n], each of ``count`` devices at work on an equal part.
 
     What is made of them number by number then is shared, too, up to where something

@@ -14,7 +14,6 @@ from conftest import (
     BACKGROUND,
     COMPAT,
     COUNT,
-    LIGHT,
     cast,
     loss_and_gradients,
     needs_two_devices,
@@ -25,7 +24,6 @@ from conftest import (
 from pictures import KINDS, assert_same, images
 
 import gsjax
-from gsjax import RasterConfig
 from gsjax.raster import picture
 
 pytestmark = pytest.mark.as_users
@@ -80,7 +78,7 @@ def test_a_projection_in_parts_is_bit_equal(monkeypatch):
     gaussians, camera = cast(scene_of("random"), jnp.float32)
     gaussians = gsjax.grow(gaussians, COUNT + 9)
     assert gaussians.sh_degree > 0
-    config = RasterConfig(**LIGHT, outputs=("rgb",)).replace(devices=2)
+    config = COMPAT.replace(outputs=("rgb",), devices=2)
     calls, usual = [], picture.in_parts
 
     def total(params):
