@@ -34,9 +34,8 @@ from gsjax import cli
 
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
-TEXTS = {
-    path: path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *PAGES]
-}
+READMES = [ROOT / "README.md", ROOT / "benchmarks" / "README.md"]
+TEXTS = {path: path.read_text(encoding="utf-8") for path in [*READMES, *PAGES]}
 CLI_PAGE = TEXTS[DOCS / "cli.md"]
 _SPEC = importlib.util.spec_from_file_location("options", DOCS / "options.py")
 assert _SPEC is not None
@@ -92,7 +91,7 @@ def test_commands_are_those_of_the_program(path, helps):
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.stem)
 def test_options_are_those_of_some_command(path, helps):
-    """Or, in the README, of one of the benchmarks."""
+    """Or of one of the benchmarks."""
     known = {"--help", "--version"}.union(*map(options_in, helps.values()))
     for source in (ROOT / "benchmarks").glob("*.py"):
         known |= set(re.findall(r'"(--\w+)" in sys.argv', source.read_text("utf-8")))

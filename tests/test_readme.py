@@ -1,12 +1,14 @@
 """The README's Python runs as it stands, and its table is that of the code."""
 
 import re
+from pathlib import Path
 
 import pytest
 from snippets import ROOT, blocks, run_pages
 
 import gsjax
 
+BENCHMARKS = ROOT / "benchmarks"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 # What the snippets claim in their comments.
 CLAIMS = """
@@ -28,12 +30,30 @@ def test_python_blocks_run(tmp_path):
     assert (tmp_path / "scene.ply").exists()
 
 
+def links(page: Path) -> list[Path]:
+    """The files that a page links to."""
+    found = re.findall(r"\]\(([^)\s#]+)", page.read_text(encoding="utf-8"))
+    return [page.parent / link for link in found if "://" not in link]
+
+
 def test_linked_files_are_there():
-    links = [
-        link for link in re.findall(r"\]\(([^)\s#]+)", README) if "://" not in link
-    ]
-    assert len(links) > 30
-    assert [link for link in links if not (ROOT / link).exists()] == []
+    found = [*links(ROOT / "README.md"), *links(BENCHMARKS / "README.md")]
+    assert len(found) > 100
+    assert [path for path in found if not path.exists()] == []
+
+
+def test_benchmarks_and_their_results_are_linked():
+    """The README links every picture, and that of the benchmarks all there is."""
+    results = set((BENCHMARKS / "results").iterdir())
+    pictures = {path for path in results if path.suffix in (".png", ".webp")}
+    assert pictures - set(links(ROOT / "README.md")) == set()
+    claims = {
+        path
+        for path in BENCHMARKS.glob("*.py")
+        if path.read_text(encoding="utf-8").startswith('"""Claim: ')
+    }
+    assert len(claims) > 15
+    assert (results | claims) - set(links(BENCHMARKS / "README.md")) == set()
 
 
 def test_presets_are_as_in_the_table():
