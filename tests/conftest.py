@@ -37,6 +37,8 @@ from gsjax import Gaussians, RasterConfig
 from gsjax.cameras import Camera
 from gsjax.stress.scenes import fields_at
 
+# What is traced are objects by the million, and few of them in cycles.
+gc.set_threshold(200_000, 20, 50)
 # Thousands of programs of all sizes in one process: memory kept would only pile up.
 gsjax.devices.keep_memory = lambda: False
 
