@@ -2,6 +2,7 @@
 
 from importlib import import_module
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from conftest import (
 from pictures import assert_same, images, largest_difference
 
 import gsjax
-from gsjax.errors import CapacityError
+from gsjax.errors import CapacityError, InputError
 from gsjax.raster.counts import total_count
 from gsjax.raster.render import _for_active
 
@@ -165,3 +166,17 @@ def test_total_count_saturates(counts, wanted):
     assert total.dtype == jnp.int32
     assert total == wanted
     assert safe == (wanted < 2**30)
+
+
+@pytest.mark.parametrize("call", [gsjax.render_exact, gsjax.exact_config, gsjax.plan])
+def test_what_decides_by_numbers_is_refused_under_jit(call):
+    scene = scene_of("random")
+    for traced in (0, 1):
+        given = list(scene)
+
+        def inside(value, traced=traced, given=given):
+            given[traced] = value
+            call(*given)
+
+        with pytest.raises(InputError, match=r"decide by numbers, .* call them before"):
+            jax.jit(inside)(scene[traced])

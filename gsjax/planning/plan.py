@@ -20,13 +20,14 @@ from gsjax.planning import bounds
 from gsjax.planning.accuracy import ROUNDING, within_budget
 from gsjax.planning.sizes import shown, tuned, with_capacities
 from gsjax.planning.types import Plan, Reason
-from gsjax.raster.render import DEFAULT_CONFIG
+from gsjax.raster.render import DEFAULT_CONFIG, on_the_host
 from gsjax.raster.types import COLOR_LIMIT, RasterConfig
 
 _CAMERAS = 12  # to measure on, at most
 _SH_SHARE = 0.25
 
 
+@on_the_host()
 def plan(
     gaussians: Gaussians,
     cameras: Camera | Sequence[Camera],
@@ -60,7 +61,8 @@ def plan(
 
     Raises:
       InputError: if there is no camera, or the budget is not above 0, or is below what
-        float32 rounding allows, or colours span too much for it.
+        float32 rounding allows, or colours span too much for it; and under `jax.jit`,
+        `vmap` or `scan`.
       CapacityError: as `render_exact`.
     """
     views = _sampled(cameras)

@@ -2,6 +2,10 @@
 batch. Each raises InputError if a shape does not fit, or a number is complex.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import jax
 import jax.numpy as jnp
 
 from gsjax.cameras import Camera
@@ -9,6 +13,23 @@ from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.raster.types import Array, RasterConfig
 from gsjax.sh import degree_of
+
+_UNKNOWN = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
+
+
+@contextmanager
+def on_the_host() -> Iterator[None]:
+    """Within, or of a function that this decorates: InputError says what to do under a
+    transformation that leaves numbers open.
+    """
+    try:
+        yield
+    except _UNKNOWN as error:
+        raise InputError(
+            "render_exact, exact_config and plan decide by numbers, which are not "
+            "known under jax.jit, vmap or scan: call them before, and inside render "
+            "with the config that exact_config or plan gave"
+        ) from error
 
 
 def check_gaussians(gaussians: Gaussians) -> None:

@@ -26,6 +26,7 @@ from gsjax.raster.inputs import (
     checked_size,
     with_batch,
 )
+from gsjax.raster.inputs import on_the_host as on_the_host
 from gsjax.raster.picture import draw, finish
 from gsjax.raster.rasterise import device_count as device_count
 from gsjax.raster.types import Array, Demand, RasterConfig, Render
@@ -138,6 +139,7 @@ def _demand_jit(gaussians: Gaussians, camera: Camera, config: RasterConfig):
     return view.demand, view.overflowed
 
 
+@on_the_host()
 def render_exact(
     gaussians: Gaussians,
     camera: Camera,
@@ -160,7 +162,7 @@ def render_exact(
     Raises:
       CapacityError: if more than ``max_capacity`` is wanted, or more memory than there
         is (see `gsjax.memory`).
-      InputError: as `render`.
+      InputError: as `render`, and under `jax.jit`, `vmap` or `scan`.
     """
     config = _for_active(gaussians, config)
     while True:
@@ -171,6 +173,7 @@ def render_exact(
         config = _regrow(config, result.demand, max_capacity)
 
 
+@on_the_host()
 def exact_config(
     gaussians: Gaussians,
     camera: Camera,
@@ -190,7 +193,7 @@ def exact_config(
       max_capacity: as for `render_exact`.
 
     Raises:
-      CapacityError: as `render_exact`.
+      CapacityError, InputError: as `render_exact`.
     """
     fitted = _fit(count_demand(gaussians, camera, config, max_capacity), max_capacity)
     return config.replace(
