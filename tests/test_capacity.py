@@ -168,15 +168,26 @@ def test_total_count_saturates(counts, wanted):
     assert safe == (wanted < 2**30)
 
 
+TRANSFORMED = {
+    "jit": lambda function, value: jax.jit(function)(value),
+    "vmap": lambda function, value: jax.vmap(function)(batch_of_one(value)),
+    "scan": lambda function, value: jax.lax.scan(
+        lambda _, one: (None, function(one)), None, batch_of_one(value)
+    ),
+}
+
+
+def batch_of_one(tree):
+    return jax.tree.map(lambda a: jnp.asarray(a)[None], tree)
+
+
 @pytest.mark.parametrize("call", [gsjax.render_exact, gsjax.exact_config, gsjax.plan])
-def test_what_decides_by_numbers_is_refused_under_jit(call):
-    scene = scene_of("random")
-    for traced in (0, 1):
-        given = list(scene)
-
-        def inside(value, traced=traced, given=given):
-            given[traced] = value
-            call(*given)
-
-        with pytest.raises(InputError, match=r"decide by numbers, .* call them before"):
-            jax.jit(inside)(scene[traced])
+@pytest.mark.parametrize("name", TRANSFORMED)
+def test_what_decides_by_numbers_is_refused_where_they_are_not_known(name, call):
+    gaussians, camera = scene_of("random")
+    told = r"decide by numbers, .* call them before"
+    with pytest.raises(InputError, match=told):
+        TRANSFORMED[name](lambda value: call(value, camera), gaussians)
+    if name != "vmap":  # for which a render is compiled before it is refused
+        with pytest.raises(InputError, match=told):
+            TRANSFORMED[name](lambda value: call(gaussians, value), camera)

@@ -1,5 +1,6 @@
-"""What a caller passes to `render`: its shape checked, and with the leading axis of a
-batch. Each raises InputError if a shape does not fit, or a number is complex.
+"""What a caller passes: to `render`, its shape checked, and with the leading axis of a
+batch; and to whoever decides by numbers, that they are known. Each raises InputError
+if a shape does not fit, or a number is complex, or not known.
 """
 
 from collections.abc import Iterator
