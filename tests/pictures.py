@@ -2,12 +2,12 @@
 
 import jax.numpy as jnp
 import numpy as np
-from conftest import ALL, BACKGROUND, COMPAT, assert_not_empty, cast, render
+from conftest import ALL, BACKGROUND, WHOLE, assert_not_empty, cast, render
 
 KINDS = ("random", "wall", "equal_depths")
 
 
-def images(gaussians, camera, config=COMPAT, dtype=jnp.float32):
+def images(gaussians, camera, config=WHOLE, dtype=jnp.float32):
     given = cast((gaussians, camera, BACKGROUND), dtype)
     out = render(given[0], given[1], config, given[2])
     assert not out.overflowed

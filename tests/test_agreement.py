@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import COMPAT, camera_of, pose, scene_of
+from conftest import WHOLE, camera_of, pose, scene_of
 from pictures import KINDS, images, largest_difference
 
 import gsjax
@@ -30,7 +30,7 @@ from gsjax.numerics import in_float64
 def test_tile_and_chunk_sizes(changes, report):
     for kind in KINDS:
         scene = scene_of(kind)
-        found = images(*scene, COMPAT.replace(**changes))
+        found = images(*scene, WHOLE.replace(**changes))
         error = largest_difference(found, images(*scene))
         report(f"{kind}, {changes}", error, 2e-5)
         assert error <= 2e-5, kind
@@ -42,7 +42,7 @@ def test_occlusion(report):
     for dtype, bar in ((jnp.float32, 5e-7), (jnp.float64, 1e-15)):
         for kind in ("wall", "random", "saturated"):
             scene = scene_of(kind)
-            plain = images(*scene, COMPAT.replace(occlusion=False), dtype)
+            plain = images(*scene, WHOLE.replace(occlusion=False), dtype)
             found = images(*scene, dtype=dtype)
             error = largest_difference(found, plain)
             report(f"occlusion, {kind}, {dtype.__name__}", error, bar)
@@ -77,14 +77,14 @@ def test_depths_that_differ_by_less_than_a_step_of_float32(report):
             gsjax.make_gaussians(**fields),
             jax.tree.map(jnp.float32, camera),
         )
-        found = gsjax.render_exact(scene, narrow, COMPAT).rgb
+        found = gsjax.render_exact(scene, narrow, WHOLE).rgb
         row, means = np.asarray(narrow.viewmat)[2], fields["means"]
         as_computed = sum(row[i] * means[:, i] for i in range(3)) + row[3]
     wide, camera = in_float64((scene, narrow))
     z = np.asarray(wide.params.means) @ np.asarray(camera.viewmat)[2, :3]
     # What float32 makes of it is another order.
     assert (np.argsort(z) != np.argsort(as_computed, kind="stable")).any()
-    wanted = gsjax.render_exact(wide, camera, COMPAT).rgb
+    wanted = gsjax.render_exact(wide, camera, WHOLE).rgb
     error = float(jnp.abs(found - wanted).max())
     report("order within a step of float32", error, 1e-5)
     assert error <= 1e-5

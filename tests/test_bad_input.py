@@ -7,9 +7,9 @@ import pytest
 from conftest import (
     ALL,
     BACKGROUND,
-    COMPAT,
     COUNT,
     HEIGHT,
+    WHOLE,
     WIDTH,
     assert_not_empty,
     camera_of,
@@ -220,16 +220,16 @@ def test_gaussians_of_unequal_length():
         for wrong in (array[:-1], array[:, None], array + 0j):
             params = gaussians.params.replace(**{name: wrong})
             with pytest.raises(InputError, match=name):
-                gsjax.render(gaussians.replace(params=params), camera, COMPAT)
+                gsjax.render(gaussians.replace(params=params), camera, WHOLE)
     for wrong in (gaussians.active[:-1], gaussians.active[None]):
         with pytest.raises(InputError, match="wanted"):
-            gsjax.render(gaussians.replace(active=wrong), camera, COMPAT)
+            gsjax.render(gaussians.replace(active=wrong), camera, WHOLE)
     numbers = gaussians.replace(active=gaussians.active.astype(float))
     with pytest.raises(InputError, match=r"active .* of float"):
-        gsjax.render(numbers, camera, COMPAT)
+        gsjax.render(numbers, camera, WHOLE)
     params = gaussians.params.replace(sh=gaussians.params.sh[:, :5])
     with pytest.raises(InputError, match="5 spherical-harmonic"):
-        gsjax.render(gaussians.replace(params=params), camera, COMPAT)
+        gsjax.render(gaussians.replace(params=params), camera, WHOLE)
 
 
 def test_cameras_put_together_by_hand():
@@ -238,15 +238,15 @@ def test_cameras_put_together_by_hand():
     for name in ("viewmat", "K", "near", "far"):
         mixed = gsjax.Camera(**{**vars(both), name: getattr(camera, name)})
         with pytest.raises(InputError, match="see make_camera"):
-            gsjax.render(gaussians, mixed, COMPAT)
+            gsjax.render(gaussians, mixed, WHOLE)
         imaginary = getattr(camera, name) + 0j
         with pytest.raises(InputError, match=f"{name} is complex"):
             gsjax.render(
-                gaussians, gsjax.Camera(**{**vars(camera), name: imaginary}), COMPAT
+                gaussians, gsjax.Camera(**{**vars(camera), name: imaginary}), WHOLE
             )
     twice = jax.tree.map(lambda a: a[None], both)
     with pytest.raises(InputError, match="see make_camera"):
-        gsjax.render(gaussians, twice, COMPAT)
+        gsjax.render(gaussians, twice, WHOLE)
 
 
 def test_a_background_in_the_place_of_settings():
@@ -263,11 +263,11 @@ def test_a_background_in_the_place_of_settings():
         ("features", {"features": jnp.zeros(COUNT)}),
         ("features", {"features": [1, 2, 3]}),
         ("features", {"features": np.zeros((COUNT, 0))}),
-        ("1000 devices|devices = 1000", {"config": COMPAT.replace(devices=1000)}),
+        ("1000 devices|devices = 1000", {"config": WHOLE.replace(devices=1000)}),
         ("probe", {"probe": jnp.zeros((COUNT, 3))}),
         ("probe", {"probe": jnp.zeros((1, COUNT, 2))}),
         ("abs_probe", {"abs_probe": jnp.zeros((COUNT, 2))}),  # without absgrad
-        ("abs_probe", {"config": COMPAT.replace(absgrad=True)}),
+        ("abs_probe", {"config": WHOLE.replace(absgrad=True)}),
         ("background", {"background": np.zeros(4)}),
         ("background", {"background": np.zeros((3, 3))}),
         ("background", {"background": np.zeros((HEIGHT, WIDTH, 3))}),
@@ -275,7 +275,7 @@ def test_a_background_in_the_place_of_settings():
     ids=str,
 )
 def test_arguments_of_render(named, kwargs):
-    kwargs = {"config": COMPAT, **kwargs}
+    kwargs = {"config": WHOLE, **kwargs}
     config = kwargs.pop("config")
     with pytest.raises(InputError, match=named):
         jax.eval_shape(
@@ -320,9 +320,9 @@ def test_arrays_of_numpy(batched):
         "probe": np.zeros((*camera.viewmat.shape[:-2], COUNT, 2), np.float32),
     }
     host = jax.device_get(gaussians)
-    found = jax.jit(lambda c: gsjax.render(host, c, COMPAT, **given).rgb)(camera)
+    found = jax.jit(lambda c: gsjax.render(host, c, WHOLE, **given).rgb)(camera)
     given = jax.tree.map(jnp.asarray, given)
-    wanted = jax.jit(lambda g, c: gsjax.render(g, c, COMPAT, **given).rgb)
+    wanted = jax.jit(lambda g, c: gsjax.render(g, c, WHOLE, **given).rgb)
     assert np.std(found) > 0.01
     np.testing.assert_allclose(found, wanted(gaussians, camera), atol=1e-5)
 
@@ -330,7 +330,7 @@ def test_arrays_of_numpy(batched):
 def test_a_probe_of_another_precision():
     """It follows the scene's, as the optimiser's zeros under x64 may not."""
     gaussians, camera = cast(scene_of("random"), jnp.float32)
-    config = COMPAT.replace(absgrad=True)
+    config = WHOLE.replace(absgrad=True)
     zeros = np.zeros((COUNT, 2))
     assert jnp.asarray(zeros).dtype == jnp.float64
     out = jax.eval_shape(
@@ -483,7 +483,7 @@ def test_a_camera_that_is_not_finite_draws_nothing_under_jit():
         gsjax.Camera(**{**vars(camera), "viewmat": camera.viewmat * np.nan}),
         gsjax.Camera(**{**vars(camera), "near": camera.near * np.nan}),
     ):
-        out = render(gaussians, spoilt_camera, COMPAT, BACKGROUND)
+        out = render(gaussians, spoilt_camera, WHOLE, BACKGROUND)
         np.testing.assert_array_equal(
             out.rgb, np.broadcast_to(BACKGROUND, out.rgb.shape)
         )
@@ -513,7 +513,7 @@ def empty_scenes():
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_an_empty_scene_is_exactly_the_background(kind, dtype):
     gaussians, camera, background = cast((*empty_scenes()[kind], BACKGROUND), dtype)
-    out = render(gaussians, camera, COMPAT, background)
+    out = render(gaussians, camera, WHOLE, background)
     assert out.rgb.shape == (HEIGHT, WIDTH, 3)
     np.testing.assert_array_equal(out.rgb, np.broadcast_to(background, out.rgb.shape))
     for name in ("alpha", "depth", "median_depth", "radii"):
@@ -531,5 +531,5 @@ def test_no_slot_is_still_a_scene():
     gaussians = gsjax.make_gaussians(**none)
     assert gaussians.capacity == 1
     assert gsjax.num_active(gaussians) == 0
-    out = render(gaussians, camera_of(1, 1), COMPAT, BACKGROUND)
+    out = render(gaussians, camera_of(1, 1), WHOLE, BACKGROUND)
     np.testing.assert_array_equal(out.rgb[0, 0], BACKGROUND)

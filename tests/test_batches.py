@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import ALL, BACKGROUND, COMPAT, COUNT, camera_of, cast, render, scene_of
+from conftest import ALL, BACKGROUND, COUNT, WHOLE, camera_of, cast, render, scene_of
 from pictures import images, largest_difference
 
 import gsjax
@@ -25,9 +25,9 @@ def test_single_batch_and_vmap(dtype, bar, report):
     second = cast(camera_of(centre=(30.0, 8.0)), dtype)
     cameras = gsjax.stack_cameras([first, second])
     background = jnp.asarray(BACKGROUND, dtype)
-    batch = render(gaussians, cameras, COMPAT, background)
+    batch = render(gaussians, cameras, WHOLE, background)
     mapped = jax.jit(
-        jax.vmap(lambda c, g, b: gsjax.render(g, c, COMPAT, b), (0, None, None))
+        jax.vmap(lambda c, g, b: gsjax.render(g, c, WHOLE, b), (0, None, None))
     )(cameras, gaussians, background)
     for i, camera in enumerate((first, second)):
         wanted = images(gaussians, camera, dtype=dtype)
@@ -62,7 +62,7 @@ def test_a_batch_of_one(report):
 def test_a_mapped_camera_that_sees_nothing(report):
     """Beside one that sees much: sizes and branches are those that do for both."""
     gaussians, camera = cast(scene_of("random"), jnp.float32)
-    config = COMPAT.replace(rungs=4, pair_capacity=2**16)
+    config = WHOLE.replace(rungs=4, pair_capacity=2**16)
     away = dataclasses.replace(camera, viewmat=camera.viewmat.at[2].multiply(-1))
     cameras = gsjax.stack_cameras([camera, away])
 
@@ -88,7 +88,7 @@ def test_a_mapped_camera_that_sees_nothing(report):
 
 
 @pytest.mark.parametrize(("dtype", "bar"), [(jnp.float32, 1e-6), (jnp.float64, 4e-15)])
-@pytest.mark.parametrize("config", [COMPAT, COMPAT.replace(chunk_size=3, stop=0.3)])
+@pytest.mark.parametrize("config", [WHOLE, WHOLE.replace(chunk_size=3, stop=0.3)])
 def test_a_derivative_changes_no_image(config, dtype, bar, report):
     """With one the lists are gone through in another way; see `composite`."""
     gaussians, camera = cast(scene_of("random"), dtype)

@@ -141,7 +141,6 @@ def test_counts_past_32_bits_do_not_wrap():
         chunk_size=1,
         tiles_per_step=1024,
         pair_capacity=8192,
-        occlusion=False,
     )
     out = render(*cast((scene, camera), jnp.float32), config)
     assert out.overflowed

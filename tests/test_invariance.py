@@ -12,8 +12,8 @@ import pytest
 from conftest import (
     ALL,
     BACKGROUND,
-    COMPAT,
     COUNT,
+    WHOLE,
     cast,
     loss_and_gradients,
     needs_two_devices,
@@ -54,7 +54,7 @@ def test_settings_are_bit_equal(changes, dtype):
     for kind in KINDS:
         scene = scene_of(kind)
         wanted = images(*scene, dtype=dtype)
-        assert_same(images(*scene, COMPAT.replace(**changes), dtype), wanted)
+        assert_same(images(*scene, WHOLE.replace(**changes), dtype), wanted)
 
 
 @on_cpu
@@ -78,7 +78,7 @@ def test_a_projection_in_parts_is_bit_equal(monkeypatch):
     gaussians, camera = cast(scene_of("random"), jnp.float32)
     gaussians = gsjax.grow(gaussians, COUNT + 9)
     assert gaussians.sh_degree > 0
-    config = COMPAT.replace(outputs=("rgb",), devices=2)
+    config = WHOLE.replace(outputs=("rgb",), devices=2)
     calls, usual = [], picture.in_parts
 
     def total(params):
@@ -187,6 +187,6 @@ def test_the_same_without_x64():
     gaussians, camera = cast(scene_of("random"), jnp.float32)
     wanted = images(gaussians, camera)
     with jax.enable_x64(False):
-        out = render(gaussians, camera, COMPAT, jnp.float32(BACKGROUND))
+        out = render(gaussians, camera, WHOLE, jnp.float32(BACKGROUND))
         assert_same(out, wanted, (*ALL, "radii"))
     assert out.demand == wanted.demand

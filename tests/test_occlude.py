@@ -29,10 +29,11 @@ from gsjax.raster.occlude import (
 from gsjax.raster.order import depth_order
 from gsjax.raster.project import project
 
+SEARCHING = {**LIGHT, "occlusion": True}
 PRESETS = {
-    "compat": RasterConfig.compat(**LIGHT),
-    "accurate": RasterConfig.accurate(**LIGHT),
-    "fast": RasterConfig.fast(**LIGHT),
+    "compat": RasterConfig.compat(**SEARCHING),
+    "accurate": RasterConfig.accurate(**SEARCHING),
+    "fast": RasterConfig.fast(**SEARCHING),
 }
 
 

@@ -14,11 +14,11 @@ from conftest import (
     ACCURATE,
     ALL,
     BACKGROUND,
-    COMPAT,
     COUNT,
     HEIGHT,
     PRESETS,
     SCENES,
+    WHOLE,
     WIDTH,
     assert_not_empty,
     camera_of,
@@ -69,8 +69,8 @@ def test_float64(kind, preset, report):
 def test_float64_against_factors(kind, report):
     """Needles against an oracle in numpy that never forms the covariance."""
     gaussians, camera = scene_of(kind)
-    out = render(gaussians, camera, COMPAT, BACKGROUND)
-    wanted = well_conditioned_render(gaussians, camera, COMPAT, BACKGROUND)
+    out = render(gaussians, camera, WHOLE, BACKGROUND)
+    wanted = well_conditioned_render(gaussians, camera, WHOLE, BACKGROUND)
     errors, _ = errors_of(out, wanted, BAND[jnp.float64])
     for name, error in errors.items():
         report(f"{kind}, {name}, float64, factors", error, BAR[jnp.float64])
@@ -108,7 +108,7 @@ def test_settings(changes, report):
     if changes.get("devices", 1) > jax.local_device_count():
         pytest.skip("needs two local devices")
     for kind in ("random", "wall", "around", "saturated"):
-        errors, _ = compare(*scene_of(kind), COMPAT.replace(**changes), jnp.float64)
+        errors, _ = compare(*scene_of(kind), WHOLE.replace(**changes), jnp.float64)
         for name, error in errors.items():
             report(f"{kind}, {changes}, {name}", error, BAR[jnp.float64])
             assert error <= BAR[jnp.float64], (kind, name)
@@ -127,7 +127,7 @@ def test_settings(changes, report):
 )
 def test_sizes(size, dtype, report):
     gaussians, _ = scene_of("random")
-    errors, _ = compare(gaussians, camera_of(*size), COMPAT, dtype)
+    errors, _ = compare(gaussians, camera_of(*size), WHOLE, dtype)
     for name, error in errors.items():
         report(f"size {size}, {name}, {dtype.__name__}", error, BAR[dtype])
         assert error <= BAR[dtype], name
@@ -136,7 +136,7 @@ def test_sizes(size, dtype, report):
 def test_orthographic(report):
     gaussians, _ = scene_of("random")
     camera = camera_of(model="orthographic", focal=(8.0, 7.0))
-    errors, _ = compare(gaussians, camera, COMPAT, jnp.float64)
+    errors, _ = compare(gaussians, camera, WHOLE, jnp.float64)
     for name, error in errors.items():
         report(f"orthographic, {name}", error, BAR[jnp.float64])
         assert error <= BAR[jnp.float64], name
@@ -147,7 +147,7 @@ def test_degrees(degree, report):
     """Degree 3 is that of all other scenes."""
     gaussians, camera = scene_of("random")
     gaussians = gsjax.with_sh_degree(gaussians, degree)
-    errors, _ = compare(gaussians, camera, COMPAT, jnp.float64)
+    errors, _ = compare(gaussians, camera, WHOLE, jnp.float64)
     report(f"degree {degree}", max(errors.values()), BAR[jnp.float64])
     assert max(errors.values()) <= BAR[jnp.float64]
 
@@ -159,7 +159,7 @@ def test_features(channels, report):
     features = jnp.asarray(rng.normal(size=(COUNT, channels)))
     background = rng.normal(size=channels)
     errors, _ = compare(
-        gaussians, camera, COMPAT, jnp.float64, background, features=features
+        gaussians, camera, WHOLE, jnp.float64, background, features=features
     )
     report(f"{channels} features", max(errors.values()), BAR[jnp.float64])
     assert max(errors.values()) <= BAR[jnp.float64]
@@ -169,11 +169,11 @@ def test_batch_with_a_background_each(report):
     gaussians, first = scene_of("random")
     cameras = [first, camera_of(viewmat=pose(0) + 0.0, centre=(30, 8))]
     backgrounds = np.random.default_rng(0).uniform(0, 1, (2, 3))
-    out = render(gaussians, gsjax.stack_cameras(cameras), COMPAT, backgrounds)
+    out = render(gaussians, gsjax.stack_cameras(cameras), WHOLE, backgrounds)
     assert out.rgb.shape == (2, HEIGHT, WIDTH, 3)
     assert out.radii.shape == (2, COUNT)
     for i, camera in enumerate(cameras):
-        wanted = reference(gaussians, camera, COMPAT, backgrounds[i])
+        wanted = reference(gaussians, camera, WHOLE, backgrounds[i])
         one = out._replace(**{name: getattr(out, name)[i] for name in ALL})
         errors, _ = errors_of(one, wanted, BAND[jnp.float64])
         report("batch with backgrounds", max(errors.values()), BAR[jnp.float64])

@@ -18,7 +18,7 @@ from gsjax.train.start import extent_of
 
 VIEWS, POINTS, WIDTH, HEIGHT = 4, 60, 32, 24
 # Small programs: they take longest in these tests.
-RASTER = RasterConfig(**{**LIGHT, "pair_capacity": 4096}, occlusion=False)
+RASTER = RasterConfig(**{**LIGHT, "pair_capacity": 4096})
 # No threshold within reach, so that finite differences are those of the gradient.
 SMOOTH = RASTER.replace(alpha_cut=1e-14, alpha_cap=1 - 1e-9, stop=0, stop_rule="after")
 
