@@ -45,8 +45,8 @@ gsjax.devices.keep_memory = lambda: False
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 # One size of the ladder and one device: anything more is compiled again. Nor is what is
-# hidden looked for, a quarter of a program: tests of the oracle, of equal bits, of
-# batches and of bad numbers do that, by `WHOLE` and `PRESETS`.
+# hidden looked for, which compiles longer (see benchmarks/training_skips.py): tests of
+# the oracle, of equal bits, of batches and of bad numbers do, by `WHOLE` and `PRESETS`.
 LIGHT = {"rungs": 1, "devices": 1, "pair_capacity": 8192, "occlusion": False}
 ALL = ("rgb", "alpha", "depth", "median_depth")
 COMPAT = RasterConfig.compat(**LIGHT, outputs=ALL)

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import (
+    ALL,
     COUNT,
     HEIGHT,
-    LIGHT,
+    PRESETS,
     WIDTH,
     assert_not_empty,
     camera_of,
@@ -18,7 +19,6 @@ from conftest import (
     render,
 )
 
-from gsjax import RasterConfig
 from gsjax.raster.occlude import (
     ALPHA_MARGIN,
     SQUARE,
@@ -28,13 +28,6 @@ from gsjax.raster.occlude import (
 )
 from gsjax.raster.order import depth_order
 from gsjax.raster.project import project
-
-SEARCHING = {**LIGHT, "occlusion": True}
-PRESETS = {
-    "compat": RasterConfig.compat(**SEARCHING),
-    "accurate": RasterConfig.accurate(**SEARCHING),
-    "fast": RasterConfig.fast(**SEARCHING),
-}
 
 
 def scene_behind(layers: int, across: float = 1.0):
@@ -72,7 +65,7 @@ def test_bit_equal_with_and_without(preset, layers, across):
     without = render(gaussians, camera, config=config.replace(occlusion=False))
     assert not with_it.overflowed
     assert_not_empty(with_it.alpha)
-    for name in ("rgb", "alpha", "depth"):
+    for name in ALL:
         np.testing.assert_array_equal(getattr(with_it, name), getattr(without, name))
     seen, whole = np.asarray(with_it.visible), np.asarray(without.visible)
     assert not (seen & ~whole).any()

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import (
-    ACCURATE,
     ALL,
     BACKGROUND,
     COUNT,
@@ -199,7 +198,9 @@ def test_accurate_against_the_exact_image(kind, report):
         gaussians, camera = scene_of(kind)
     else:
         gaussians, camera = thousands(kind), camera_of()
-    config = ACCURATE.replace(pair_capacity=2**17) if kind == "4000 faint" else ACCURATE
+    config = PRESETS["accurate"]
+    if kind == "4000 faint":
+        config = config.replace(pair_capacity=2**17)
     exact = reference(gaussians, camera, None, BACKGROUND)
     out = render(gaussians, camera, config, BACKGROUND)
     assert not out.overflowed
