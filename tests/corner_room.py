@@ -58,8 +58,16 @@ def texture(seed: int) -> np.ndarray:
     return np.clip(128 + 45 * total, 0, 255).astype(np.uint8)
 
 
-def exif(orientation: int, focal_35mm: int) -> bytes:
-    """EXIF with an orientation, a camera, and a focal length for 35 mm film."""
+def exif(
+    orientation: int,
+    focal_35mm: int,
+    focal_mm: tuple[int, int] = (60, 10),
+    camera: tuple[bytes, bytes] = (b"Maker", b"Model"),
+) -> bytes:
+    """EXIF with an orientation, a camera, and its focal length.
+
+    For 35 mm film, which counts unless it is 0, and of the lens, as a fraction.
+    """
 
     def ifd(entries, at):
         head, tail = struct.pack("<H", len(entries)), b""
@@ -74,15 +82,17 @@ def exif(orientation: int, focal_35mm: int) -> bytes:
 
     short = struct.Struct("<H").pack
     main = [
-        (0x010F, 2, 6, b"Maker\0"),
-        (0x0110, 2, 6, b"Model\0"),
+        *(
+            (tag, 2, len(name) + 1, name + b"\0")
+            for tag, name in zip((0x010F, 0x0110), camera)
+        ),
         (0x0112, 3, 1, short(orientation)),
         (0x8769, 4, 1, struct.pack("<I", 8)),
     ]
     start = 8 + len(ifd(main, 8))
     main[-1] = (0x8769, 4, 1, struct.pack("<I", start))
     lens = [
-        (0x920A, 5, 1, struct.pack("<II", 60, 10)),
+        (0x920A, 5, 1, struct.pack("<II", *focal_mm)),
         (0xA405, 3, 1, short(focal_35mm)),
     ]
     body = b"II*\0" + struct.pack("<I", 8) + ifd(main, 8) + ifd(lens, start)
@@ -90,14 +100,16 @@ def exif(orientation: int, focal_35mm: int) -> bytes:
     return b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
 
 
-def write_photo(path: Path, upright: np.ndarray, orientation=1, focal_35mm=0) -> None:
+def write_photo(
+    path: Path, upright: np.ndarray, orientation=1, focal_35mm=0, **lens
+) -> None:
     """A JPEG of RGB pixels; of orientation 6 it is stored turned to the left."""
     stored = np.rot90(upright, 1) if orientation == 6 else upright
     quality = [cv2.IMWRITE_JPEG_QUALITY, 97]
     data = cv2.imencode(".jpg", np.ascontiguousarray(stored[..., ::-1]), quality)[1]
     data = data.tobytes()
-    if focal_35mm or orientation != 1:
-        data = data[:2] + exif(orientation, focal_35mm) + data[2:]
+    if focal_35mm or lens or orientation != 1:
+        data = data[:2] + exif(orientation, focal_35mm, **lens) + data[2:]
     path.write_bytes(data)
 
 

@@ -36,7 +36,11 @@ from gsjax.scene import sfm_engine
 from gsjax.scene.colmap import load_colmap
 from gsjax.scene.photos import load_photo
 from gsjax.scene.sfm import SfmSettings, run_sfm
-from gsjax.scene.sfm_colmap import exif_camera, extract
+from gsjax.scene.sfm_colmap import (
+    _leave_out_impossible,
+    exif_camera,
+    extract,
+)
 from gsjax.scene.sfm_photos import Workshop, find_photos, prepare_photos
 from gsjax.scene.video import sharpest_frames, sharpness
 
@@ -372,6 +376,46 @@ def test_the_focal_length_of_exif_is_where_colmap_begins(room, tmp_path):
     assert [c.has_prior_focal_length for c in cameras] == [True, False, True]
     assert cameras[0].camera_id == cameras[2].camera_id
     assert cameras[0].focal_length == pytest.approx(32 / 35 * WIDTH, rel=0.05)
+
+
+PHONE = (b"Apple", b"iPhone 12")  # COLMAP has a table of sensors, and this one's
+
+
+@pytest.mark.parametrize(
+    ("focal_35mm", "focal_mm", "known"),
+    [
+        (0, (42, 10), True),
+        (0, (0, 0), False),
+        (0, (5, 0), False),
+        (0, (1, 10**5), False),
+        (65535, (42, 10), False),
+        (1, (42, 10), False),
+    ],
+)
+def test_a_focal_length_that_none_has_is_not_known(
+    tmp_path, focal_35mm, focal_mm, known
+):
+    """COLMAP would place no photograph, or look for ever."""
+    pixels, lens = corner_view(viewmat_at(0)), {"focal_mm": focal_mm, "camera": PHONE}
+    write_photo(tmp_path / "a.jpg", pixels, 1, focal_35mm, **lens)
+    camera, focal = exif_camera(tmp_path / "a.jpg")
+    assert camera.startswith("Apple-iPhone 12")
+    assert (focal is not None) == known
+    if focal is not None:
+        assert WIDTH / 2 < focal < 2 * WIDTH
+
+
+def test_a_camera_that_there_cannot_be_is_not_placed(solved):
+    model = pycolmap.Reconstruction(solved / "sparse" / "0")
+    _leave_out_impossible(model, pycolmap.IncrementalMapperOptions())
+    assert model.num_reg_images() == COUNT
+    points, image = model.num_points3D(), next(iter(model.images.values()))
+    image.camera.focal_length_x = -5e5
+    gone = {i.name for i in model.images.values() if i.camera_id == image.camera_id}
+    _leave_out_impossible(model, pycolmap.IncrementalMapperOptions())
+    assert {i.name for i in model.images.values()} == set(NAMES) - gone
+    assert model.num_points3D() < points
+    assert all(i.num_points3D and i.has_pose for i in model.images.values())
 
 
 # --- video ---

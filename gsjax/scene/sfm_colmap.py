@@ -43,14 +43,23 @@ def exif_camera(path: Path) -> tuple[str, float | None]:
     """Name of the camera and focal length in px of the stored photograph.
 
     The length is that of a side × (mm / mm of the sensor), the sensor being known from
-    EXIF or from COLMAP's table of cameras. Nothing is invented: ("", None) if absent.
+    EXIF or from COLMAP's table of cameras. Nothing is invented: None if it is absent, or
+    beyond what COLMAP takes for a camera, as what comes of zeros in EXIF is; and "".
     """
     bitmap = colmap().Bitmap.read(str(path), False)
     if bitmap is None:
         return "", None
     # The name ends in the stored size, whose sides change places in a turned photo.
     name = re.sub(r"-\d+x\d+$", "", bitmap.exif_camera_model() or "")
-    return name, bitmap.exif_focal_length() or None
+    focal = bitmap.exif_focal_length() or 0.0
+    least, most = _focal_limits(max(bitmap.width, bitmap.height))
+    return name, focal if least < focal < most else None  # nor if it is no number
+
+
+def _focal_limits(side: int) -> tuple[float, float]:
+    """Focal lengths in px between which COLMAP looks, of photographs of that side."""
+    mapper = colmap().IncrementalMapperOptions()
+    return mapper.min_focal_length_ratio * side, mapper.max_focal_length_ratio * side
 
 
 def extract(
@@ -195,9 +204,26 @@ def reconstruct(
 
     models.mkdir()
     found = watched(work, lambda: f"mapping: {placed} images placed", tell)
-    return sorted(
-        found.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D())
-    )
+    for model in found.values():
+        _leave_out_impossible(model, options.mapper)
+    possible = [model for model in found.values() if model.num_reg_images() > 1]
+    return sorted(possible, key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+
+
+def _leave_out_impossible(model: Any, limits: Any) -> None:
+    """Images that see no point, or by a camera that there can't be, are not placed.
+
+    COLMAP leaves them out before it adjusts for the last time, and not after.
+    """
+    for image in list(model.images.values()):
+        impossible = image.camera.has_bogus_params(
+            limits.min_focal_length_ratio,
+            limits.max_focal_length_ratio,
+            limits.max_extra_param,
+        )
+        if impossible or not image.num_points3D:
+            model.deregister_frame(image.frame_id)
+    model.tear_down()  # else they are there still, without a pose
 
 
 def match_again(database: Path, files: set[str], listing: Path, seed: int, tell: Tell):
