@@ -152,7 +152,8 @@ def writing(path: Path, what: str = "written") -> Iterator[None]:
 def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
     """A file to write to that becomes ``path``, in place of what is there, at the end.
 
-    It stands beside ``path`` until then, and is gone if anything fails.
+    It stands beside ``path`` until then, and is gone if anything fails. Where ``path``
+    is a link, all that goes for what it leads to.
 
     Args:
       path: of the file.
@@ -162,7 +163,8 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
     Raises:
       InputError: as `writing`.
     """
-    temporary = temporary_in(path.parent)
+    place = Path(os.path.realpath(path))
+    temporary = temporary_in(place.parent)
     try:
         with writing(path):
             with temporary.open("xb") as file:
@@ -170,7 +172,7 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
                 if durable:
                     file.flush()
                     os.fsync(file.fileno())
-            os.replace(temporary, path)
+            os.replace(temporary, place)
     finally:
         with suppress(OSError):  # it is told already
             temporary.unlink()

@@ -1,7 +1,9 @@
 """COLMAP models: equal to what pycolmap reads, and strict where that is not."""
 
 import shutil
+import unicodedata
 from dataclasses import replace
+from pathlib import Path
 
 import cv2  # before pycolmap: see captures.synthetic_model
 import numpy as np
@@ -220,7 +222,7 @@ def test_equal_cameras_become_one(tmp_path):
 # --- datasets ---
 
 
-@pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", ".", "colmap/sparse/0"])
 def test_places(tmp_path, place):
     scene = dataset(tmp_path, place=place)
     loaded = load_colmap(tmp_path)
@@ -334,6 +336,52 @@ def test_suffixes_of_masks_are_of_either_case(tmp_path, photo, appended, suffix)
     exact = tmp_path / (stem + ".png")
     exact.touch()
     assert exact.samefile(find_mask(tmp_path, photo) or ""), "its very name goes first"
+
+
+@pytest.mark.parametrize(
+    "form", ["/data/photos/{}", "../photos/{}", "C:\\photos\\{}", "images/{}"]
+)
+def test_names_that_lead_out_of_the_folder(tmp_path, form):
+    """Never followed; looked for in a folder that is told."""
+    scene = scene_of_views()
+    names = [view.name for view in scene.views]
+    views = [replace(view, name=form.format(view.name)) for view in scene.views]
+    write_colmap(tmp_path / "sparse/0", replace(scene, views=tuple(views)))
+    for name in names:
+        save_photo(tmp_path / "images" / name)
+    save_photo(tmp_path / "masks" / names[0])
+    if not form.startswith("images"):
+        with pytest.raises(InputError, match=r"within the dataset.*pass images="):
+            load_colmap(tmp_path)
+    for images in [None, "images"] if form.startswith("images") else ["images"]:
+        with pytest.warns(UserWarning, match="4 of 5 photographs have no mask"):
+            found = load_colmap(tmp_path, images=images).views
+        assert [view.name for view in found] == names
+        assert [view.image for view in found] == [
+            tmp_path / "images" / n for n in names
+        ]
+        assert found[0].mask == tmp_path / "masks" / names[0]
+    poses = load_colmap(tmp_path, poses_only=True).views
+    assert [view.image.name for view in poses] == names
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_letters_may_be_composed_or_not(tmp_path, form):
+    """As after a copy to or from macOS, which has its own way with accents."""
+    other = {"NFC": "NFD", "NFD": "NFC"}[form]
+    scene = scene_of_views(2)
+    names = [unicodedata.normalize(form, name) for name in ("für/ä.png", "é.png")]
+    views = [replace(view, name=name) for view, name in zip(scene.views, names)]
+    write_colmap(tmp_path / "sparse/0", replace(scene, views=tuple(views)))
+    for name in names:
+        folder, name = name.rpartition("/")[::2]
+        name = unicodedata.normalize(other, name)
+        save_photo(tmp_path / "images" / folder / name)
+        save_photo(tmp_path / "masks" / folder / name)
+    for view, name in zip(load_colmap(tmp_path).views, names):
+        assert view.name == name
+        assert view.image.is_file()
+        assert (view.mask or Path("none")).is_file()
 
 
 def test_missing_photographs(tmp_path):

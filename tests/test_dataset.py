@@ -92,6 +92,17 @@ def test_order_of_formats(tmp_path):
     assert load_dataset(tmp_path / "transforms.json").format == "transforms"
 
 
+def test_the_list_of_nerfstudio_goes_before_its_model(tmp_path):
+    """Which is of the photographs before it straightened the scene."""
+    scene = scene_of_views()
+    write_colmap(tmp_path / "colmap/sparse/0", scene)
+    for view in scene.views:
+        save_photo(tmp_path / "images" / view.name)
+    assert load_dataset(tmp_path).format == "colmap"
+    transforms(tmp_path)
+    assert load_dataset(tmp_path).format == "transforms"
+
+
 def test_nothing_known(tmp_path):
     (tmp_path / "IMG_1.JPG").write_bytes(b"")
     with pytest.raises(

@@ -32,6 +32,16 @@ def test_a_failed_write_leaves_nothing(tmp_path):
     assert (tmp_path / "file").read_bytes() == b"old"
 
 
+def test_what_a_link_leads_to_is_written(tmp_path):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link").symlink_to("there/file")
+    for data in (b"first", b"second"):
+        write_file(tmp_path / "link", data)
+        assert (tmp_path / "there/file").read_bytes() == data
+        assert (tmp_path / "link").is_symlink()
+    assert names(tmp_path / "there") == ["file"]
+
+
 @pytest.mark.parametrize(
     "error", [OSError(28, "No space"), KeyboardInterrupt(), KeyError()], ids=repr
 )

@@ -297,6 +297,17 @@ def test_masks_and_smaller_copies(tmp_path):
         load_dataset(tmp_path)
 
 
+def test_masks_of_instant_ngp_are_told(tmp_path):
+    """No list names them, and black is what is kept there."""
+    nerfstudio(tmp_path)
+    for index in (1, 3):
+        save_photo(tmp_path / f"images/dynamic_mask_frame_{index}.png")
+    with pytest.warns(UserWarning, match=r"2 masks of instant-ngp, .*_1\.png first"):
+        views = load_dataset(tmp_path).views
+    assert [view.mask for view in views] == [None] * 4
+    load_dataset(tmp_path, poses_only=True)
+
+
 def test_photographs_elsewhere(tmp_path):
     folder, elsewhere = tmp_path / "data", tmp_path / "photos"
     nerfstudio(folder)
@@ -404,7 +415,10 @@ def test_scaled_rotations_are_warned_of(tmp_path):
         ({"w": 0}, "image size w 0"),
         ({"ply_file_path": 3}, "ply_file_path is 3; text"),
         ({"ply_file_path": "../a.ply"}, "within the dataset's folder"),
-        ({"ply_file_path": "none.ply"}, r"none\.ply: cannot be read"),
+        (
+            {"ply_file_path": "none.ply"},
+            r"ply_file_path 'none\.ply': no such file.*off",
+        ),
         ({"test_filenames": "a"}, "test_filenames is 'a'; a list"),
     ],
 )
@@ -481,12 +495,30 @@ def test_point_clouds(tmp_path):
             read_point_cloud(path)
 
 
+@pytest.mark.parametrize("names", ["red green blue", "diffuse_{}", "r g b"])
+@pytest.mark.parametrize("kind", ["uchar", "ushort"])
+def test_colours_of_16_bits_and_other_names(tmp_path, names, kind):
+    path, made = tmp_path / "a.ply", scene_of_views(points=9)
+    wide = kind == "ushort"
+    cloud(path, made.points, made.colors.astype(int) * (257 if wide else 1), kind)
+    text = path.read_text()
+    for old, new in zip(("red", "green", "blue"), "rgb"):
+        new = names.format(old) if "{}" in names else (new if names[1] == " " else old)
+        text = text.replace(f"{kind} {old}", f"{kind} {new}")
+    path.write_text(text)
+    np.testing.assert_array_equal(read_point_cloud(path)[1], made.colors)
+
+
 def test_bad_point_clouds(tmp_path):
     path = tmp_path / "a.ply"
     made = scene_of_views(points=9)
     cloud(path, made.points, made.colors.astype(float), "float")
     with pytest.raises(InputError, match=r"colours are floating-point, and up to 2"):
         read_point_cloud(path)
+    for colors, told in (([-1, 2, 3], "-1 to 3"), ([0, 70000, 1], "0 to 70000")):
+        cloud(path, made.points[:1], np.asarray([colors]), "int")
+        with pytest.raises(InputError, match=f"colours are from {told}; 0 to 255"):
+            read_point_cloud(path)
     cloud(path, np.asarray([[0, 1, 2], [0, np.nan, 1]]), None)
     with pytest.raises(InputError, match=r"1 of 2 points have .*the first: \[1\]"):
         read_point_cloud(path)

@@ -516,6 +516,26 @@ def test_infinite_opacities_are_clamped(tmp_path):
     np.testing.assert_array_equal(found[2:], fields["logit_opacities"][2:])
 
 
+def test_the_filter_of_mip_splatting_is_applied(tmp_path):
+    """Scales √(s² + σ²), and as much to be seen of each: opacity × Π s / Π scales."""
+    fields, rng = random_fields(50, 1), np.random.default_rng(1)
+    table = table_of(fields)
+    sigmas = table["filter_3D"] = np.exp(rng.normal(-1, 2, 50)).astype(np.float32)
+    sigmas[:4] = 0
+    fields["logit_opacities"][2:6] = 60, -60, 60, -60
+    read = read_ply(put(tmp_path, encode(table))).params
+    scales = np.exp(fields["log_scales"].astype(np.float64))
+    wide = np.sqrt(scales**2 + sigmas[:, None].astype(np.float64) ** 2)
+    np.testing.assert_allclose(np.exp(read.log_scales), wide, rtol=3e-6)
+    seen = 1 / (1 + np.exp(-fields["logit_opacities"].astype(np.float64)))
+    seen *= np.prod(scales / wide, axis=1)
+    found = 1 / (1 + np.exp(-np.asarray(read.logit_opacities, np.float64)))
+    np.testing.assert_allclose(found, seen, rtol=3e-5)
+    for name in ("means", "quats", "sh"):
+        np.testing.assert_array_equal(getattr(read, name), fields[name])
+    np.testing.assert_array_equal(read.log_scales[:4], fields["log_scales"][:4])
+
+
 def test_zero_quaternions_are_warned_of(tmp_path):
     fields = random_fields(4, 0)
     fields["quats"][2] = 0

@@ -53,6 +53,7 @@ def _format_of(path: Path) -> Format:
     if suffix not in FORMATS:
         raise InputError(
             f"{path}: the suffix {path.suffix!r} is no known format of Gaussians; "
-            f"known: {', '.join(sorted(FORMATS))}"
+            f"known: {', '.join(sorted(FORMATS))}; convert it with the tool that made "
+            "it, or with SuperSplat"
         )
     return FORMATS[suffix]

@@ -26,6 +26,7 @@ from gsjax.io.ply_rows import CHUNK_ROWS, read_rows
 from gsjax.memory import Estimate, require
 
 _NORMALS = ("nx", "ny", "nz")
+_FILTER = "filter_3D"  # of Mip-Splatting: σ by which a Gaussian is to be smoothed
 _MAX_SHIFT = 0.1  # of a Gaussian's size by rounding, before it is told
 # Exporters write ±inf for opacities of exactly 0 and 1; the range of `logit`.
 _MAX_LOGIT = math.log((1 - 2.0**-23) / 2.0**-23)
@@ -35,9 +36,10 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
     """Gaussians of a 3DGS PLY file, binary or ascii, of any SH degree up to 4.
 
     Properties are found by name, in any order and of any scalar type; those that
-    are not needed (normals too) are skipped. Opacities of ±inf are clamped to the
-    logit of [2^-23, 1 - 2^-23] with a warning. Zero quaternions, values that look
-    activated and trailing bytes are warned of.
+    are not needed (normals too) are skipped. Where there is Mip-Splatting's
+    ``filter_3D``, scales and opacities are those that it makes of them, see `_smooth`.
+    Opacities of ±inf are clamped to the logit of [2^-23, 1 - 2^-23] with a warning.
+    Zero quaternions, values that look activated and trailing bytes are warned of.
 
     Args:
       path: the file.
@@ -99,6 +101,9 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
     )
     fields = _allocate(header.vertex.rows, bases, dtype)
     views = _views(fields)
+    smoothed = _FILTER in header.vertex.types
+    if smoothed:
+        views[_FILTER] = np.empty(header.vertex.rows, dtype)
     start, displaced, furthest = 0, 0, 0.0
     with np.errstate(over="ignore", invalid="ignore"):  # _check_values finds them
         for size, columns in read_rows(file, header):
@@ -112,6 +117,8 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
                 displaced += int(moved.sum())
                 furthest = max(furthest, shift[moved].max(initial=0.0))
             start += size
+        if smoothed:
+            _smooth(fields, views[_FILTER])
     if displaced:
         warn(
             f"{header.path}: {displaced} of {start} Gaussians lie so far from the "
@@ -120,6 +127,23 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
             "the scene to the origin"
         )
     return fields
+
+
+def _smooth(fields: dict[str, np.ndarray], sigmas: np.ndarray) -> None:
+    """Convolve Gaussians with isotropic ones of ``sigmas`` [N], in place.
+
+    Scales s become √(s² + σ²), and opacities less by √(Π s² / Π (s² + σ²)), so that
+    as much is seen of each (Yu et al., "Mip-Splatting", CVPR 2024, equation 9).
+    """
+    scales = fields["log_scales"].astype(np.float64)
+    with np.errstate(divide="ignore"):
+        logs = np.log(np.abs(sigmas[:, None].astype(np.float64)))
+        wide = np.logaddexp(2 * scales, 2 * logs) / 2
+        loss = np.sum(scales - wide, axis=1)  # log of what is left of an opacity
+        # logit(e^loss / (1 + e^-l)), without a difference of what is nearly 1.
+        left = np.logaddexp(np.log(-np.expm1(loss)), -fields["logit_opacities"])
+    fields["log_scales"][:] = wide
+    fields["logit_opacities"][:] = loss - left
 
 
 def _check_values(

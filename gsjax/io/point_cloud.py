@@ -12,20 +12,26 @@ from gsjax.io.ply_rows import read_rows
 from gsjax.memory import Estimate, require
 
 _GREY = 128
+_COLORS = (  # names of red, green and blue
+    ("red", "green", "blue"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("r", "g", "b"),
+)
 
 
 def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
     """Points [M, 3] float64 and colours [M, 3] uint8, in the order of the file.
 
-    Properties are found by name: x y z, and red green blue, which are 0 to 255, or 0
-    to 1 where they are floating-point; grey where there are none.
+    Properties are found by name: x y z, and red green blue, which are 0 to 255, of 16
+    bits 0 to 65535 where any is beyond 255, or 0 to 1 where they are floating-point;
+    grey where there are none.
 
     Args:
       path: the file, binary or ascii.
 
     Raises:
       InputError: if the file cannot be read, is no PLY, is truncated, has no x y z,
-        or values that are not finite, or floating-point colours beyond 1.
+        or values that are not finite, or colours beyond what there can be.
       CapacityError: if the memory would not hold it, before it is read.
     """
     path = Path(path)
@@ -38,18 +44,18 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
                 "y, z are wanted: export the points as a PLY"
             )
         check_size(header)
-        names = [name for name in ("red", "green", "blue") if name in types]
-        names = names if len(names) == 3 else []
+        known = (names for names in _COLORS if types.keys() >= {*names})
+        names = next(known, ())
         unit = bool(names) and all((types[n] or "").startswith("f") for n in names)
         require(
-            Estimate({"coordinates and colours": header.vertex.rows * 28}),
+            Estimate({"coordinates and colours": header.vertex.rows * 34}),
             f"{path}: {header.vertex.rows:,} points",
             "leave out some of them where the file was made",
         )
         points = np.empty((header.vertex.rows, 3))
-        colors = np.full((header.vertex.rows, 3), _GREY, np.uint8)
+        colors = np.full((header.vertex.rows, 3), _GREY, np.uint16)
         wild = np.zeros(header.vertex.rows, bool)
-        start, brightest = 0, 0.0
+        start, darkest, brightest = 0, 0.0, 0.0
         for size, columns in read_rows(file, header):
             rows = slice(start, start + size)
             for axis, name in enumerate("xyz"):
@@ -60,8 +66,9 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
                 wild[rows] |= ~np.isfinite(values)
                 values = np.nan_to_num(values)
                 brightest = max(brightest, values.max(initial=0.0))
-                values = np.rint(values * (255 if unit else 1))
-                colors[rows, axis] = np.clip(values, 0, 255)
+                darkest = min(darkest, values.min(initial=0.0))
+                values = np.clip(values, 0, 1) * 255 if unit else values
+                colors[rows, axis] = np.rint(np.clip(values, 0, 65535))
             start += size
     if wild.any():
         raise InputError(
@@ -74,4 +81,10 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
             f"{path}: colours are floating-point, and up to {brightest:g}; 0 to 1 is "
             "wanted of such, or whole numbers of type uchar"
         )
-    return points, colors
+    if not unit and not 0 <= darkest <= brightest <= 65535:
+        raise InputError(
+            f"{path}: colours are from {darkest:g} to {brightest:g}; 0 to 255 is "
+            "wanted, of type uchar, or 0 to 65535, of type ushort"
+        )
+    wide = not unit and brightest > 255
+    return points, (np.rint(colors / 257) if wide else colors).astype(np.uint8)

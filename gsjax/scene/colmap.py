@@ -20,10 +20,16 @@ from gsjax.scene.colmap_model import (
     ColmapPoints,
     viewmat_of,
 )
-from gsjax.scene.image_files import find_files, find_masks, image_folder
+from gsjax.scene.image_files import (
+    find_files,
+    find_masks,
+    image_folder,
+    inside,
+    last_parts,
+)
 from gsjax.scene.types import Scene, View
 
-_PLACES = ("sparse/0", "sparse", ".")
+_PLACES = ("sparse/0", "sparse", ".", "colmap/sparse/0")  # the last is nerfstudio's
 
 
 class ColmapModel(NamedTuple):
@@ -35,7 +41,8 @@ class ColmapModel(NamedTuple):
 
 
 def find_colmap(folder: Path) -> Path | None:
-    """Where the model of a dataset lies: sparse/0, sparse or the folder itself."""
+    """Where the model of a dataset lies: sparse/0, sparse, the folder itself, or
+    nerfstudio's colmap/sparse/0."""
     for place in _PLACES:
         if any(
             (folder / place / f"cameras.{form}").exists() for form in ("bin", "txt")
@@ -119,6 +126,30 @@ def _declared(path: Path) -> int:
         return 0
 
 
+def _path(place: Path, listed: str, root: Path, moved: bool) -> str:
+    """Where a photograph lies in ``root``, by its name in the model.
+
+    Of one that was ``moved`` to another folder, the end of it that does not lead out;
+    and some models are of the folder above, and name that of the photographs, too.
+    """
+    if moved:
+        return last_parts(listed) or listed
+    offer = ", or pass images=, the folder that it is in (--images)"
+    path = inside(str(place), listed, offer)
+    if len(path.parts) > 1 and path.parts[0] == "images" and not (root / path).exists():
+        return path.relative_to("images").as_posix()
+    return listed
+
+
+def _name(root: Path, path: str, found: dict[str, Path]) -> str | None:
+    """What a photograph is called: where it was looked for, or where it was found in
+    another folder; None if it is missing."""
+    file = found.get(path)
+    if file is None or file.parent == (root / path).parent:
+        return None if file is None else path
+    return file.relative_to(root).as_posix()
+
+
 def load_colmap(
     folder: Path,
     *,
@@ -134,28 +165,32 @@ def load_colmap(
     model = read_colmap(place)
     _warn_of_larger(place, len(model.images))
     root = image_folder(folder, images, factor, poses_only=poses_only)
-    names = [image.name for image in model.images]
-    files = find_files(
-        *(place, root, names),
+    moved = images is not None or poses_only
+    paths = {i.name: _path(place, i.name, root, moved) for i in model.images}
+    found = find_files(
+        *(place, root, paths.values()),
         skip_missing=skip_missing,
+        elsewhere=images is not None,
         factor=factor,
         poses_only=poses_only,
     )
-    masks = {} if poses_only else find_masks(folder / "masks", list(files))
+    names = {listed: _name(root, path, found) for listed, path in paths.items()}
+    called = list(filter(None, names.values()))
+    masks = {} if poses_only else find_masks(folder / "masks", called)
     views = []
     for image in model.images:
-        if image.name not in files:
+        name, camera = names[image.name], model.cameras[image.camera]
+        if name is None:
             continue
-        camera = model.cameras[image.camera]
         view = View(
-            name=image.name,
-            image=files[image.name],
+            name=name,
+            image=found[paths[image.name]],
             viewmat=viewmat_of(image.quat, image.translation),
             K=camera.K,
             width=camera.width,
             height=camera.height,
             lens=camera.lens,
-            mask=masks.get(image.name),
+            mask=masks.get(name),
         )
         views.append(view)
     points = model.points

@@ -104,9 +104,10 @@ def _read(
         if path.suffix.lower() == ".npy":
             return llff(path)
         raise InputError(f"{path}: pass the folder of a dataset, a .json or a .npy")
-    if find_colmap(path) is not None:
+    model, lists = find_colmap(path), find_transforms(path)
+    # Of nerfstudio's two, its list has what was done to the poses afterwards.
+    if model is not None and not (lists and model.parent.parent.name == "colmap"):
         return load_colmap(path, skip_missing=skip_missing, **where)
-    lists = find_transforms(path)
     if lists:
         return nerf(lists)
     if (path / "poses_bounds.npy").exists():

@@ -1,6 +1,7 @@
 """Where the photographs of a dataset lie: folders, names, and what is missing."""
 
 import re
+import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
@@ -114,7 +115,8 @@ def find_files(
     """Files of photographs, by name; a name with no file is missing.
 
     A file of another suffix than its name stands in for it: smaller copies are often
-    of another type, and NeRF's lists leave suffixes out. Copies of which none is called
+    of another type, and NeRF's lists leave suffixes out; and one whose letters are
+    composed otherwise, as after a copy to or from macOS. Copies of which none is called
     like its original, as in the scenes of LLFF, go with the originals in the order of
     their names, if they are as many; a warning says so.
 
@@ -230,16 +232,24 @@ def _file_at(path: Path, stems: Callable[[Path], dict[str, Path]]) -> Path | Non
     """The file there, or the photograph that is called so but for its suffix."""
     if path.is_file():
         return path
-    return stems(path.parent).get(path.name) or stems(path.parent).get(path.stem)
+    names = _composed(path.name), _composed(path.stem)
+    return next(filter(None, map(stems(path.parent).get, names)), None)
 
 
 def _stems(folder: Path) -> dict[str, Path]:
-    """Photographs of a folder by their names without suffix."""
+    """Photographs of a folder by their names, `_composed`, whole and without suffix."""
     files = [p for p in folder.iterdir() if p.is_file()] if folder.is_dir() else []
     rank = {suffix: index for index, suffix in enumerate(reversed(SUFFIXES))}
     files = [p for p in files if p.suffix.lower() in rank]
     files.sort(key=lambda p: (rank[p.suffix.lower()], p.name))
-    return {p.stem: p for p in files}
+    whole = {_composed(p.name): p for p in files}
+    return {_composed(p.stem): p for p in files} | whole
+
+
+def _composed(name: str) -> str:
+    """A name with its letters and accents composed, which macOS has apart: in Unicode's
+    form C."""
+    return unicodedata.normalize("NFC", name)
 
 
 def short_names(names: Sequence[str]) -> list[str]:
@@ -293,8 +303,9 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 def _lowered(name: str) -> str:
-    """A name with the suffixes of photographs that it ends with in lower case."""
-    return _ENDING.sub(lambda ending: ending[0].lower(), name)
+    """A name, `_composed`, with the suffixes of photographs that it ends with in lower
+    case."""
+    return _ENDING.sub(lambda ending: ending[0].lower(), _composed(name))
 
 
 def by_suffix_of_either_case(folder: Path) -> dict[str, Path]:
@@ -313,7 +324,8 @@ def find_mask(
     Args:
       folder: of the masks; it need not exist.
       name: of the photograph: masks are called the same, or have ``.png`` appended
-        (COLMAP) or in place of the suffix. Suffixes may be of either case.
+        (COLMAP) or in place of the suffix. Suffixes may be of either case, and letters
+        composed or not.
       listing: what is in a folder, by `_lowered` names.
     """
     path = folder / inside(str(folder), name)

@@ -104,6 +104,8 @@ def load_nerf(
             split = splits[index]
             views.append(_view(frame, file, called, viewmat, mask, size, split))
         warn_of_scaled(path, scaled)
+    if not poses_only:
+        _warn_of_dynamic_masks(views)
     points, colors = _points(lists[0][0], folder)
     source = paths[0] if len(paths) == 1 else folder
     return Scene(source, "transforms", tuple(views), points, colors)
@@ -250,6 +252,21 @@ def _mask(frame: Frame, folder: Path) -> Path | None:
     return mask
 
 
+def _warn_of_dynamic_masks(views: list[View]) -> None:
+    """Tell of instant-ngp's masks, which no list names: what is not black is left out
+    there, the opposite of all others."""
+    masks = [v.image.with_name(f"dynamic_mask_{v.image.stem}.png") for v in views]
+    there = [mask for mask in masks if mask.is_file()]
+    if there:
+        warnings.warn(
+            f"{there[0].parent}: {len(there)} masks of instant-ngp, {there[0].name} "
+            "first, are not heeded; to leave out what they show, invert them, black "
+            "for what is left out, and name them in the list by mask_path",
+            UserWarning,
+            stacklevel=3,
+        )
+
+
 def _lens(frame: Frame) -> Lens | None:
     model = model_of(frame)
     if model not in (*_PERSPECTIVE, *_FISHEYE):
@@ -298,4 +315,10 @@ def _points(frame: Frame, folder: Path) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not isinstance(path, str):
         raise InputError(f"{frame.where}: ply_file_path is {shown(path)}; text")
-    return read_point_cloud(folder / inside(f"{folder}: ply_file_path", path))
+    cloud = folder / inside(f"{folder}: ply_file_path", path)
+    if not cloud.is_file():
+        raise InputError(
+            f"{frame.where}: ply_file_path {shown(path)}: no such file in {folder}; "
+            "put it there, or take ply_file_path off the list to go without points"
+        )
+    return read_point_cloud(cloud)

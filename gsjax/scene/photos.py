@@ -146,7 +146,10 @@ def _ratio(view: View, width: int, height: int) -> tuple[float, float]:
     tolerance = _ASPECT_TOLERANCE + 1 / width + 1 / height
     if abs(np.log(sx / sy)) > tolerance:
         turned = abs(np.log(width / view.height * view.width / height)) <= tolerance
-        remedy = "it was rotated: keep the photographs that the cameras are of"
+        remedy = (
+            "it was rotated, or is to be by its EXIF, which is not heeded here: keep "
+            "the photographs that the cameras are of, or save it as it is shown"
+        )
         raise InputError(
             f"{view.image}: {width} × {height} px, but its camera is for {view.width} "
             f"× {view.height}; "

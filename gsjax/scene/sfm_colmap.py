@@ -43,8 +43,8 @@ def exif_camera(path: Path) -> tuple[str, float | None]:
     """Name of the camera and focal length in px of the stored photograph.
 
     The length is that of a side × (mm / mm of the sensor), the sensor being known from
-    EXIF or from COLMAP's table of cameras. Nothing is invented: None if it is absent, or
-    beyond what COLMAP takes for a camera, as what comes of zeros in EXIF is; and "".
+    EXIF or from COLMAP's table of cameras. Nothing is invented: None if it is absent
+    or beyond what COLMAP takes for a camera, as what comes of zeros is; "" likewise.
     """
     bitmap = colmap().Bitmap.read(str(path), False)
     if bitmap is None:

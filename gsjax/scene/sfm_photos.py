@@ -28,7 +28,8 @@ READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 _KEPT = (".jpg", ".jpeg", ".png")  # formats in which the dataset is written
 _UNREAD = (
     *(".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"),
-    *(".orf", ".rw2", ".gif", ".jxl"),
+    *(".orf", ".rw2", ".pef", ".srw", ".nrw", ".gif", ".jxl", ".jp2", ".psd"),
+    *(".jfif", ".jpe", ".mpo", ".ppm"),
 )
 _JPEG = b"\xff\xd8"  # how such files, which have no alpha, begin
 _REACH = 2  # px, of the cubic interpolation that undoes the lens
