@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from gsjax.errors import InputError
 from gsjax.numerics import safe_divide
 
 Array = jax.Array
@@ -25,21 +26,37 @@ def psnr(image: Array, target: Array, weight: Array | None = None) -> Array:
     """Peak signal-to-noise ratio in dB, for a peak of 1.
 
     Args:
-      image, target: [H, W, C].
+      image, target: [H, W, C] in [0, 1].
       weight: [H, W] of each pixel, or None for all alike.
 
     Returns:
-      [] −10 log10 of the mean squared error; infinite for equal pictures.
+      [] −10 log10 of the mean squared error; infinite, without a derivative, for equal
+      pictures, and NaN where no pixel counts.
+
+    Raises:
+      InputError: if a picture is of whole numbers.
     """
     image, target = seen_only(image, target, weight)
-    return -10 * jnp.log10(weighted_mean(jnp.square(image - target), weight))
+    error = weighted_mean(jnp.square(image - target), weight)
+    if weight is not None:
+        error = jnp.where(jnp.any(weight > 0), error, jnp.nan)
+    return -10 * jnp.log10(error)
 
 
 def seen_only(image: Array, target: Array, weight: Array | None) -> tuple[Array, Array]:
     """Both pictures [H, W, C], black where the weight [H, W] is 0.
 
     So that what lies there cannot show, NaN included, nor in a derivative.
+
+    Raises:
+      InputError: if one is of whole numbers, whose differences would wrap.
     """
+    for picture in (image, target):
+        if not jnp.issubdtype(jnp.result_type(picture), jnp.floating):
+            raise InputError(
+                f"a picture of {jnp.result_type(picture)}; floating-point numbers in "
+                "[0, 1] are wanted: pass picture / 255"
+            )
     if weight is None:
         return image, target
     seen = (weight > 0)[..., None]
@@ -77,6 +94,9 @@ def ssim(image: Array, target: Array, weight: Array | None = None) -> Array:
 
     Returns:
       [] at most 1.
+
+    Raises:
+      InputError: if a picture is of whole numbers.
     """
     image, target = seen_only(image, target, weight)
     return weighted_mean(ssim_map(image, target), weight)

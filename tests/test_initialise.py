@@ -8,10 +8,15 @@ import pytest
 from captures import scene_of_views
 
 import gsjax
+from gsjax import look_at
+from gsjax.cameras import NEAR
 from gsjax.errors import InputError
 from gsjax.scene.initialise import (
+    extent_of,
     init_gaussians,
+    near_plane,
     neighbour_distance,
+    points_in_ball,
     scene_extent,
 )
 from gsjax.scene.paths import focus_point
@@ -38,8 +43,20 @@ def test_distance_where_there_are_no_neighbours():
     assert neighbour_distance(np.zeros((0, 3)), 5.0).shape == (0,)
     same = neighbour_distance(np.ones((7, 3)), 5.0)
     np.testing.assert_array_equal(same, 5e-7)
-    far = neighbour_distance(np.diag([1e6, 1e6, 1e6]), 5.0)
-    np.testing.assert_array_equal(far, 0.5)
+    sparse = neighbour_distance(np.diag([1e6, 1e6, 1e6]), 5.0)
+    np.testing.assert_allclose(sparse, np.sqrt(2) * 1e6)
+
+
+@pytest.mark.parametrize(("extent", "most"), [(5.0, 0.5), (1.0, None)])
+def test_distance_of_points_far_from_all_others(extent, most):
+    """A tenth of the extent, or three times the median of all."""
+    points = np.concatenate([np.random.default_rng(0).normal(size=(99, 3)), [[99] * 3]])
+    points *= 0.1
+    found, wanted = neighbour_distance(points, extent), brute_force(points)
+    most = 3 * np.median(wanted) if most is None else most
+    np.testing.assert_allclose(found, np.minimum(wanted, most), rtol=1e-12)
+    assert found[-1] == pytest.approx(most)
+    assert np.sum(found == found[-1]) < 10
 
 
 def test_extent():
@@ -48,6 +65,43 @@ def test_extent():
     assert scene_extent(centres) == pytest.approx(wanted)
     assert scene_extent(centres[:1]) == 1.0
     assert scene_extent(np.ones((5, 3))) == 1.0
+
+
+@pytest.mark.parametrize("at", [(0, 0, 0), (1.3, 2.1, 0.7), (1000, 2000, 5)])
+def test_cameras_on_a_tripod_are_in_one_place(at):
+    """But for the rounding of −Rᵀt."""
+    views = [replace(v, viewmat=turned) for v, turned in zip(*on_a_tripod(at))]
+    centres = np.stack([view.centre for view in views])
+    assert np.ptp(centres, axis=0).max() < 1e-11
+    assert scene_extent(centres) == 1.0
+    assert near_plane(centres) == NEAR
+    assert scene_extent(centres + 1e-6 * np.eye(5, 3)) < 1e-5
+
+
+def on_a_tripod(at):
+    views, rng = scene_of_views(5).views, np.random.default_rng(1)
+    return views, [look_at(at, np.add(at, rng.normal(size=3))) for _ in views]
+
+
+def test_the_extent_of_training_is_not_less_than_its_points_want():
+    """In any unit; that of the cameras where they stand apart."""
+    scene = scene_of_views(points=500)
+    centres = np.stack([view.centre for view in scene.views])
+    assert extent_of(scene) == scene_extent(centres)
+    for at in ((0, 0, -4), (1000, 2000, 5)):
+        views, turns = scene_of_views(5).views, []
+        for index in range(5):
+            turns.append(look_at(np.add(at, 1e-9 * index), np.add(at, [0, 0, 1])))
+        views = tuple(replace(v, viewmat=m) for v, m in zip(views, turns))
+        points = scene.points * 0.3 + at + np.asarray([0, 0, 4])
+        for unit in (1e-3, 1.0, 1e3):
+            resized = [v.viewmat.copy() for v in views]
+            for viewmat in resized:
+                viewmat[:3, 3] *= unit
+            some = tuple(replace(v, viewmat=m) for v, m in zip(views, resized))
+            narrow = replace(scene, views=some, points=points * unit)
+            assert extent_of(narrow) == pytest.approx(0.4 * unit, rel=0.05)
+    assert extent_of(replace(scene_of_views(1), points=np.zeros((0, 3)))) == 1.0
 
 
 def test_points_become_gaussians():
@@ -59,8 +113,8 @@ def test_points_become_gaussians():
     assert params.sh.shape == (40, 9, 3)
     np.testing.assert_array_equal(params.means, scene.points)
     np.testing.assert_allclose(jax.nn.sigmoid(params.logit_opacities), 0.3, rtol=1e-12)
-    extent = scene_extent(np.stack([view.centre for view in scene.views]))
-    wanted = np.clip(0.5 * brute_force(scene.points), 0, 0.05 * extent)
+    rms = brute_force(scene.points)
+    wanted = 0.5 * np.minimum(rms, max(0.1 * extent_of(scene), 3 * np.median(rms)))
     np.testing.assert_allclose(
         np.exp(params.log_scales), np.repeat(wanted[:, None], 3, 1), rtol=1e-12
     )
@@ -111,9 +165,9 @@ def test_of_too_many_some_are_drawn():
     np.testing.assert_array_equal(again.params.means, means)
     assert not np.array_equal(other.params.means, means)
     # As wide as those are apart that are left.
-    extent = scene_extent(np.stack([view.centre for view in scene.views]))
     np.testing.assert_allclose(
-        few.params.log_scales[:, 0], np.log(neighbour_distance(means, extent))
+        few.params.log_scales[:, 0],
+        np.log(neighbour_distance(means, extent_of(scene))),
     )
 
 
@@ -130,6 +184,12 @@ def test_random_ones_are_in_view():
     # Even in the ball: the cube of the distance is uniform.
     shares = np.histogram(away**3, 10, (0, 1))[0]
     assert np.sum((shares - 300) ** 2 / 300) < 34  # χ², 9 degrees, 0.9999
+    # Cameras side by side see more of what is before them than they are apart.
+    turned = [look_at((x, 0, 0), (0, 0, 10.0)) for x in (-0.6, 0.6)]
+    views = tuple(replace(v, viewmat=m) for v, m in zip(scene.views, turned))
+    away = points_in_ball(replace(scene, views=views), 3000, np.random.default_rng(0))
+    away = np.linalg.norm(away - [0, 0, 10], axis=1)
+    assert away.max() == pytest.approx(5, rel=0.01)
     colors = dc_to_rgb(np.asarray(gaussians.params.sh[:, 0]))
     assert colors.min() >= 0
     assert colors.max() <= 1

@@ -42,6 +42,19 @@ def test_l1_of_what_is_masked():
     assert (slope != 0).any()
 
 
+@pytest.mark.parametrize("loss", [l1, photometric])
+def test_what_is_right_stays_so(loss):
+    """|x| has slope 0 at 0; elsewhere that of `jnp.abs`."""
+    x, y, _ = pictures()
+    equal = np.zeros(x.shape, bool)
+    equal[3:9, 4:] = True
+    image = np.where(equal, y, x)
+    slope = jax.grad(lambda image: l1(image, y))(image)
+    np.testing.assert_allclose(slope, np.sign(image - y) / image.size, atol=1e-18)
+    slope = np.asarray(jax.grad(lambda image: loss(image, y))(y))
+    np.testing.assert_allclose(slope, 0, atol=1e-15)
+
+
 def test_nothing_to_see_is_no_loss_to_learn_from():
     x, y, weight = pictures()
     value, grad = jax.value_and_grad(photometric)(x, y, 0 * weight)

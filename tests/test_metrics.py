@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gsjax.errors import InputError
 from gsjax.metrics import psnr, ssim, ssim_map, weighted_mean
 
 # Smaller than the window, one pixel, and on either side of the blocks of 128 rows.
@@ -100,6 +101,23 @@ def test_psnr_of_known_errors():
     one = np.zeros((10, 10, 1))
     one[0, 0] = 1
     np.testing.assert_allclose(psnr(one, np.zeros_like(one)), 20)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, bool])
+@pytest.mark.parametrize("measure", [psnr, ssim])
+def test_whole_numbers_are_refused(dtype, measure):
+    """Differences of uint8 wrap; what reads images gives that."""
+    x, y = (picture.astype(np.float32) for picture in pair(24, 32))
+    for both in ((x.astype(dtype), y), (x, y.astype(dtype))):
+        with pytest.raises(InputError, match=r"a picture of .*picture / 255"):
+            measure(*both)
+        with pytest.raises(InputError, match=r"a picture of .*picture / 255"):
+            jax.jit(measure)(*both)
+
+
+def test_of_no_pixel_there_is_no_psnr():
+    x, y = pair(24, 32)
+    assert np.isnan(psnr(x, y, np.zeros((24, 32))))
 
 
 def test_weights_count():

@@ -33,6 +33,7 @@ from conftest import (
 from pictures import errors_of
 
 import gsjax
+from gsjax.cameras import camera_centre
 from gsjax.raster.reference import reference_colors
 from gsjax.rotations import quaternion_to_matrix
 
@@ -130,6 +131,38 @@ def test_sizes(size, dtype, report):
     for name, error in errors.items():
         report(f"size {size}, {name}, {dtype.__name__}", error, BAR[dtype])
         assert error <= BAR[dtype], name
+
+
+@pytest.mark.parametrize("at", ["the camera", "nowhere"])
+def test_a_gaussian_that_is_not_drawn_changes_nothing(at):
+    """Neither a pixel nor a gradient, of a degree that turns with the view."""
+    gaussians, camera = scene_of("random")
+    place = camera_centre(camera.viewmat) if at == "the camera" else np.full(3, np.nan)
+
+    def picture(means):
+        params = gaussians.params.replace(means=means)
+        found = reference(gaussians.replace(params=params), camera, WHOLE)
+        return jnp.sum(found["rgb"]), found
+
+    means = gaussians.params.means.at[3].set(jnp.asarray(place))
+    keep = np.delete(np.arange(COUNT), 3)
+    active = gaussians.active.at[3].set(False)
+    wanted = gsjax.reference_render(gaussians.replace(active=active), camera, WHOLE)
+    (_, found), slopes = jax.value_and_grad(picture, has_aux=True)(means)
+    for name in ("rgb", "alpha", "depth"):
+        np.testing.assert_allclose(found[name], wanted[name], atol=1e-14)
+    assert np.isfinite(slopes[keep]).all()
+    if at == "the camera":
+        np.testing.assert_array_equal(slopes[3], 0)
+
+
+def test_no_gaussian_is_the_background():
+    gaussians, camera = scene_of("random")
+    none = gaussians.replace(active=jnp.zeros(COUNT, bool))
+    for config in (None, WHOLE, WHOLE.replace(stop=0.0)):
+        found = gsjax.reference_render(none, camera, config, BACKGROUND)
+        assert (found["rgb"] == BACKGROUND).all()
+        assert np.isinf(found["margin"]).all()
 
 
 def test_orthographic(report):

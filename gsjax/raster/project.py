@@ -23,7 +23,7 @@ from gsjax.raster.types import COLOR_LIMIT, Array, Projected, RasterConfig
 def usable(camera: Camera) -> Array:
     """Whether a camera can draw at all; under jit a bad one cannot be refused."""
     low, high = LENS_RANGE
-    focal = jnp.abs(jnp.stack([camera.K[0, 0], camera.K[1, 1]]))
+    focal = jnp.stack([camera.K[0, 0], camera.K[1, 1]])
     centre = jnp.abs(jnp.stack([camera.K[0, 2], camera.K[1, 2]]))
     good = jnp.all(jnp.isfinite(camera.viewmat[:3]))
     return good & jnp.all((focal > low) & (focal < high) & (centre < high))

@@ -49,8 +49,11 @@ def reference_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.
 
 
 def reference_colors(gaussians: Gaussians, camera: Camera) -> Array:
-    """SH colour [N, 3] of each Gaussian seen from the camera."""
+    """SH colour [N, 3] of each Gaussian seen from the camera; where that is, as along
+    the world's z."""
     offset = gaussians.params.means - camera_centre(camera.viewmat)
+    there = jnp.any(offset != 0, axis=-1, keepdims=True)
+    offset = jnp.where(there, offset, jnp.asarray([0.0, 0.0, 1.0]))
     directions = offset / jnp.linalg.norm(offset, axis=-1, keepdims=True)
     return jnp.maximum(sh_lib.eval_sh(gaussians.params.sh, directions) + 0.5, 0)
 
@@ -95,6 +98,7 @@ def reference_render(
         reference_colors(gaussians, camera) if features is None else features[slots]
     )
     colors, depth, inside = colors[order], depth[order], inside[order]
+    colors = jnp.where(inside[:, None], colors, 0)  # of which nothing is blended
     means2d, opacity = means2d[order], jnp.where(inside, opacity[order], 0)
     inverse = jnp.linalg.inv(cov2d[order])
 
@@ -104,7 +108,8 @@ def reference_render(
     alpha = opacity[:, None] * jnp.exp(-0.5 * power)  # [N, pixels]
     margin = jnp.full(alpha.shape[1], jnp.inf)
     if config is not None:
-        margin = jnp.min(jnp.abs(alpha / config.alpha_cut - 1), axis=0)
+        from_cut = jnp.abs(alpha / config.alpha_cut - 1)
+        margin = jnp.min(from_cut, axis=0, initial=jnp.inf)
         alpha = jnp.where(alpha < config.alpha_cap, alpha, config.alpha_cap)
         alpha = jnp.where(alpha >= config.alpha_cut, alpha, 0)
     after = jnp.cumprod(1 - alpha, axis=0)
@@ -114,7 +119,8 @@ def reference_render(
         blended = tested > config.stop
         if config.stop > 0:
             near_stop = jnp.abs(tested / config.stop - 1)
-            margin = jnp.minimum(margin, jnp.min(near_stop, axis=0))
+            nearest = jnp.min(near_stop, axis=0, initial=jnp.inf)
+            margin = jnp.minimum(margin, nearest)
     else:
         blended = jnp.ones_like(after, bool)
     weight = jnp.where(blended, alpha * before, 0)

@@ -157,7 +157,7 @@ def render_exact(
     Args:
       gaussians, camera, config, background: as for `render`.
       max_capacity: refuse to grow the pair capacity beyond this.
-      **kwargs: mask, features, probe, abs_probe.
+      **kwargs: mask, features, size, probe, abs_probe.
 
     Raises:
       CapacityError: if more than ``max_capacity`` is wanted, or more memory than there

@@ -61,7 +61,8 @@ class RasterConfig:
         where a view needs a quarter of its capacity or less.
       devices: how many devices share the tiles (and on CPUs the projection, where
         colours turn with the view); None means all local ones. Within a
-        `jax.shard_map` of your own: 1, and ``check_vma=False`` there.
+        `jax.shard_map` of your own: 1, and ``check_vma=False`` there; within
+        `jax.pmap` or `jax.set_mesh`: 1.
 
     Raises:
       InputError: if a setting is out of its range.
@@ -91,7 +92,7 @@ class RasterConfig:
             "alpha_cap": self.alpha_cut < self.alpha_cap <= 1,
             "stop": 0 <= self.stop < 1,
             "stop_rule": self.stop_rule in STOP_RULES,
-            "dilation": 0 <= self.dilation < float("inf"),
+            "dilation": 0 <= self.dilation <= 1e9,  # its square is one of float32
             "outputs": isinstance(self.outputs, tuple)
             and len(self.outputs) > 0
             and set(self.outputs) <= set(OUTPUTS),

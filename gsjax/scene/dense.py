@@ -47,7 +47,9 @@ _LEAST_SCORE = 0.6
 _AGREEING = 2  # other views
 _STEPS = 1.5  # of depths, that two may differ by and still agree
 _ROOM = (0.8, 1.3)  # beyond the depths of the points that are known
-_FARTHEST = 10.0  # extents, where no points are known
+# Extents, where no points are known. What is farther than is looked for is found where
+# something happens to look alike; and evenly in 1 / z far costs next to nothing.
+_FARTHEST = 60.0
 _MOST_THREADS = 16  # with 20 MB each
 
 
@@ -65,7 +67,7 @@ def find_points(
 
     Of a scene of more than 48 views, 16 that lie far from one another are looked at,
     each with two neighbours. Depths are looked for where the scene's points are or, if
-    it has none, from the ball around what its cameras look at to ten extents away.
+    it has none, from the ball around what its cameras look at to sixty extents away.
 
     Args:
       scene: its cameras and points.

@@ -11,6 +11,20 @@ from gsjax.scene.paths import focus_point
 from gsjax.scene.types import Scene
 from gsjax.sh import C0, num_bases
 
+# Cameras no farther apart than that share of their coordinates stand in one place.
+_ROUNDING = 1e-12
+_LEAST_EXTENT, _SAMPLED = 0.1, 5000  # of the distance of points, some of which tell it
+_MOST_SPACING = 3.0  # times the median
+# Cameras that all look at one point from a narrow place see this much around it, as a
+# share of how far away it is.
+_IN_VIEW = 0.5
+
+
+def in_one_place(centres: np.ndarray) -> bool:
+    """Whether cameras at ``centres`` [V, 3] are apart by rounding at most."""
+    apart = np.abs(centres - centres.mean(0)).max()
+    return bool(apart <= _ROUNDING * np.abs(centres).max())
+
 
 def scene_extent(centres: np.ndarray) -> float:
     """1.1 times the largest distance of a camera from their mean (Kerbl et al. 2023).
@@ -21,8 +35,27 @@ def scene_extent(centres: np.ndarray) -> float:
     Returns:
       The extent, above 0; 1 where all cameras stand in one place.
     """
-    spread = np.linalg.norm(centres - centres.mean(0), axis=1).max()
-    return float(1.1 * spread) if spread > 0 else 1.0
+    if in_one_place(centres):
+        return 1.0
+    return float(1.1 * np.linalg.norm(centres - centres.mean(0), axis=1).max())
+
+
+def extent_of(scene: Scene) -> float:
+    """The extent by which a scene is trained, above 0.
+
+    That of its cameras, see `scene_extent`; where they stand nearly in one place, a
+    tenth of the median distance of its points from them along their axes.
+    """
+    centres = np.stack([view.centre for view in scene.views])
+    points = scene.points[finite_points(scene)]
+    points = points[:: max(1, len(points) // _SAMPLED)]
+    axes = np.stack([view.viewmat[2] for view in scene.views])
+    depths = points @ axes[:, :3].T + axes[:, 3]
+    before = depths[depths > 0]
+    least = _LEAST_EXTENT * float(np.median(before)) if before.size else 0.0
+    if least > 0 and in_one_place(centres):
+        return least
+    return max(scene_extent(centres), least)
 
 
 def near_plane(centres: np.ndarray) -> float:
@@ -35,7 +68,7 @@ def near_plane(centres: np.ndarray) -> float:
       The same share of `scene_extent` in any unit, at most `NEAR`, which is also that
       of cameras in one place.
     """
-    extent = scene_extent(centres) if np.ptp(centres, axis=0).any() else USUAL_EXTENT
+    extent = USUAL_EXTENT if in_one_place(centres) else scene_extent(centres)
     return NEAR * min(1.0, extent / USUAL_EXTENT)
 
 
@@ -77,8 +110,8 @@ def init_gaussians(
       opacity: of each, above 0 and below 1.
       scale: times the root mean square distance to the three nearest neighbours.
       max_count: of more points than that, that many are drawn.
-      random_count: that many, drawn evenly from the ball of the scene's extent around
-        the point that the cameras look at, instead of its points.
+      random_count: that many, drawn evenly from a ball around the point that the
+        cameras look at, see `points_in_ball`, instead of its points.
       capacity: number of slots, or what says it of the number of Gaussians; default
         that number.
       seed: of what is drawn.
@@ -108,8 +141,7 @@ def init_gaussians(
         chosen = np.sort(rng.choice(len(points), max_count, replace=False))
         points, colors = points[chosen], colors[chosen]
     count = len(points)
-    centres = np.stack([view.centre for view in scene.views])
-    spacing = scale * neighbour_distance(points, scene_extent(centres))
+    spacing = scale * neighbour_distance(points, extent_of(scene))
     sh = np.zeros((count, num_bases(sh_degree), 3))
     sh[:, 0] = (colors - 0.5) / C0
     return make_gaussians(
@@ -125,8 +157,9 @@ def init_gaussians(
 def neighbour_distance(points: np.ndarray, extent: float) -> np.ndarray:
     """[M] root mean square distance to the three nearest other points.
 
-    At least 1e-7 and at most 0.1 of the extent: points in one place, and points far
-    from all others, would otherwise be nothing or everything.
+    At least 1e-7 and at most 0.1 of the extent, or three times the median where that is
+    more: points in one place, and points far from all others, would otherwise be
+    nothing or everything.
     """
     from scipy.spatial import cKDTree  # pyright: ignore
 
@@ -135,15 +168,21 @@ def neighbour_distance(points: np.ndarray, extent: float) -> np.ndarray:
         return np.full(len(points), 0.01 * extent)
     distance, _ = cKDTree(points).query(points, k=count)
     rms = np.sqrt(np.mean(np.square(distance[:, 1:]), 1))
-    return np.clip(rms, 1e-7 * extent, 0.1 * extent)
+    most = max(0.1 * extent, _MOST_SPACING * float(np.median(rms)))
+    return np.clip(rms, 1e-7 * extent, most)
 
 
 def points_in_ball(scene: Scene, count: int, rng: np.random.Generator) -> np.ndarray:
-    """[count, 3] drawn evenly from the ball of the scene's extent around the point that
-    the cameras look at."""
+    """[count, 3] drawn evenly from the ball around the point that the cameras look at.
+
+    Its radius is the scene's extent, or half of their mean distance from that point
+    where that is more: cameras side by side see more of it than they are apart.
+    """
     centres = np.stack([view.centre for view in scene.views])
     extent = scene_extent(centres)
     middle = focus_point([view.viewmat for view in scene.views], depth=extent)
+    away = float(np.linalg.norm(centres - middle, axis=1).mean())
+    extent = max(extent, _IN_VIEW * away)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     radius = extent * rng.uniform(size=(count, 1)) ** (1 / 3)

@@ -17,7 +17,7 @@ from gsjax.scene.photos import scaled_intrinsics, size_within
 
 # px, a side: small ones keep edges, large ones find what has little texture.
 _WINDOWS = (3, 7)
-_LEAST_DEPTHS, _MOST_DEPTHS = 16, 128
+_LEAST_DEPTHS, _MOST_DEPTHS = 16, 144
 _MARGIN = max(_WINDOWS) // 2
 # Variance of a window that is told from noise: of 1.5 of 255 grey levels.
 _LEAST_VARIANCE = (1.5 / 255) ** 2
@@ -134,7 +134,7 @@ def sweep(
 
     At each depth the better half of the neighbours count: what is hidden in the others
     looks like nothing. Depths are as dense as a pixel of the neighbour that sees most
-    of a shift, up to 128, evenly in 1 / z; between them by a parabola.
+    of a shift, up to 144, evenly in 1 / z; between them by a parabola.
 
     Args:
       shot: the view.

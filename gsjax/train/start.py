@@ -8,7 +8,7 @@ import numpy as np
 
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.scene.dense import find_points
-from gsjax.scene.initialise import has_points, init_gaussians, scene_extent
+from gsjax.scene.initialise import extent_of, has_points, init_gaussians
 from gsjax.scene.types import Photo, Scene
 from gsjax.sh import num_bases
 from gsjax.train.config import TrainConfig
@@ -17,11 +17,6 @@ from gsjax.train.room import slots_for
 from gsjax.train.state import TrainState, init_state
 
 _LEAST_FOUND = 1000
-
-
-def extent_of(scene: Scene) -> float:
-    """Of the scene's cameras; see `scene_extent`."""
-    return scene_extent(np.stack([view.centre for view in scene.views]))
 
 
 def with_initial(scene: Scene, config: TrainConfig) -> TrainConfig:
