@@ -36,6 +36,7 @@ LENS_RANGE = (1e-15, 1e15)
 _K_ROUNDING = 1e-6
 Array = jax.Array
 Point = tuple[Array, Array, Array]
+Length = int | Array  # px
 
 
 class CameraModel(NamedTuple):
@@ -45,12 +46,13 @@ class CameraModel(NamedTuple):
       name: what files and messages call it.
       project_point: (K, (x, y, z)) → (u, v) in pixels; K is [3, 3].
       linearisation_point: (K, width, height, (x, y, z)) → the point at which the
-        EWA Jacobian is taken, kept away from where the linearisation is wild.
+        EWA Jacobian is taken, kept away from where the linearisation is wild. Width
+        and height are arrays [] where `gsjax.render` is given a ``size``.
     """
 
     name: str
     project_point: Callable[[Array, Point], tuple[Array, Array]]
-    linearisation_point: Callable[[Array, int, int, Point], Point]
+    linearisation_point: Callable[[Array, Length, Length, Point], Point]
 
 
 def _pinhole_project(K: Array, point: Point) -> tuple[Array, Array]:
@@ -58,7 +60,7 @@ def _pinhole_project(K: Array, point: Point) -> tuple[Array, Array]:
     return K[0, 0] * (x / z) + K[0, 2], K[1, 1] * (y / z) + K[1, 2]
 
 
-def _pinhole_linearise(K: Array, width: int, height: int, point: Point) -> Point:
+def _pinhole_linearise(K: Array, width: Length, height: Length, point: Point) -> Point:
     # Limits of gsplat: 30 % of half the field of view beyond each *side* of the
     # image, so that a principal point off the centre is treated evenly.
     x, y, z = point
@@ -82,7 +84,7 @@ def _orthographic_project(K: Array, point: Point) -> tuple[Array, Array]:
     return K[0, 0] * x + K[0, 2], K[1, 1] * y + K[1, 2]
 
 
-def _linear_everywhere(K: Array, width: int, height: int, point: Point) -> Point:
+def _linear_everywhere(K: Array, width: Length, height: Length, point: Point) -> Point:
     del K, width, height
     return point
 
@@ -122,6 +124,11 @@ class Camera:
     def batched(self) -> bool:
         """Whether the arrays have a leading camera axis."""
         return self.viewmat.ndim == 3
+
+    @property
+    def shown(self) -> tuple[Length, Length]:
+        """Width and height, px, of what is looked at of the image."""
+        return self.width, self.height
 
 
 def make_camera(

@@ -75,6 +75,9 @@ def evaluate(
 ) -> Iterator[ViewResult]:
     """Render each view at its photograph's size and compare.
 
+    Photographs of other sizes than the largest are part of a larger picture while they
+    are rendered: one program is compiled for all.
+
     Args:
       gaussians: the scene.
       views, photos: as many of one as of the other.
@@ -98,25 +101,38 @@ def evaluate(
     gaussians = on_all_devices(gaussians)
     for view, photo in zip(views, photos, strict=True):
         photo.require(view.name)
-        height, width = photo.pixels.shape[:2]
+    sizes = {photo.pixels.shape[:2] for photo in photos}
+    height, width = np.max([(1, 1), *sizes], axis=0)
+    for view, photo in zip(views, photos, strict=True):
         camera = make_camera(
-            viewmat=view.viewmat, K=photo.K, width=width, height=height, near=view.near
+            viewmat=view.viewmat,
+            K=photo.K,
+            width=int(width),
+            height=int(height),
+            near=view.near,
         )
-        result = render_exact(gaussians, camera, config, jnp.asarray(behind))
+        rows, cols = photo.pixels.shape[:2]
+        size = jnp.asarray([cols, rows]) if len(sizes) > 1 else None
+        result = render_exact(gaussians, camera, config, jnp.asarray(behind), size=size)
         assert result.rgb is not None
-        image = np.clip(np.asarray(result.rgb, np.float32), 0, 1)
-        truth = _over(photo, behind)
-        weight = None if photo.valid is None else photo.valid.astype(np.float32)
+        image = np.clip(np.asarray(result.rgb, np.float32)[:rows, :cols], 0, 1)
+        truth, weight = _over(photo, behind), None
+        if photo.valid is not None or len(sizes) > 1:
+            weight = np.ones((rows, cols), np.float32)
+            weight *= 1 if photo.valid is None else photo.valid
         quality = likeness = np.nan
         if weight is None or weight.any():
-            quality, likeness = _scores(image, truth, weight)
+            room = (0, int(height) - rows), (0, int(width) - cols)
+            given = np.pad(image, (*room, (0, 0))), np.pad(truth, (*room, (0, 0)))
+            counted = None if weight is None else np.pad(weight, room)
+            quality, likeness = _scores(*given, counted)
         yield ViewResult(
             name=view.name,
             psnr=float(quality),
             ssim=float(likeness),
             truth=truth,
             render=image,
-            depth=np.asarray(result.depth, np.float32),
+            depth=np.asarray(result.depth, np.float32)[:rows, :cols],
             valid=photo.valid,
         )
 

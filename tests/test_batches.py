@@ -10,7 +10,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import ALL, BACKGROUND, COUNT, WHOLE, camera_of, cast, render, scene_of
+from conftest import (
+    ALL,
+    BACKGROUND,
+    COUNT,
+    WHOLE,
+    assert_not_empty,
+    camera_of,
+    cast,
+    render,
+    scene_of,
+)
 from pictures import images, largest_difference
 
 import gsjax
@@ -57,6 +67,37 @@ def test_a_batch_of_one(report):
     report("batch of one", error, 1e-6)
     assert error <= 1e-6
     assert batch.demand == wanted.demand
+
+
+def test_a_picture_in_the_corner(report):
+    """Is that of a smaller camera: limits of the linearisation, radii, gradients."""
+    gaussians, camera = scene_of("random")
+    corner = np.s_[:20, :30]
+    weight = np.random.default_rng(0).normal(size=(20, 30, 3))
+    small = dataclasses.replace(camera, width=30, height=20)
+
+    @jax.jit
+    def seen(params, camera, size):
+        def loss(params):
+            some = gaussians.replace(params=params)
+            out = gsjax.render(some, camera, WHOLE, BACKGROUND, size=size)
+            return jnp.sum(out.rgb[corner] * weight), out
+
+        return jax.grad(loss, has_aux=True)(params)
+
+    slopes, found = seen(gaussians.params, camera, jnp.asarray([30, 20]))
+    wanted_slopes, wanted = seen(gaussians.params, small, None)
+    assert_not_empty(wanted.alpha)
+    for name in ALL:
+        error = np.max(np.abs(getattr(found, name)[corner] - getattr(wanted, name)))
+        report(f"in the corner, {name}", error, 1e-13)
+        assert error <= 1e-13, name
+    np.testing.assert_allclose(found.radii, wanted.radii, rtol=1e-12)
+    assert found.demand.visible == wanted.demand.visible < COUNT
+    for name, by in vars(wanted_slopes).items():
+        error = np.max(np.abs(getattr(slopes, name) - by)) / np.max(np.abs(by))
+        report(f"in the corner, gradient of {name}", error, 1e-12)
+        assert error <= 1e-12, name
 
 
 def test_a_mapped_camera_that_sees_nothing(report):

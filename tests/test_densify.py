@@ -216,6 +216,39 @@ def test_large_ones_go_after_the_first_reset():
     np.testing.assert_array_equal(np.flatnonzero(edit.active), np.delete(live, 1))
 
 
+@pytest.mark.parametrize("by", ["scale", "radius"])
+def test_what_a_split_makes_small_enough_is_split(by):
+    """Growth comes before pruning (Kerbl et al.'s code): there is no hole after it."""
+    limit = 0.5
+    sizes = np.full(SLOTS, 0.2)
+    gaussians, live = scene_with()
+    hot, cold, huge = live[:3]
+    sizes[[hot, cold, huge]] = 1.2 * limit, 1.2 * limit, 2 * limit
+    stats, kwargs = stats_with([hot, huge]), {"reset_every": 100}
+    if by == "scale":
+        kwargs |= {"prune_scale": limit / EXTENT}
+        params = gaussians.params.replace(
+            log_scales=jnp.log(sizes)[:, None].repeat(3, 1)
+        )
+        gaussians = gaussians.replace(params=params)
+    else:
+        kwargs |= {"prune_scale": 100.0, "prune_radius": limit, "clone_below": 1e-6}
+        stats = stats._replace(radius=jnp.asarray(sizes))
+    edit = plan(gaussians, stats, 110, **kwargs)
+    born = new_slots(edit, gaussians)
+    wanted = gaussians.params.log_scales[hot] - np.log(SETTINGS.shrink)
+    assert len(born) == 1
+    for slot in (hot, born[0]):
+        assert edit.active[slot]
+        np.testing.assert_allclose(edit.params.log_scales[slot], wanted, rtol=1e-12)
+    assert not edit.active[cold]
+    assert not edit.active[huge]
+    # Without room for a split it is as large as it is.
+    full = plan(gaussians, stats, 110, max_gaussians=14, **kwargs)
+    assert not full.active[hot]
+    assert full.wanted == edit.wanted == 15
+
+
 def test_when_slots_run_out_the_best_get_them():
     gaussians, live = scene_with(count=20)
     free = np.flatnonzero(~np.asarray(gaussians.active))

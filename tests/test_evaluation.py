@@ -109,6 +109,36 @@ def test_transparent_photographs_lie_over_the_background(gaussians, scene, rende
     np.testing.assert_allclose(result.truth, wanted, atol=1e-6)
 
 
+def test_photographs_of_unequal_sizes(gaussians, scene, renders, monkeypatch):
+    """As each by itself, by one program."""
+    rng = np.random.default_rng(0)
+    sizes = [(24, 20), (15, 32)]
+    seen = rng.uniform(size=sizes[1]) > 0.3
+    photos = [
+        Photo(r[:h, :w], None, valid, v.K)
+        for r, (h, w), valid, v in zip(renders, sizes, (None, seen), scene.views)
+    ]
+    rendered = []
+
+    def render(gaussians, camera, *args, **kwargs):
+        rendered.append((camera.width, camera.height))
+        return gsjax.render_exact(gaussians, camera, *args, **kwargs)
+
+    monkeypatch.setattr("gsjax.evaluation.render_exact", render)
+    together = scored(gaussians, scene, photos)
+    assert rendered == [(32, 24)] * 2
+    for index, found in enumerate(together):
+        part = replace(scene, views=scene.views[index : index + 1])
+        alone = scored(gaussians, part, photos[index : index + 1])[0]
+        assert found.render.shape == (*sizes[index], 3)
+        assert found.psnr == pytest.approx(alone.psnr, rel=1e-4)
+        assert found.ssim == pytest.approx(alone.ssim, rel=1e-4)
+        for name in ("render", "truth", "depth"):
+            wanted = getattr(alone, name)
+            np.testing.assert_allclose(getattr(found, name), wanted, atol=2e-6)
+        assert alone.psnr > 40
+
+
 def test_as_many_photographs_as_views(gaussians, scene, renders):
     photo = photo_of(scene.views[0], renders[0])
     with pytest.raises(ValueError, match="shorter"):

@@ -4,9 +4,9 @@ Axis legend: N Gaussians (capacity), B cameras.
 
 Where the image wants to move a Gaussian, on average over the views that show it,
 there are too few of them: a small one is cloned, a large one split in two. What is
-nearly transparent or too large goes. If there are fewer free slots than candidates,
-those with the largest gradient get them, and the count wanted is reported, also
-beyond the most that there may be.
+nearly transparent goes, or too large, and of what is split its halves would be. If
+there are fewer free slots than candidates, those with the largest gradient get them,
+and the count wanted is reported, also beyond the most that there may be.
 """
 
 from dataclasses import dataclass
@@ -182,19 +182,25 @@ def _densified(
     largest = jnp.max(scales, -1)
 
     late = (settings.reset_every > 0) & (step > settings.reset_every)
-    too_big = largest > settings.prune_scale * extent
-    if settings.prune_radius is not None:
-        too_big |= stats.radius > settings.prune_radius
-    # Phrased positively: what is not a number goes too.
-    kept = active & (opacity >= settings.prune_opacity) & ~(late & too_big)
+
+    def too_big(shrink):
+        big = largest > shrink * settings.prune_scale * extent
+        if settings.prune_radius is not None:
+            big |= stats.radius > shrink * settings.prune_radius
+        return late & big
 
     mean = stats.gradient / jnp.maximum(stats.views, 1)
-    hot = kept & (mean >= settings.threshold)
+    hot = mean >= settings.threshold
     large = largest > settings.clone_below * extent
+    # As big as they will be. Phrased positively: what is not a number goes too.
+    kept = active & (opacity >= settings.prune_opacity)
+    kept &= ~too_big(jnp.where(hot & large, settings.shrink, 1))
+    hot &= kept
     remaining = jnp.sum(kept, dtype=jnp.int32)
     room = jnp.maximum(settings.max_gaussians - remaining, 0)
     new = assign(hot, mean, ~kept, room)
     split, cloned = new.chosen & large, new.chosen & ~large
+    kept &= split | ~too_big(1)  # for which there was no room
 
     noise = jax.random.normal(key, (2, *scales.shape), scales.dtype)
     rotations = quaternion_to_matrix(params.quats)

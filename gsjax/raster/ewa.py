@@ -26,7 +26,7 @@ def transform_point(viewmat: Array, point):
 
 def ewa_jacobian(camera: Camera, point):
     """Rows (du/d·, dv/d·) of the Jacobian of the lens at camera ``point``."""
-    at = camera.model.linearisation_point(camera.K, camera.width, camera.height, point)
+    at = camera.model.linearisation_point(camera.K, *camera.shown, point)
     one, zero = jnp.ones_like(at[0]), jnp.zeros_like(at[0])
     columns = [
         jax.jvp(

@@ -138,9 +138,7 @@ def _look(
     opacity = jax.nn.sigmoid(logits)
     reach = reach_of(opacity, config)
     extents, wide = [], jnp.zeros_like(live)
-    for centre, row, size in zip(
-        centres, ewa_jacobian(camera, point), (camera.width, camera.height)
-    ):
+    for centre, row, size in zip(centres, ewa_jacobian(camera, point), camera.shown):
         gain = stretch * sum(j * j for j in row)
         square = largest * largest * gain
         extent = jnp.sqrt(reach * (square + config.dilation))

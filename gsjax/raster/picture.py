@@ -3,6 +3,9 @@
 Axis legend: N Gaussians (capacity), H W image, B cameras, C channels.
 """
 
+from dataclasses import dataclass, fields
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -20,6 +23,32 @@ from gsjax.raster.rasterise import device_count, rasterise
 from gsjax.raster.types import COLOR_LIMIT, Array, Demand, RasterConfig
 
 
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("viewmat", "K", "near", "far", "size"),
+    meta_fields=("width", "height", "model"),
+)
+@dataclass(frozen=True)
+class _Corner(Camera):
+    """A camera of whose image the upper left corner is shown alone.
+
+    Attributes:
+      size: [2] its width and height, px.
+    """
+
+    size: Array | None = None
+
+    @property
+    def shown(self) -> tuple[Array, Array]:
+        assert self.size is not None
+        return self.size[0], self.size[1]
+
+
+def _corner(camera: Camera, size: Array) -> _Corner:
+    given = {field.name: getattr(camera, field.name) for field in fields(camera)}
+    return _Corner(**given, size=size.astype(camera.K.dtype))
+
+
 def draw(
     gaussians: Gaussians,
     config: RasterConfig,
@@ -31,6 +60,8 @@ def draw(
     size: Array | None,
 ) -> tuple[dict[str, Array], Array, Demand, Array]:
     """One camera: images before the background, radii [N], demand, overflowed."""
+    if size is not None:
+        camera = _corner(camera, size)
     # The names that a profile shows.
     with jax.named_scope("order"):
         order, visible = depth_order(gaussians, camera, config, features)
@@ -43,10 +74,7 @@ def draw(
             gaussians, camera, config, order, visible, features, probe, abs_probe
         )
     radii = jnp.zeros(gaussians.capacity, out.u.dtype)
-    width, height = camera.width, camera.height
-    if size is not None:
-        width, height = size.astype(out.u.dtype)
-    seen = bins.radii(lax.stop_gradient(out), width, height)
+    seen = bins.radii(lax.stop_gradient(out), *camera.shown)
     sums, demand, overflowed = rasterise(out, camera.width, camera.height, config, mask)
     room = min(config.visible_capacity or gaussians.capacity, gaussians.capacity)
     return (

@@ -63,7 +63,8 @@ def render(
         gradients by them mean anything. Not counted as pairs is what lies before the
         first and after the last wanted tile of a row.
       size: [2], or [B, 2] for a batch: width and height, px, of a picture that fills
-        the upper left corner alone; ``radii`` are 0 for what is out of it.
+        the upper left corner alone, as if the camera had it; what other pixels come to
+        is not defined, and ``radii`` are 0 for what is out of it.
       features: [N, C] composited in place of the SH colour.
       probe: [N, 2], or [B, N, 2] for a batch, zeros: added to the projected means
         (px); its gradient is the screen-space statistic of densification.
