@@ -36,13 +36,14 @@ def number(name: str, value: Any) -> float:
     """``value`` as a float.
 
     Raises:
-      InputError: if it is no real number, or NaN; ``name`` says which.
+      InputError: if it is no real number, or not finite, which files of settings
+        cannot hold; ``name`` says which.
     """
     if isinstance(value, Real) and not isinstance(value, bool):
         value = float(value)
-        if not math.isnan(value):
+        if math.isfinite(value):
             return value
-    raise InputError(f"{name} = {value!r}: a number is wanted")
+    raise InputError(f"{name} = {value!r}: a finite number is wanted")
 
 
 def _flag(name: str, value: Any) -> bool:

@@ -90,9 +90,9 @@ start
 # ## Training
 #
 # The settings are those of the preset `fast`, made shorter: L1 and SSIM, Adam with a
-# rate for each kind of number, and adaptive density control, which clones and splits
-# Gaussians where the picture wants to move them, and removes those that hardly show.
-# There is room for 4000 Gaussians at most.
+# rate for each kind of number. Other than there, Gaussians come and go by adaptive
+# density control, which clones and splits them where the picture wants to move them,
+# and removes those that hardly show. There is room for 4000 at most.
 #
 # `fit` calls back after each step. `live` is such a hook: it draws the held-out view it
 # is given, beside its photograph, over and over in the same place. What is left of it

@@ -235,6 +235,7 @@ def test_refusals_of_the_command(tmp_path, capsys):
         (["bench", "nowhere"], 3, "knot"),
         (["bench", "--repeats", "0"], 2, "--repeats"),
         (["bench", "--budget", "x"], 2, "--budget"),
+        (["bench", "--budget", "2"], 2, "above 0 and below 1"),
         (["bench", "--plot", str(plot)], 3, "a.png"),
         (["bench", "--plot", str(plot.with_suffix(".jpg"))], 2, "in .png is wanted"),
     ):

@@ -378,6 +378,27 @@ def render(*more: str):
 
 BAD = {
     "no run": (3, no_run, "no run is here"),
+    "outer folder": (3, lambda d, _: ["info", str(d)], "but one is in "),
+    "a file to train into": (
+        3,
+        lambda d, _: ["train", str(d / "dataset"), "-o", str(d / "run" / "splat.ply")],
+        "splat.ply: is a file; pass a folder with -o",
+    ),
+    "the dataset to train into": (
+        3,
+        lambda d, _: ["train", str(d / "dataset"), "-o", str(d / "dataset")],
+        "dataset: is the dataset's own folder",
+    ),
+    "no viewer": (
+        2,
+        lambda _d, _t: ["train", "a", "-o", "b", "--viewer-port", "9000"],
+        "--viewer-port goes with --viewer",
+    ),
+    "frames of photos": (
+        2,
+        lambda d, t: ["sfm", str(d), "-o", str(t / "o"), "--frames", "9"],
+        "--frames are of a video",
+    ),
     "missing run": (
         3,
         lambda _d, t: ["info", str(t / "none")],

@@ -271,6 +271,19 @@ def test_photographs_count_as_their_files_have_them(tmp_path):
     assert bytes_of(640, 480, (320, 240)) == large == 4 * small
 
 
+def test_what_does_not_count_takes_a_byte_a_pixel():
+    """A mask, a lens, and what pads a photograph that is smaller than another."""
+    config, many = preset("fast"), [(64, 48)] * 5
+
+    def held(sizes, **kwargs):
+        found = run_estimate(sizes, config, 1000, 1024, **kwargs)
+        return found.parts["of photographs"]
+
+    assert held(many, masked=True) * 3 == held(many) * 4
+    pixels, largest = 4 * 64 * 48 + 50 * 40, 5 * 64 * 48
+    assert held([*many[1:], (50, 40)]) == 3 * pixels + 2 * 4 * largest
+
+
 def test_one_is_told_as_one(capsys):
     config = preset("fast")
     few = config.replace(mcmc=replace(config.mcmc, max_gaussians=1))

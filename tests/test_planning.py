@@ -98,7 +98,8 @@ def test_reasons_add_up_and_are_told(foggy):
     assert len(lines) == len(made.reasons) + 1
     for what in ("SH degree", "stop", "alpha_cut", "capacity", "pair_capacity", "lens"):
         assert any(line.startswith(f"{what}: ") for line in lines)
-    assert "of 1/255 (estimate)" in lines[-1]
+    assert "of 1/255 allowed (estimate)" in lines[-1]
+    assert "error" not in lines[-1], "the word that failures begin with"
 
 
 @pytest.mark.usefixtures("as_fitting")

@@ -42,9 +42,11 @@ def test_numbers(value):
     assert type(found) is float
 
 
-@pytest.mark.parametrize("value", [np.nan, "0.5", None, True, [0.5], 0.5j], ids=repr)
+@pytest.mark.parametrize(
+    "value", [np.nan, -np.inf, "0.5", None, True, [0.5], 0.5j], ids=repr
+)
 def test_no_numbers(value):
-    with pytest.raises(InputError, match=r"^x = .*: a number is wanted"):
+    with pytest.raises(InputError, match=r"^x = .*: a finite number is wanted"):
         number("x", value)
 
 

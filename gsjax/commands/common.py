@@ -52,7 +52,10 @@ def parse_size(text: str) -> tuple[int, int]:
     """
     match = re.fullmatch(r"([0-9]{1,6})[x×X]([0-9]{1,6})", text)
     if match is None or min(int(match[1]), int(match[2])) < 1:
-        raise UsageError(f"--size {text!r}: WIDTHxHEIGHT in pixels is wanted: 800x600")
+        raise UsageError(
+            f"--size {text!r}: WIDTHxHEIGHT in pixels is wanted, 1 to 999999 each: "
+            "800x600"
+        )
     return int(match[1]), int(match[2])
 
 
@@ -86,13 +89,15 @@ def parse_budget(text: str) -> float:
     """The error ``1/255`` or ``0.004``.
 
     Raises:
-      UsageError: if it is neither, or not above 0.
+      UsageError: if it is neither, or not above 0 and below 1.
     """
     number = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,2})?"
     match = re.fullmatch(rf"({number})(?:/({number}))?", text)
     parts = [float(part or 1) for part in match.groups()] if match else [0.0]
-    if min(parts) <= 0:
-        raise UsageError(f"--budget {text!r}: an error above 0, e.g. 1/255 or 0.004")
+    if min(parts) <= 0 or parts[0] >= parts[1]:
+        raise UsageError(
+            f"--budget {text!r}: an error above 0 and below 1, e.g. 1/255 or 0.004"
+        )
     return parts[0] / parts[1]
 
 

@@ -27,8 +27,9 @@ class SfmCommand(Command):
     max_size: Annotated[int, arg(metavar="PX")] = 1600
     """Longer side: larger photos are scaled down to it, for the features and in the
     dataset; 0 leaves them as they are."""
-    frames: int = 100
-    """How many frames of a video to take, the sharpest of each stretch."""
+    frames: int | None = None
+    """How many frames of a video to take, the sharpest of each stretch; default:
+    100."""
     masks: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder of masks, black where a photo is to be ignored: for IMG.jpg, IMG.png or
     IMG.jpg.png, as large as the photo seen upright. Where a photo is transparent it is
@@ -41,8 +42,10 @@ class SfmCommand(Command):
     def run(self) -> int:
         if self.max_size < 64 and self.max_size != 0:
             raise UsageError(f"--max-size {self.max_size}: 64 or more, or 0, is wanted")
-        if self.frames < 2:
+        if self.frames is not None and self.frames < 2:
             raise UsageError(f"--frames {self.frames}: 2 or more are wanted")
+        if self.frames is not None and self.source.is_dir():
+            raise UsageError(f"--frames are of a video, and {self.source} is a folder")
         if not 0 <= self.seed < 2**31:
             raise UsageError(f"--seed {self.seed}: from 0 to {2**31 - 1} is wanted")
         from gsjax.errors import SfmError
@@ -52,7 +55,7 @@ class SfmCommand(Command):
             matcher=self.matcher,
             camera=self.camera,
             max_size=self.max_size,
-            frames=self.frames,
+            frames=self.frames or SfmSettings.frames,
             masks=self.masks,
             seed=self.seed,
         )

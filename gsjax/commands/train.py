@@ -36,7 +36,8 @@ class TrainCommand(HeavyCommand):
     out: Annotated[Path, arg(aliases=["-o"], metavar="RUN")]
     """Folder for the run; created if missing."""
     preset: Literal["fast", "default", "quality"] = "default"
-    """fast: minutes on two cores; quality: 30 000 steps as in the papers."""
+    """fast: about two minutes on two cores; default: twenty and more; quality: 30 000
+    steps as in the papers."""
     strategy: Literal["adaptive", "mcmc"] | None = None
     """How Gaussians are added and removed; default: the preset's."""
     steps: int | None = None
@@ -86,8 +87,8 @@ class TrainCommand(HeavyCommand):
     """Steps between measurements on the held-out views; default: 0, only at the end."""
     viewer: bool = False
     """Show the scene in the browser as it grows; needs the extra gsjax[viewer]."""
-    viewer_port: int = 8080
-    """Where; the next free port if it is taken."""
+    viewer_port: int | None = None
+    """Where, default: 8080; the next free port if it is taken."""
     resume: bool = False
     """Go on where the run in RUN stopped, with the settings that it has; to the same
     bits, with as many cores. Where there is none yet, start one."""
@@ -101,7 +102,9 @@ class TrainCommand(HeavyCommand):
             raise UsageError("--test-images wants the name of one view at least")
         if self.test_images and self.test_every is not None:
             raise UsageError("--test-every and --test-images exclude each other")
-        if not 1 <= self.viewer_port < 2**16:
+        if self.viewer_port is not None and not self.viewer:
+            raise UsageError("--viewer-port goes with --viewer")
+        if self.viewer_port is not None and not 1 <= self.viewer_port < 2**16:
             raise UsageError(f"--viewer-port {self.viewer_port}: from 1 to 65535")
         start_jax()
         try:
@@ -116,7 +119,7 @@ class TrainCommand(HeavyCommand):
     def _watched(self) -> int:
         from gsjax.viewer.live import LiveViewer
 
-        viewer = LiveViewer(port=self.viewer_port)
+        viewer = LiveViewer(port=self.viewer_port or 8080)
         try:
             code = self._train(viewer.begin)
             if code == 0:

@@ -132,8 +132,10 @@ def _sampled(cameras: Camera | Sequence[Camera]) -> list[Camera]:
 def _check_budget(budget: float | None, gaussians: Gaussians) -> None:
     if budget is None:
         return
-    if not 0 < budget < float("inf"):
-        raise InputError(f"budget {budget}: an error above 0 is wanted, as 1 / 255")
+    if not 0 < budget < 1:
+        raise InputError(
+            f"budget {budget}: an error above 0 and below 1 is wanted, as 1 / 255"
+        )
     single = gaussians.params.means.dtype == jnp.float32
     if single and budget < 5 * ROUNDING:
         raise InputError(

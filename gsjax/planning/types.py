@@ -59,5 +59,6 @@ class Plan(NamedTuple):
         kind = "bound for every camera" if self.bounded else "estimate"
         if self.budget is not None:
             limit = f"{255 * self.budget:.3g}/255"
-            told.append(f"error: {255 * self.error:.3g}/255 of {limit} ({kind})")
+            error = f"{255 * self.error:.3g}/255 at most, of {limit} allowed"
+            told.append(f"in all: {error} ({kind})")
         return told

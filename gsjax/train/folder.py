@@ -221,6 +221,8 @@ def _no_run(path: Path) -> str:
     if is_dataset(path):
         call = shlex.join(["gsjax", "train", str(path)])
         return f"a dataset; train on it first ({call} -o RUN)"
+    if run_files(path / "run").config.exists():  # as `gsjax demo` makes it
+        return f"no run is here, but one is in {path / 'run'}"
     return "no run is here (config.json is missing)"
 
 

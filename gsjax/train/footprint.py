@@ -89,6 +89,7 @@ def run_estimate(
     slots: int,
     *,
     begins: bool = False,
+    masked: bool = False,
 ) -> Estimate:
     """What a run takes in all, from its photographs on.
 
@@ -100,10 +101,12 @@ def run_estimate(
       config: of the run.
       count: Gaussians, and ``slots`` for them.
       begins: whether they are those that it begins with.
+      masked: whether any of the photographs has pixels that do not count.
     """
     size = max(w for w, _ in sizes), max(h for _, h in sizes)
-    photos = 3 * sum(w * h for w, h in sizes)
-    frames = 3 * size[0] * size[1] * len(sizes)
+    photos = (3 + masked) * sum(w * h for w, h in sizes)
+    some = masked or len({*sizes}) > 1  # the smaller ones are part of a larger
+    frames = (3 + some) * size[0] * size[1] * len(sizes)
     each = _PAIRS
     if begins and config.initial == "random":
         # As wide as they are far from one another.
@@ -146,9 +149,11 @@ def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) ->
     else:
         count, slots = int(np.sum(state.gaussians.active)), state.gaussians.capacity
     sizes = trained_sizes(scene, config)
-    now = run_estimate(sizes, config, count, slots, begins=state is None)
+    # What a lens does not show counts as little as what a mask hides.
+    masked = any(view.mask is not None or view.lens is not None for view in scene.views)
+    now = run_estimate(sizes, config, count, slots, begins=state is None, masked=masked)
     most = max(config.max_gaussians, count)
-    then = run_estimate(sizes, config, most, capacity_bucket(most)).total
+    then = run_estimate(sizes, config, most, capacity_bucket(most), masked=masked).total
     free = available()
     told = "" if free is None else f"; {size_text(free)} is free"
     note(

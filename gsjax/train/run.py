@@ -94,11 +94,16 @@ def start_run(
 
     Raises:
       InputError: if the folder holds a run and ``overwrite`` is not set, or files that
-        are not a run's, or another process trains in it, or what is read or written
-        fails.
+        are not a run's, or is the dataset's or a file, or another process trains in it,
+        or what is read or written fails.
       DivergedError: as `fit`; the last good checkpoint is kept, and its scene.
     """
     _replaced(folder, overwrite)
+    dataset = settings.dataset.resolve()
+    if folder.resolve() == (dataset if dataset.is_dir() else dataset.parent):
+        raise InputError(
+            f"{folder}: is the dataset's own folder; pass another one with -o"
+        )
     data = load_data(settings)
     settings = replace(with_views(settings, data), config=_begun(settings.config, data))
     sitting = Sitting(settings.config, data, run_files(folder), Start())
@@ -121,6 +126,8 @@ def _replaced(folder: Path, overwrite: bool) -> list[Path]:
     Raises:
       InputError: if there are any, and it may not, or they are no run's.
     """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; pass a folder with -o")
     files = run_files(folder)
     names = dict.fromkeys((*files, *run_files(folder, "train")))
     ours = [path for path in names if path.exists() or path.is_symlink()]
