@@ -14,6 +14,7 @@ from gsjax.errors import InputError
 from gsjax.scene.initialise import (
     extent_of,
     init_gaussians,
+    least_extent,
     near_plane,
     neighbour_distance,
     points_in_ball,
@@ -101,6 +102,9 @@ def test_the_extent_of_training_is_not_less_than_its_points_want():
             some = tuple(replace(v, viewmat=m) for v, m in zip(views, resized))
             narrow = replace(scene, views=some, points=points * unit)
             assert extent_of(narrow) == pytest.approx(0.4 * unit, rel=0.05)
+            centres = np.stack([view.centre for view in narrow.views])
+            near = near_plane(centres, least_extent(narrow))
+            assert near == pytest.approx(min(NEAR, 8e-4 * unit), rel=0.05)
     assert extent_of(replace(scene_of_views(1), points=np.zeros((0, 3)))) == 1.0
 
 

@@ -367,7 +367,7 @@ def test_padding_does_not_matter():
 
 def test_a_padded_view_gives_the_statistic_of_the_view_alone():
     """In units of its own size; what the padding alone would show is not seen."""
-    size = width, height = 24, 18  # what shows there is within the limits of both
+    size = width, height = 20, 15
     config = TUNED.replace(
         strategy="adaptive", adaptive=AdaptiveSettings(), raster=RASTER
     )

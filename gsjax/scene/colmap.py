@@ -133,7 +133,7 @@ def _path(place: Path, listed: str, root: Path, moved: bool) -> str:
     and some models are of the folder above, and name that of the photographs, too.
     """
     if moved:
-        return last_parts(listed) or listed
+        listed = last_parts(listed) or listed
     offer = ", or pass images=, the folder that it is in (--images)"
     path = inside(str(place), listed, offer)
     if len(path.parts) > 1 and path.parts[0] == "images" and not (root / path).exists():

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.scene.colmap import find_colmap, load_colmap
-from gsjax.scene.initialise import near_plane
+from gsjax.scene.initialise import least_extent, near_plane
 from gsjax.scene.llff import load_llff
 from gsjax.scene.nerf import find_transforms, load_nerf
 from gsjax.scene.rebase import rebase
@@ -133,7 +133,7 @@ def _finished(scene: Scene) -> Scene:
             )
     centres = np.stack([view.centre for view in views])
     _check_places(scene, [view.name for view in views], centres)
-    near = near_plane(centres)
+    near = near_plane(centres, least_extent(scene))
     views = tuple(replace(view, near=near) for view in views)
     return rebase(replace(scene, views=views))
 

@@ -43,32 +43,42 @@ def scene_extent(centres: np.ndarray) -> float:
 def extent_of(scene: Scene) -> float:
     """The extent by which a scene is trained, above 0.
 
-    That of its cameras, see `scene_extent`; where they stand nearly in one place, a
-    tenth of the median distance of its points from them along their axes.
+    That of its cameras, see `scene_extent`; where they stand nearly in one place, that
+    of its points, see `least_extent`.
     """
     centres = np.stack([view.centre for view in scene.views])
-    points = scene.points[finite_points(scene)]
-    points = points[:: max(1, len(points) // _SAMPLED)]
-    axes = np.stack([view.viewmat[2] for view in scene.views])
-    depths = points @ axes[:, :3].T + axes[:, 3]
-    before = depths[depths > 0]
-    least = _LEAST_EXTENT * float(np.median(before)) if before.size else 0.0
+    least = least_extent(scene)
     if least > 0 and in_one_place(centres):
         return least
     return max(scene_extent(centres), least)
 
 
-def near_plane(centres: np.ndarray) -> float:
+def least_extent(scene: Scene) -> float:
+    """A tenth of the median distance of the points from the cameras that they lie
+    before, along their axes; 0 of no such points."""
+    points = scene.points[finite_points(scene)]
+    points = points[:: max(1, len(points) // _SAMPLED)]
+    axes = np.stack([view.viewmat[2] for view in scene.views])
+    depths = points @ axes[:, :3].T + axes[:, 3]
+    before = depths[depths > 0]
+    return _LEAST_EXTENT * float(np.median(before)) if before.size else 0.0
+
+
+def near_plane(centres: np.ndarray, least: float = 0.0) -> float:
     """How near a camera Gaussians are drawn: `NEAR`, less in a scene of a small unit.
 
     Args:
       centres: [V, 3] where the cameras stand.
+      least: that the extent is at least, see `least_extent`.
 
     Returns:
-      The same share of `scene_extent` in any unit, at most `NEAR`, which is also that
-      of cameras in one place.
+      The same share of the extent in any unit, at most `NEAR`, which is also that of
+      cameras in one place without anything before them.
     """
-    extent = USUAL_EXTENT if in_one_place(centres) else scene_extent(centres)
+    if in_one_place(centres):
+        extent = least or USUAL_EXTENT
+    else:
+        extent = max(scene_extent(centres), least)
     return NEAR * min(1.0, extent / USUAL_EXTENT)
 
 
