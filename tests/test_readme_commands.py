@@ -55,7 +55,8 @@ WRITTEN = ("out", "html", "plot", "json")
 
 
 def smaller(words: list[str]) -> list[str]:
-    more = SMALLER.get(words[0], {})
+    of_photos = words[:2] == ["sfm", "photos"]  # there are no frames to choose from
+    more = {} if of_photos else SMALLER.get(words[0], {})
     return words + [
         word for name, value in more.items() if name not in words
         for word in (name, value)

@@ -46,14 +46,19 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
         check_size(header)
         known = (names for names in _COLORS if types.keys() >= {*names})
         names = next(known, ())
-        unit = bool(names) and all((types[n] or "").startswith("f") for n in names)
+        kinds = {types[name] or "" for name in names}
+        unit = bool(names) and all(kind.startswith("f") for kind in kinds)
+        narrow = unit or kinds <= {"u1"}
         require(
-            Estimate({"coordinates and colours": header.vertex.rows * 34}),
+            Estimate(
+                {"coordinates and colours": header.vertex.rows * (28 if narrow else 34)}
+            ),
             f"{path}: {header.vertex.rows:,} points",
             "leave out some of them where the file was made",
         )
         points = np.empty((header.vertex.rows, 3))
-        colors = np.full((header.vertex.rows, 3), _GREY, np.uint16)
+        kind = np.uint8 if narrow else np.uint16
+        colors = np.full((header.vertex.rows, 3), _GREY, kind)
         wild = np.zeros(header.vertex.rows, bool)
         start, darkest, brightest = 0, 0.0, 0.0
         for size, columns in read_rows(file, header):
@@ -68,7 +73,9 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
                 brightest = max(brightest, values.max(initial=0.0))
                 darkest = min(darkest, values.min(initial=0.0))
                 values = np.clip(values, 0, 1) * 255 if unit else values
-                colors[rows, axis] = np.rint(np.clip(values, 0, 65535))
+                colors[rows, axis] = np.rint(
+                    np.clip(values, 0, 255 if narrow else 65535)
+                )
             start += size
     if wild.any():
         raise InputError(
@@ -86,5 +93,6 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
             f"{path}: colours are from {darkest:g} to {brightest:g}; 0 to 255 is "
             "wanted, of type uchar, or 0 to 65535, of type ushort"
         )
-    wide = not unit and brightest > 255
-    return points, (np.rint(colors / 257) if wide else colors).astype(np.uint8)
+    if brightest > 255:
+        colors = (colors.astype(np.uint32) + 128) // 257
+    return points, colors.astype(np.uint8, copy=False)
