@@ -476,10 +476,12 @@ def test_at_the_lens_in_a_far_world():
         assert np.isfinite(leaf).all()
 
 
-def test_a_camera_that_is_not_finite_draws_nothing_under_jit():
+def test_a_camera_that_there_cannot_be_draws_nothing_under_jit():
     """Outside jit it cannot be made; under jit it cannot raise."""
     gaussians, camera = scene_of("random")
     for spoilt_camera in (
+        gsjax.Camera(**{**vars(camera), "K": camera.K.at[0, 0].multiply(-1)}),
+        gsjax.Camera(**{**vars(camera), "K": camera.K.at[1, 1].multiply(-1)}),
         gsjax.Camera(**{**vars(camera), "viewmat": camera.viewmat * np.nan}),
         gsjax.Camera(**{**vars(camera), "near": camera.near * np.nan}),
     ):

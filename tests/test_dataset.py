@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from captures import save_photo, scene_of_views, to_opengl
 
+from gsjax import look_at
 from gsjax.errors import InputError
 from gsjax.scene.colmap import read_colmap
 from gsjax.scene.colmap_writer import write_colmap
 from gsjax.scene.dataset import load_dataset
+from gsjax.scene.initialise import extent_of, scene_extent
 from gsjax.scene.rebase import far_origin
 from gsjax.scene.splits import split_views
 from gsjax.scene.types import View
@@ -60,6 +62,28 @@ def test_cameras_on_a_tripod_and_one_elsewhere_are_read(tmp_path):
         views.append(replace(view, viewmat=viewmat))
     transforms(tmp_path, replace(scene, views=tuple(views)))
     assert len(load_dataset(tmp_path).views) == len(views) > 2
+
+
+@pytest.mark.parametrize("points", [0, 200])
+@pytest.mark.parametrize(
+    "at", [(0, 0, 0), (1.3, 2.1, 0.7), (1e3, 2e3, 5), (1e6, 2e6, 5)]
+)
+def test_cameras_on_a_tripod_are_in_one_place(tmp_path, at, points):
+    """Also where rounding is all that is left of their coordinates."""
+    scene, rng = scene_of_views(points=points, at=at), np.random.default_rng(1)
+    turns = [look_at(at, np.add(at, rng.normal(size=3))) for _ in scene.views]
+    views = [replace(v, viewmat=m) for v, m in zip(scene.views, turns)]
+    scene = replace(scene, views=tuple(views))
+    write_colmap(tmp_path / "sparse/0", scene)
+    for view in scene.views:
+        save_photo(tmp_path / "images" / view.name)
+    loaded = load_dataset(tmp_path)
+    centres = np.stack([view.centre for view in loaded.views])
+    apart = np.abs(centres + loaded.origin - at).max()
+    assert apart <= 1e-12 * max(1, np.abs(at).max())
+    assert scene_extent(centres) == 1.0
+    extent = extent_of(loaded)
+    assert extent == 1.0 if not points else 0.01 < extent < 1
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])

@@ -307,8 +307,9 @@ def test_two_views_are_enough():
     assert np.mean(off_surface(found.points) < 0.05) > 0.85
 
 
-def test_a_wall_before_parallel_cameras():
-    """As of LLFF: no points are known, and the wall is eight extents away."""
+def wall_at(depth: float) -> np.ndarray:
+    """Depths [M] that are found of a wall before five cameras side by side, 2 apart in
+    all, which is of an extent of 1.1. No points are known."""
     rng = np.random.default_rng(0)
     tiles = rng.integers(0, 256, (60, 60, 3)).astype(np.uint8)
     K = np.asarray([[120.0, 0, 80], [0, 120, 60], [0, 0, 1]])
@@ -317,18 +318,34 @@ def test_a_wall_before_parallel_cameras():
     for index in range(5):
         viewmat = np.eye(4)
         viewmat[0, 3] = -0.5 * (index - 2)
-        x = (u - 80) / 120 * 8.8 + 0.5 * (index - 2) + 30
-        y = (v - 60) / 120 * 8.8 + 30
-        pixels = tiles[(3 * y).astype(int) % 60, (3 * x).astype(int) % 60]
+        x = (u - 80) / 120 * depth + 0.5 * (index - 2) + 30
+        y = (v - 60) / 120 * depth + 30
+        scale = 3 * 8.8 / depth  # tiles as large in the pictures, wherever it is
+        pixels = tiles[(scale * y).astype(int) % 60, (scale * x).astype(int) % 60]
         name = f"{index}.png"
         views.append(View(name, Path(name), viewmat, K, WIDTH, HEIGHT))
         photos.append(Photo(pixels, None, None, K))
     scene = Scene(Path("wall"), "made up", tuple(views))
-    found = find_points(scene, photos, ALL)
-    assert len(found.points) > 10_000
-    off = np.abs(found.points[:, 2] / 8.8 - 1)  # 0.07 is half a pixel
+    return find_points(scene, photos, ALL).points[:, 2]
+
+
+def test_a_wall_before_parallel_cameras():
+    """As of LLFF: the wall is eight extents away."""
+    found = wall_at(8.8)
+    assert len(found) > 10_000
+    off = np.abs(found / 8.8 - 1)  # 0.07 is half a pixel
     assert np.median(off) < 0.04
     assert np.mean(off < 0.14) > 0.95
+
+
+@pytest.mark.parametrize("extents", [15, 25])
+def test_a_wall_farther_away_is_not_found_before_it(extents):
+    """Where something looks alike by chance."""
+    depth = 1.1 * extents
+    found = wall_at(depth)
+    assert len(found) > 5000
+    off = np.abs(depth / found - 1)  # 1 / z is what a shift tells: 1 px is 0.017 depth
+    assert np.mean(off < 0.017 * depth) > 0.95
 
 
 def test_nor_do_cores_matter(monkeypatch):

@@ -36,11 +36,7 @@ from gsjax.scene import sfm_engine
 from gsjax.scene.colmap import load_colmap
 from gsjax.scene.photos import load_photo
 from gsjax.scene.sfm import SfmSettings, run_sfm
-from gsjax.scene.sfm_colmap import (
-    _leave_out_impossible,
-    exif_camera,
-    extract,
-)
+from gsjax.scene.sfm_colmap import _leave_out_impossible, exif_camera, extract
 from gsjax.scene.sfm_photos import Workshop, find_photos, prepare_photos
 from gsjax.scene.video import sharpest_frames, sharpness
 

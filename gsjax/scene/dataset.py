@@ -11,7 +11,7 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.scene.colmap import find_colmap, load_colmap
-from gsjax.scene.initialise import least_extent, near_plane
+from gsjax.scene.initialise import in_one_place, least_extent, near_plane
 from gsjax.scene.llff import load_llff
 from gsjax.scene.nerf import find_transforms, load_nerf
 from gsjax.scene.rebase import rebase
@@ -135,7 +135,19 @@ def _finished(scene: Scene) -> Scene:
     _check_places(scene, [view.name for view in views], centres)
     near = near_plane(centres, least_extent(scene))
     views = tuple(replace(view, near=near) for view in views)
-    return rebase(replace(scene, views=views))
+    scene = rebase(replace(scene, views=views))
+    return _together(scene) if in_one_place(centres) else scene
+
+
+def _together(scene: Scene) -> Scene:
+    """With all cameras where the first is; what they were apart was rounding, which may
+    be all that is left of their coordinates by now."""
+    centre, moved = scene.views[0].centre, []
+    for view in scene.views:
+        viewmat = view.viewmat.copy()
+        viewmat[:3, 3] = -viewmat[:3, :3] @ centre
+        moved.append(replace(view, viewmat=viewmat))
+    return replace(scene, views=tuple(moved))
 
 
 def _check_places(scene: Scene, names: list[str], centres: np.ndarray) -> None:
