@@ -27,6 +27,20 @@ RNG = np.random.default_rng(0)
 NOISE = RNG.integers(0, 256, (24, 32, 3)).astype(np.uint8)
 
 
+def png_of(width, height, depth=8, color=2, rows=bytes(1000), clear=None) -> bytes:
+    """A PNG of packed rows, each behind a 0; and a transparent grey."""
+
+    def chunk(kind, body):
+        sizes = struct.pack(">I", len(body)), struct.pack(">I", zlib.crc32(kind + body))
+        return sizes[0] + kind + body + sizes[1]
+
+    head = struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)
+    chunks = [chunk(b"IHDR", head)]
+    chunks += [] if clear is None else [chunk(b"tRNS", struct.pack(">H", clear))]
+    chunks += [chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
 def view_of(path: Path, width=32, height=24, K=None, **more) -> View:
     if K is None:
         K = np.asarray([[40.0, 0, 15.5], [0, 42.0, 12.25], [0, 0, 1]])
@@ -80,6 +94,37 @@ def test_a_tiff_that_is_transparent_in_part_is_refused(tmp_path):
     image.fromarray(rgba, "RGBA").save(tmp_path / "a.tiff")
     with pytest.raises(InputError, match=r"a\.tiff: a TIFF .* transparent in part"):
         load_photo(view_of(tmp_path / "a.tiff"))
+
+
+@pytest.mark.parametrize("depth", [2, 8, 16])
+def test_a_grey_that_is_transparent(tmp_path, depth):
+    """A PNG may name one instead of having an alpha channel; OpenCV takes no notice."""
+    grey, path = NOISE[..., 0] % 4, tmp_path / "a.png"
+    one = {2: 1, 8: 1, 16: 257}[depth]
+    if depth == 2:
+        rows = np.packbits((grey[..., None] >> [1, 0] & 1).reshape(24, -1), axis=1)
+    else:
+        rows = (grey.astype(int) * one).astype(f">u{depth // 8}")
+    lines = b"".join(b"\0" + row.tobytes() for row in rows)
+    path.write_bytes(png_of(32, 24, depth, 0, lines, 2 * one))
+    photo = load_photo(view_of(path))
+    assert photo.alpha is not None
+    np.testing.assert_array_equal(photo.alpha, np.where(grey == 2, 0, 255))
+    shown = grey * (85 if depth == 2 else 1)
+    np.testing.assert_array_equal(photo.pixels, np.repeat(shown[..., None], 3, 2))
+
+
+def test_a_tiff_of_grey_and_transparency_is_refused(tmp_path):
+    """OpenCV drops the one, or reads 16 bits as zeros."""
+    image = pytest.importorskip("PIL.Image", reason="Pillow is absent")
+    both = image.fromarray(np.ascontiguousarray(NOISE[..., :2]), "LA")
+    both.save(tmp_path / "a.tif")
+    with pytest.raises(InputError, match=r"a\.tif: a TIFF of two samples .* to PNG"):
+        load_photo(view_of(tmp_path / "a.tif"))
+    both.getchannel(0).save(tmp_path / "b.tif")
+    np.testing.assert_array_equal(
+        load_photo(view_of(tmp_path / "b.tif")).pixels, np.repeat(NOISE[..., :1], 3, 2)
+    )
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])
@@ -411,6 +456,9 @@ def test_masks(tmp_path):
     twice = save_photo(tmp_path / "m2.png", np.kron(mask, np.ones((2, 2), np.uint8)))
     photo = load_photo(view_of(path, mask=twice))
     np.testing.assert_array_equal(photo.valid, mask > 0)
+    # In 16 bits what is darker than a step of 8 bits is not black either.
+    deep = save_photo(tmp_path / "m16.png", (mask > 0).astype(np.uint16))
+    np.testing.assert_array_equal(load_photo(view_of(path, mask=deep)).valid, mask > 0)
     white = save_photo(tmp_path / "m3.png", np.full((24, 32), 255, np.uint8))
     assert load_photo(view_of(path, mask=white)).valid is None
 
@@ -470,22 +518,6 @@ def test_thumbnail_does_not_hide_truncation(tmp_path):
     path.write_bytes(data[:2] + inner + data[2:-9])
     with pytest.raises(InputError, match="no end-of-image marker"):
         load_photo(view_of(path))
-
-
-def png_of(width, height, extra=b"", color=2) -> bytes:
-    def chunk(kind, body):
-        return (
-            struct.pack(">I", len(body))
-            + kind
-            + body
-            + struct.pack(">I", zlib.crc32(kind + body))
-        )
-
-    head = struct.pack(">IIBBBBB", width, height, 8, color, 0, 0, 0)
-    body = zlib.compress(bytes(1000)) + extra
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        [chunk(b"IHDR", head), chunk(b"IDAT", body), chunk(b"IEND", b"")]
-    )
 
 
 def test_bombs(tmp_path):

@@ -323,7 +323,7 @@ def test_masks_and_transparency_both_count(tmp_path):
     ]
     drawn = np.full((HEIGHT, WIDTH), 255, np.uint8)
     drawn[:, -60:] = 0
-    cv2.imwrite(str(masks / "both.png"), drawn)
+    cv2.imwrite(str(masks / "both.png"), (drawn > 0).astype(np.uint16))
     made = prepare_photos(paths, masks, work, 0)
     assert [photo.mask for photo in made] == [True, True, False, False]
     both, alpha, *others = (read(work.mask(photo.shot.file)) for photo in made)

@@ -19,7 +19,13 @@ import numpy as np
 from gsjax.errors import InputError
 from gsjax.files import read_bytes
 from gsjax.images import opencv
-from gsjax.scene.image_header import check_image, has_tiff_alpha, tiff_as_stored
+from gsjax.scene.image_header import (
+    check_image,
+    clear_grey,
+    has_tiff_alpha,
+    has_two_samples,
+    tiff_as_stored,
+)
 
 # What libjpeg, libpng and, through OpenCV, libtiff say of pixels that are not as they
 # were; the rest of libpng's warnings are of colour profiles and the like.
@@ -47,12 +53,17 @@ def decode(
     Raises:
       InputError: as ``check``; if the file cannot be read, is no image, is truncated,
         declares more pixels than any camera makes, or is a TIFF of half-transparent
-        pixels.
+        pixels, or of grey and another sample.
     """
     data = read_bytes(path, "a photograph")
     size = check_image(path, data)
     if check is not None:
         check(*size)
+    if has_two_samples(data):  # of which OpenCV drops one, or reads 16 bits as zeros
+        raise InputError(
+            f"{path}: a TIFF of two samples a pixel, grey and transparency, which "
+            "cannot be read; convert it to PNG"
+        )
     cv2 = opencv()
     if flags & cv2.IMREAD_IGNORE_ORIENTATION:  # IMREAD_UNCHANGED is among them
         data = tiff_as_stored(data)  # of which OpenCV takes no notice in a TIFF
@@ -75,6 +86,11 @@ def decode(
                 f"{path}: a TIFF with pixels that are transparent in part, whose "
                 "colours cannot be told from black mixed into them; convert it to PNG"
             )
+    grey = clear_grey(data) if flags == cv2.IMREAD_UNCHANGED else None
+    if grey is not None and pixels.ndim == 2:  # OpenCV heeds it in colours alone
+        most = np.iinfo(pixels.dtype).max
+        alpha = np.where(pixels == round(grey * most), 0, most).astype(pixels.dtype)
+        pixels = np.stack([pixels, alpha], -1)
     return pixels
 
 

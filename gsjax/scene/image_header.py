@@ -22,10 +22,10 @@ _MAX_DEFLATE = 1032
 _MAX_TIFF = 1400
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _REMEDY = "copy or export it again"
-# Tags of TIFF: width, height, bits of a sample, compression, how it is turned, what a
-# fourth sample is.
+# Tags of TIFF: width, height, bits of a sample, compression, how it is turned, samples
+# of a pixel, what those are that are no colours.
 _ORIENTATION = 274
-_TIFF_TAGS = (256, 257, 258, 259, _ORIENTATION, 338)
+_TIFF_TAGS = (256, 257, 258, 259, _ORIENTATION, 277, 338)
 # Markers of JPEG without a length, and those that carry the size of the image.
 _JPEG_BARE = {0x01, *range(0xD0, 0xD9)}
 _JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
@@ -163,6 +163,26 @@ def has_tiff_alpha(data: Buffer) -> bool:
     fourth sample is: opacity, that colours were multiplied by (1) or not (2).
     """
     return _reader(data[:12]) is _tiff and _tiff_tags(data).get(338) in (1, 2)
+
+
+def has_two_samples(data: Buffer) -> bool:
+    """Whether an image, which `check_image` has seen, is a TIFF of grey and alpha."""
+    return _reader(data[:12]) is _tiff and _tiff_tags(data).get(277) == 2
+
+
+def clear_grey(data: Buffer) -> float | None:
+    """Of an image, which `check_image` has seen: the grey, of 1, that is transparent in
+    a PNG without other transparency (its tRNS chunk); else None.
+    """
+    if _reader(data[:12]) is not _png or data[25] != 0:
+        return None
+    depth, at = data[24], 8
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        if kind == b"tRNS" and length == 2:
+            return struct.unpack_from(">H", data, at + 8)[0] / (2**depth - 1)
+        at += 12 + length
+    return None
 
 
 def tiff_as_stored(data: bytes) -> bytes:

@@ -201,6 +201,7 @@ def _masked(path: Path, width: int, height: int) -> np.ndarray:
     """[H, W] bool: where the mask is 0."""
     cv2 = opencv()
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    flags |= cv2.IMREAD_ANYDEPTH  # of 16 bits, 1 is no black
     mask = decode(path, flags, partial(_check_mask, path, (width, height)))
     if mask.shape != (height, width):
         rows = (np.arange(height) + 0.5) * (mask.shape[0] / height)

@@ -124,7 +124,8 @@ def dataset_name(path: Path) -> str:
 
 
 def read_upright(path: Path, grey: bool = False) -> np.ndarray:
-    """[H, W, 3] BGR (or [H, W]) uint8, turned as EXIF says.
+    """[H, W, 3] BGR uint8, turned as EXIF says; or [H, W] grey, of as many bits as it
+    has: of 16, the darkest that is not black would be black in 8.
 
     Raises:
       InputError: if the file is no image, truncated, damaged, or declares more pixels
@@ -132,7 +133,8 @@ def read_upright(path: Path, grey: bool = False) -> np.ndarray:
     """
     cv2 = opencv()
     with telling_of_damage([path]):
-        return decode(path, cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
+        deep_grey = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+        return decode(path, deep_grey if grey else cv2.IMREAD_COLOR)
 
 
 def _read_photo(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
