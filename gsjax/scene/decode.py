@@ -76,11 +76,11 @@ def decode(
             f"{path}: cannot be decoded: the image is truncated, damaged or of a kind "
             "that OpenCV does not read; convert it to PNG or JPEG"
         )
+    most = 65535 if pixels.dtype == np.uint16 else 255
     # OpenCV 5.0 multiplies colours of 8 bits that were not, leaves what was as it is,
     # and does not say so.
     if pixels.ndim == 3 and pixels.shape[2] == 4 and has_tiff_alpha(data):
         alpha = pixels[..., 3]
-        most = 65535 if alpha.dtype == np.uint16 else 255
         if ((alpha > 0) & (alpha < most)).any():
             raise InputError(
                 f"{path}: a TIFF with pixels that are transparent in part, whose "
@@ -88,7 +88,6 @@ def decode(
             )
     grey = clear_grey(data) if flags == cv2.IMREAD_UNCHANGED else None
     if grey is not None and pixels.ndim == 2:  # OpenCV heeds it in colours alone
-        most = np.iinfo(pixels.dtype).max
         alpha = np.where(pixels == round(grey * most), 0, most).astype(pixels.dtype)
         pixels = np.stack([pixels, alpha], -1)
     return pixels
