@@ -10,18 +10,21 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from hostile import HOSTILE, harmless, write_hostile
 
+import gsjax
 import gsjax.train.run as run_module
 from gsjax import cli
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import InputError
 from gsjax.files import alone_in
 from gsjax.raster.types import RasterConfig
+from gsjax.scene.dataset import load_dataset
 from gsjax.subjects import open_subject
-from gsjax.train.config import TrainConfig
+from gsjax.train.config import Level, TrainConfig, going_on, preset
 from gsjax.train.config_json import from_json, to_json
 from gsjax.train.folder import (
     RunSettings,
@@ -34,6 +37,7 @@ from gsjax.train.folder import (
 from gsjax.train.held_out import evaluate_run
 from gsjax.train.history import read_metrics
 from gsjax.train.run import RunResult, resume_run, start_run
+from gsjax.train.start import initial_state
 
 pytestmark = pytest.mark.usefixtures("float32")
 
@@ -275,6 +279,87 @@ def test_with_points_it_starts_from_them(whole):
     assert load_settings(whole / "run").config == CONFIG.replace(initial="points")
 
 
+@pytest.mark.parametrize("degree", [0, 2])
+def test_gaussians_to_start_from_are_as_they_were(whole, degree):
+    """Bit for bit, whatever is inactive among them, but for bands cut or added."""
+    scene = load_dataset(whole / "data")
+    given = gsjax.load(whole / "run" / "splat.ply")
+    given = gsjax.with_sh_degree(given, 1)
+    keep = np.arange(given.capacity) % 3 != 0
+    wanted = gsjax.compact(gsjax.select(given, keep), int(keep.sum()))
+    wanted = gsjax.with_sh_degree(wanted, degree)
+    config = CONFIG.replace(sh_degree=degree)
+    state = initial_state(scene, config, gsjax.select(given, keep))
+    assert int(state.step) == 0
+    active = np.asarray(state.gaussians.active)
+    assert active.sum() == keep.sum() > 0
+    for ours, theirs in zip(
+        jax.tree.leaves(state.gaussians.params), jax.tree.leaves(wanted.params)
+    ):
+        np.testing.assert_array_equal(ours[active], theirs)
+    few = replace(config.mcmc, max_gaussians=given.capacity - 1)
+    for count in (0, given.capacity):
+        some = gsjax.select(given, np.arange(given.capacity) < count)
+        told = f"^{count} Gaussians .* 1 to {given.capacity - 1} are wanted"
+        with pytest.raises(InputError, match=told):
+            initial_state(scene, config.replace(mcmc=few), some)
+
+
+def test_a_scene_that_was_trained_is_used_as_a_whole():
+    """All bands and the finest photographs, from the first steps on."""
+    config = preset("default")
+    assert config.divisor(0) > 1
+    changed = going_on(config)
+    assert changed.divisor(0) == 1
+    assert changed == config.replace(sh_every=1, levels=(Level(0.0, 1),))
+
+
+def test_a_run_starts_from_a_scene(made, capsys):
+    """And starts from it again where a kill came before anything was saved."""
+    splat, run = made / "run" / "splat.ply", made / "next"
+    settings = RunSettings(made / "data", going_on(CONFIG), start=splat)
+    assert start_run(settings, run).finished
+    told = capsys.readouterr().err
+    assert f"starting from the scene of {splat}\n" in told
+    assert load_settings(run).start == splat
+    first, *_ = read_metrics(run / "metrics.jsonl")
+    *_, last = read_metrics(made / "run" / "metrics.jsonl")
+    begun, *_ = read_metrics(made / "run" / "metrics.jsonl")
+    assert first["loss"] < begun["loss"]
+    assert first["gaussians"] == last["gaussians"]
+    before = (run / "splat.ply").read_bytes()
+    shutil.rmtree(run / "checkpoints")
+    (run / "splat.ply").unlink()
+    assert resume_run(run).finished
+    assert (run / "splat.ply").read_bytes() == before
+    shutil.rmtree(run / "checkpoints")
+    splat.unlink()
+    with pytest.raises(InputError, match=r"splat\.ply"):
+        resume_run(run)
+
+
+def test_a_scene_of_elsewhere_is_refused(made, tmp_path, monkeypatch, capsys):
+    """And one of too many, before photographs are read."""
+    monkeypatch.setattr(run_module, "load_photos", None)
+    given = gsjax.load(made / "run" / "splat.ply")
+    count, means = given.capacity, given.params.means + 1e3  # far out
+    gsjax.save(
+        tmp_path / "far.ply", given.replace(params=given.params.replace(means=means))
+    )
+    args = ["train", str(made / "data"), "-o", str(tmp_path / "new"), "--initial"]
+    few = ["--max-gaussians", str(count - 1)]
+    assert cli.main([*args, str(tmp_path / "far.ply")]) == 3
+    assert f"none of its {count} Gaussians is in the view" in capsys.readouterr().err
+    assert cli.main([*args, str(made / "run"), *few]) == 3
+    told = f"{count} Gaussians to start from; 1 to {count - 1} are wanted (max_g"
+    assert told in capsys.readouterr().err
+    gsjax.save(tmp_path / "bands.ply", gsjax.with_sh_degree(given, 2))
+    few += ["--sh-degree", "1"]
+    assert cli.main([*args, str(tmp_path / "bands.ply"), *few]) == 3
+    assert "SH degree 2 the run has 1 (--sh-degree)" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
 def test_looking_for_points_counts_as_training(whole, tmp_path, monkeypatch, capsys):
     """Where a kill came before anything was saved, it is done again, to the same."""
 
@@ -429,6 +514,62 @@ def test_the_same_options_again_go_on(made, monkeypatch):
         assert cli.main([*args, "--resume"]) == 130
         assert cli.main([*args, "--resume", "--initial", initial]) == 130
         assert cli.main([*args, "--resume", "--initial", other]) == 2
+
+
+def test_a_scene_to_start_from_is_named(made, monkeypatch, capsys):
+    """By its run or its file, once: a run that began so goes on without."""
+    begun, run = [], made / "next"
+
+    def train(settings, folder, **_):
+        begun.append(settings.start)
+        save_settings(folder, with_views(settings, load_data(settings)))
+        return RunResult(run_files(folder), False, 0, 0.0, 0, None)
+
+    monkeypatch.setattr(run_module, "start_run", train)
+    monkeypatch.setattr(
+        run_module, "resume_run", lambda folder, **_: train(load_settings(folder), run)
+    )
+    run.mkdir()
+    splat = (made / "run" / "splat.ply").resolve()
+    args = ["train", str(made / "data"), "-o", str(run), "--steps", "2"]
+    for given in (made / "run", splat):
+        assert cli.main([*args, "--initial", str(given)]) == 130
+        assert cli.main([*args, "--initial", str(given), "--resume"]) == 130
+        assert cli.main([*args, "--resume"]) == 130
+        assert begun == [splat] * 3
+        begun.clear()
+        (made / "other.ply").write_bytes(splat.read_bytes())
+        for other in ("dense", str(made / "other.ply")):
+            assert cli.main([*args, "--initial", other, "--resume"]) == 2
+            assert "leave out --steps, --initial" in capsys.readouterr().err
+        (run / "config.json").unlink()
+    refined = made / "run" / "cameras.json"
+    refined.write_text("[]")
+    assert cli.main([*args, "--initial", str(made / "run")]) == 130
+    assert "has refined cameras" in capsys.readouterr().err
+    assert begun == [splat]
+
+
+def test_what_is_no_scene_to_start_from_is_told(made, capsys):
+    data, run = str(made / "data"), str(made / "run")
+    before = contents(made / "run")
+
+    def told_of(*options: str, code: int) -> str:
+        assert cli.main(["train", data, *options]) == code
+        return capsys.readouterr().err
+
+    new = ["-o", str(made / "new")]
+    told = told_of(*new, "--initial", "densely", code=2)
+    assert "--initial densely: points, dense, random, the folder of a run, or" in told
+    assert "none.ply" in told_of(*new, "--initial", str(made / "none.ply"), code=3)
+    told = told_of(*new, "--initial", data, code=3)
+    assert "a dataset; train on it first" in told
+    told = told_of("-o", run, "--overwrite", "--initial", run, code=2)
+    assert "another folder with -o" in told
+    told = told_of(*new, "--initial", run, "--antialias", code=2)
+    assert "trained without --antialias, as a run from it must be" in told
+    assert contents(made / "run") == before
+    assert not (made / "new").exists()
 
 
 def test_a_distance_and_names_exclude_each_other(whole, tmp_path, capsys):

@@ -53,9 +53,10 @@ class TrainCommand(HeavyCommand):
     background: Literal["auto", "black", "white", "random"] | None = None
     """Behind the scene; default: auto, which is random where photographs are
     transparent, else black."""
-    initial: Literal["points", "dense", "random"] | None = None
+    initial: Literal["points", "dense", "random"] | Path | None = None
     """Start from the dataset's points; from those and many more on which the
-    photographs agree (the default); or from anywhere in view."""
+    photographs agree (the default); from anywhere in view; or from a scene of this
+    dataset, by the folder of its run or its .ply."""
     antialias: bool = False
     """Compensate thin splats for the blur of a pixel, to look right at other sizes."""
     absgrad: bool = False
@@ -147,7 +148,10 @@ class TrainCommand(HeavyCommand):
             if self.resume:  # after a kill before there was anything, too
                 note(f"{self.out} is no run yet; one is started there")
             result = start_run(
-                self._settings(), self.out, overwrite=self.overwrite, watch=watch
+                self._settings(self._start()),
+                self.out,
+                overwrite=self.overwrite,
+                watch=watch,
             )
         if not result.finished:
             note(f"stopped after step {result.step}; go on with --resume")
@@ -176,13 +180,15 @@ class TrainCommand(HeavyCommand):
             if field.name not in _OF_A_SITTING
             and getattr(self, field.name) != field.default
         ]
-        mine = self._settings()
         # What is left open was decided when the run began.
-        if self.test_every is None:
-            mine = replace(mine, every=settings.every)
         if self.initial is None:
+            mine = self._settings(settings.start)
             config = mine.config.replace(initial=settings.config.initial)
             mine = replace(mine, config=config)
+        else:
+            mine = self._settings(self._start())
+        if self.test_every is None:
+            mine = replace(mine, every=settings.every)
         same = {"dataset": None, "trained": (), "held_out": ()}
         if given and replace(mine, **same) != replace(settings, **same):
             raise UsageError(
@@ -198,20 +204,55 @@ class TrainCommand(HeavyCommand):
                     f"--{name.replace('_', '-')} {value}: {least} to {2**31 - 2:,}"
                 )
 
-    def _settings(self):
-        from gsjax.train.config import preset, scaled
+    def _start(self) -> Path | None:
+        """The PLY of the scene to start from, if that is what is wanted."""
+        from gsjax.subjects import is_run, splat_file
+        from gsjax.train.folder import load_settings, run_files
+
+        given = self.initial
+        if not isinstance(given, Path):
+            return None
+        if not given.suffix and not given.exists():
+            raise UsageError(
+                f"--initial {given}: points, dense, random, the folder of a run, or a "
+                ".ply is wanted"
+            )
+        splat = splat_file(given).resolve()
+        if splat == run_files(self.out).splat.resolve():
+            raise UsageError(
+                f"--initial {given}: is what the run in {self.out} makes; give the new "
+                "one another folder with -o"
+            )
+        if not is_run(given):
+            return splat
+        if load_settings(given).config.raster.antialias != self.antialias:
+            told = "without" if self.antialias else "with"
+            raise UsageError(
+                f"{given} was trained {told} --antialias, as a run from it must be"
+            )
+        if run_files(given).cameras.exists():
+            note(
+                f"warning: {given} has refined cameras; this run starts from those of "
+                "the dataset"
+            )
+        return splat
+
+    def _settings(self, start: Path | None):
+        from gsjax.train.config import going_on, preset, scaled
         from gsjax.train.folder import RunSettings
 
         self._check_ranges()
         config = preset(self.preset)
         if self.steps is not None:
             config = scaled(config, self.steps)
+        if start is not None:
+            config = going_on(config)
         changes = {
             "strategy": self.strategy,
             "max_size": self.max_size,
             "sh_degree": self.sh_degree,
             "background": self.background,
-            "initial": self.initial,
+            "initial": self.initial if start is None else None,
             "every_checkpoint": self.checkpoint_every,
             "every_eval": self.eval_every,
         }
@@ -245,4 +286,5 @@ class TrainCommand(HeavyCommand):
             skip_missing=self.skip_missing,
             every=self.test_every,
             test_images=self.test_images or (),
+            start=start,
         )

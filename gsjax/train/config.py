@@ -216,6 +216,13 @@ def scaled(config: TrainConfig, steps: int) -> TrainConfig:
     )
 
 
+def going_on(config: TrainConfig) -> TrainConfig:
+    """The same run for a scene that was trained before: what such a scene has of
+    harmonics and of detail is used from the first steps on."""
+    finest = Level(0.0, config.levels[-1].divisor)
+    return config.replace(sh_every=1, levels=(finest,))
+
+
 def preset(name: str) -> TrainConfig:
     """Settings by name.
 

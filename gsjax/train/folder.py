@@ -50,6 +50,8 @@ class RunSettings:
       images, factor, skip_missing: as for `load_dataset`.
       every: hold out every so many-th view; 0 for none, None as the dataset says.
       test_images: hold out these instead.
+      start: a PLY, in the dataset's coordinates: the Gaussians to start from, instead
+        of what the config says.
       trained, held_out: names of the views, once they were split; they stay so, and
         what a dataset holds later is held against them.
     """
@@ -61,6 +63,7 @@ class RunSettings:
     skip_missing: bool = False
     every: int | None = None
     test_images: tuple[str, ...] = ()
+    start: Path | None = None
     trained: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ()
 
@@ -198,6 +201,8 @@ def load_settings(folder: Path) -> RunSettings:
         rest = {k: v for k, v in data.items() if k not in ("format", "train")}
         check_kinds(RunSettings, rest)
         rest["dataset"] = Path(rest["dataset"])
+        if rest.get("start") is not None:
+            rest["start"] = Path(rest["start"])
         if "trained" not in rest and rest.get("every") == 8:
             rest["every"] = None  # an old run: the dataset's own split went before
         for name in ("test_images", "trained", "held_out"):
@@ -233,7 +238,9 @@ def save_settings(folder: Path, settings: RunSettings) -> None:
       InputError: if it cannot be written.
     """
     data = {k: v for k, v in vars(settings).items() if k != "config"}
-    data["dataset"] = str(settings.dataset.resolve())
+    for name in ("dataset", "start"):
+        if data[name] is not None:
+            data[name] = str(data[name].resolve())
     train = json.loads(to_json(settings.config))
     told = {"format": _FORMAT, **data, "train": train}
     write_json(run_files(folder).config, told, indent=2)

@@ -95,6 +95,31 @@ def check_points(scene: Scene) -> None:
         )
 
 
+def check_in_view(scene: Scene, means: np.ndarray, source: str) -> None:
+    """See that some of the Gaussians that a run is to start from are in a picture.
+
+    Args:
+      scene: its views.
+      means: [N, 3] in the scene's coordinates.
+      source: where they are from.
+
+    Raises:
+      InputError: if the centre of none is: they are no scene of these photographs.
+    """
+    for view in scene.views:
+        x, y, z = view.viewmat[:3, :3] @ means.T + view.viewmat[:3, 3:]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            u, v, _ = view.K @ np.stack([x / z, y / z, np.ones_like(z)])
+        inside = (z > view.near) & (u >= 0) & (u <= view.width)
+        if np.any(inside & (v >= 0) & (v <= view.height)):
+            return
+    raise InputError(
+        f"{source}: none of its {len(means):,} Gaussians is in the view of any of the "
+        f"{len(scene.views)} cameras of {scene.source}; a scene of this dataset is "
+        "wanted, in its coordinates"
+    )
+
+
 class _Depths(NamedTuple):
     """Of points in all views: how many lie before the camera, how many of them far
     enough to be drawn, and how far the farthest is."""

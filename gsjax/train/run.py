@@ -26,12 +26,14 @@ from gsjax.train.folder import (
     RunFiles,
     RunSettings,
     load_data,
+    load_scene,
     load_settings,
     run_files,
     save_settings,
     with_views,
 )
 from gsjax.train.footprint import check_memory
+from gsjax.train.health import check_in_view
 from gsjax.train.history import keep_steps, read_metrics, write_curves
 from gsjax.train.sitting import (
     Sitting,
@@ -105,10 +107,11 @@ def start_run(
             f"{folder}: is the dataset's own folder; pass another one with -o"
         )
     data = load_data(settings)
-    settings = replace(with_views(settings, data), config=_begun(settings.config, data))
-    sitting = Sitting(settings.config, data, run_files(folder), Start())
+    settings = replace(with_views(settings, data), config=_begun(settings, data))
+    start = Start(_given_state(settings, data))
+    sitting = Sitting(settings.config, data, run_files(folder), start)
     photos = _photographs(sitting)
-    state = _first_state(sitting, photos)
+    state = start.state or _first_state(sitting, photos)
     make_folder(folder)
     with alone_in(folder):
         # By now another may have been here.
@@ -150,8 +153,11 @@ def _remove(path: Path) -> None:
             path.unlink()
 
 
-def _begun(config: TrainConfig, data: Data) -> TrainConfig:
+def _begun(settings: RunSettings, data: Data) -> TrainConfig:
     """With what the run starts from, which it keeps when it is gone on with."""
+    config = settings.config
+    if settings.start is not None:
+        return config
     decided = with_initial(subset(data.scene, data.train), config)
     if config.initial == "auto" and decided.initial == "random":
         note("the dataset has no points: starting from random ones (--initial random)")
@@ -193,12 +199,39 @@ def _resumed(folder: Path, dataset: Path | None, watch: Watch | None) -> RunResu
         else:
             note(
                 f"finished before, with step {start.step:,}: nothing is left to train; "
-                "its results are made anew"
+                "its results are made anew. For more steps, start another run from it "
+                f"(--initial {folder})"
             )
+    else:
+        start = Start(_given_state(settings, data))
     sitting = Sitting(settings.config, data, files, start)
     photos = _photographs(sitting)
     state = start.state or _first_state(sitting, photos)
     return _train(sitting, photos, state, watch)
+
+
+def _given_state(settings: RunSettings, data: Data) -> TrainState | None:
+    """A run before its first step, where it starts from a scene.
+
+    Raises:
+      InputError: if that is not there, or damaged, or of another dataset, or more than
+        there may be.
+    """
+    path, config = settings.start, settings.config
+    if path is None:
+        return None
+    gaussians, scene = (
+        load_scene(path, data.scene.origin),
+        subset(data.scene, data.train),
+    )
+    check_in_view(scene, np.asarray(gaussians.params.means), str(path))
+    had, has = gaussians.sh_degree, config.sh_degree
+    cut = f", of whose SH degree {had} the run has {has} (--sh-degree)"
+    note(f"starting from the scene of {path}{cut if had > has else ''}")
+    try:
+        return initial_state(scene, config, gaussians)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def _last_checkpoint(files: RunFiles, config: TrainConfig, scene: Scene) -> Start:

@@ -6,7 +6,8 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from gsjax.gaussians import Gaussians, make_gaussians
+from gsjax.errors import InputError
+from gsjax.gaussians import Gaussians, compact, make_gaussians, with_sh_degree
 from gsjax.scene.dense import find_points
 from gsjax.scene.initialise import extent_of, has_points, init_gaussians
 from gsjax.scene.types import Photo, Scene
@@ -57,16 +58,25 @@ def with_dense(scene: Scene, photos: Sequence[Photo], config: TrainConfig) -> Sc
     )
 
 
-def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
+def initial_state(
+    scene: Scene, config: TrainConfig, gaussians: Gaussians | None = None
+) -> TrainState:
     """A run on this scene before its first step.
 
     Args:
       scene: from `with_dense`, if more points than the dataset's are wanted.
-      config: the settings.
+      config: the settings; for Gaussians that were trained before, see
+        `gsjax.train.config.going_on`.
+      gaussians: to start from, in the scene's coordinates, instead of what
+        `TrainConfig.initial` says. Bands of their harmonics are cut, or added as zeros.
 
     Raises:
-      InputError: as `with_initial`.
+      InputError: as `with_initial`; if there are no such Gaussians, or more than there
+        may be.
     """
+    extent, views = extent_of(scene), len(scene.views)
+    if gaussians is not None:
+        return _begun(_with_slots(gaussians, config), config, extent, views)
     config = with_initial(scene, config)
     drawn = config.initial == "random" or not has_points(scene)
     gaussians = init_gaussians(
@@ -79,7 +89,19 @@ def initial_state(scene: Scene, config: TrainConfig) -> TrainState:
         capacity=lambda count: slots_for(count, 0, config),
         seed=config.seed,
     )
-    return _begun(gaussians, config, extent_of(scene), len(scene.views))
+    return _begun(gaussians, config, extent, views)
+
+
+def _with_slots(gaussians: Gaussians, config: TrainConfig) -> Gaussians:
+    """The same, of the run's degree, in as many slots as it begins with."""
+    count, most = int(np.sum(gaussians.active)), config.max_gaussians
+    if not 1 <= count <= most:
+        raise InputError(
+            f"{count:,} Gaussians to start from; 1 to {most:,} are wanted "
+            "(max_gaussians, --max-gaussians)"
+        )
+    gaussians = with_sh_degree(gaussians, config.sh_degree)
+    return compact(gaussians, slots_for(count, 0, config))
 
 
 def _begun(
