@@ -46,6 +46,7 @@ READ: dict[str, Callable[[Path], object]] = {
     "scene.ply": gsjax.load,
     "ascii.ply": gsjax.load,
     "cloud.ply": read_point_cloud,
+    "scene.spz": gsjax.load,
     "sparse/0/cameras.bin": colmap_binary.read_cameras,
     "sparse/0/images.bin": colmap_binary.read_images,
     "sparse/0/points3D.bin": colmap_binary.read_points,
@@ -74,6 +75,7 @@ def write_good_files(folder: Path) -> None:
     with jax.enable_x64(False):
         gaussians = init_gaussians(SCENE, sh_degree=0)
     gsjax.save(folder / "scene.ply", gaussians)
+    gsjax.save(folder / "scene.spz", gaussians)
     (folder / "ascii.ply").write_bytes(as_ascii((folder / "scene.ply").read_bytes()))
     cloud = "ply\nformat ascii 1.0\nelement vertex 2\n"
     cloud += "".join(f"property float {axis}\n" for axis in "xyz")

@@ -21,7 +21,8 @@ import numpy as np
 from gsjax.errors import InputError
 from gsjax.files import opened, replacing
 from gsjax.gaussians import Gaussians, make_gaussians
-from gsjax.io.ply_header import Header, check_properties, check_size, read_header, warn
+from gsjax.io.common import require_new, warn
+from gsjax.io.ply_header import Header, check_properties, check_size, read_header
 from gsjax.io.ply_rows import CHUNK_ROWS, read_rows
 from gsjax.memory import Estimate, require
 
@@ -216,12 +217,7 @@ def write_ply(
         missing, or if it cannot be written.
     """
     path = Path(path)
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; pass the name of a file")
-    if path.exists() and not overwrite:
-        raise InputError(f"{path}: exists; pass overwrite=True or another name")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: the folder {path.parent} is missing; create it")
+    require_new(path, overwrite)
     with replacing(path, durable=True) as file:
         nonfinite = _write_body(file, gaussians)
     if nonfinite:

@@ -5,12 +5,12 @@ The sizes that a header declares are checked here before anything is allocated.
 
 import os
 import re
-import warnings
 from collections.abc import Collection
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from gsjax.errors import InputError
+from gsjax.io.common import warn
 from gsjax.sh import MAX_DEGREE, num_bases
 
 _TYPES = {
@@ -61,11 +61,6 @@ class Header(NamedTuple):
     after: list[Element]
     body: int
     size: int
-
-
-def warn(message: str) -> None:
-    """Warn on behalf of the caller of the calling function."""
-    warnings.warn(message, UserWarning, stacklevel=3)
 
 
 def read_header(file: BinaryIO, path: Path) -> Header:

@@ -8,8 +8,9 @@ from typing import BinaryIO
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.io.common import warn
 from gsjax.io.numerals import BLOCK, find_words, parse_number, parse_numbers
-from gsjax.io.ply_header import Header, warn
+from gsjax.io.ply_header import Header
 
 CHUNK_ROWS = 1 << 14
 # Of a row as text: per value, and besides.

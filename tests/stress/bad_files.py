@@ -1,5 +1,6 @@
 """Bad files of every format, made of good ones: what is done to them, and the error."""
 
+import gzip
 import io
 import json
 import struct
@@ -35,6 +36,11 @@ def put(at: int, form: str, *values):
     """Overwrites numbers at a byte."""
     raw = struct.pack("<" + form, *values)
     return lambda data: data[:at] + raw + data[at + len(raw) :]
+
+
+def unpacked(change: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """What is done to what a gzip file holds."""
+    return lambda data: gzip.compress(change(gzip.decompress(data)))
 
 
 def constant(data: bytes | str):
@@ -215,6 +221,28 @@ BAD = {
         "ascii.ply",
         lambda d: d[:-2] + "\uff11\n".encode(),
         r"vertex 3 \(byte \d+\): could not convert",
+    ),
+    # SPZ
+    "spz empty": Bad("scene.spz", constant(b""), "begins with b'' where"),
+    "spz of something": Bad(
+        "scene.spz", constant(png(4, 4)), "no SPZ file, damaged .*gzip"
+    ),
+    "spz magic": Bad(
+        "scene.spz", unpacked(swap("NGSP", "PSGN")), "b'PSGN.*where an SPZ file has"
+    ),
+    "spz of later": Bad("scene.spz", gzip.decompress, "version 4 or later"),
+    "spz version": Bad("scene.spz", unpacked(put(4, "I", 9)), "version 9 in its head"),
+    "spz degree": Bad("scene.spz", unpacked(put(12, "B", 7)), "degree 7 .* 0 to 4"),
+    "spz fraction": Bad("scene.spz", unpacked(put(13, "B", 99)), "fraction 99 in its"),
+    "spz count": Bad(
+        "scene.spz", unpacked(put(8, "I", 4_000_000_000)), "bytes cannot hold so many"
+    ),
+    "spz count, a little": Bad(
+        "scene.spz", unpacked(put(8, "I", 5)), "within quats: 0 of 20 bytes"
+    ),
+    "spz cut within": Bad("scene.spz", unpacked(lambda d: d[:-5]), "within quats"),
+    "spz checksum": Bad(
+        "scene.spz", lambda d: d[:-8] + bytes(4) + d[-4:], "damaged .*CRC"
     ),
     "cloud without y": Bad(
         "cloud.ply", swap("float y", "float why"), "x, y, z are wan"

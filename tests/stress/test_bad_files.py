@@ -206,6 +206,7 @@ PHOTOS = [name for name in READ if name.startswith("photo.")]
 # A command that reads each of the files.
 COMMANDS = {
     "scene.ply": ["info", "scene.ply"],
+    "scene.spz": ["info", "scene.spz"],
     "ascii.ply": ["export", "ascii.ply", "out.ply"],
     "cloud.ply": ["train", "with_cloud.json", "-o", "run"],
     **{name: ["train", ".", "-o", "run"] for name in MODEL},
