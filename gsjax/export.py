@@ -24,7 +24,7 @@ def export_scene(
     """Write the Gaussians of a file or run to ``out``, in the coordinates they have.
 
     Args:
-      source: a .ply file, or the folder of a run.
+      source: a .ply or .spz file, or the folder of a run.
       out: the file; its folder is created if missing.
       sh_degree: of what is written; bands are cut, or added as zeros.
       min_opacity: what is less opaque is left out.

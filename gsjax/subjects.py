@@ -1,4 +1,4 @@
-"""What the commands are given as a scene: a .ply file, or the folder of a run."""
+"""What the commands are given as a scene: a file, or the folder of a run."""
 
 from collections.abc import Callable
 from functools import partial
@@ -75,7 +75,7 @@ def open_subject(
     """A scene by its file or run.
 
     Args:
-      path: a .ply file, or the folder of a run.
+      path: a .ply or .spz file, or the folder of a run.
       origin: [3] what is subtracted from the file's coordinates, as it is from those
         of the cameras that `load_dataset` or `load_near_transforms` gives.
       preset: name of the constants to render with; None takes those of the run, with

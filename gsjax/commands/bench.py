@@ -25,7 +25,7 @@ class BenchCommand(HeavyCommand):
     allows it."""
 
     scene: Annotated[Positional[str], arg(metavar="RUN|PLY|NAME")] = "knot"
-    """The folder of a run, a .ply file, or built in: knot, fog, needles or huge."""
+    """The folder of a run, a .ply or .spz, or built in: knot, fog, needles or huge."""
     cameras: Path | None = None
     """First camera of this transforms.json; else the scene's own, or one facing it."""
     size: Annotated[str | None, arg(metavar="WxH")] = None

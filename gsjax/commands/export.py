@@ -1,4 +1,4 @@
-"""`gsjax export`: a scene to a .ply that viewers read."""
+"""`gsjax export`: a scene to a file that viewers read."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +12,14 @@ from gsjax.console import say
 
 @dataclass(kw_only=True)
 class ExportCommand(HeavyCommand):
-    """Write a scene as a standard PLY, in the coordinates of its dataset."""
+    """Write a scene as a standard PLY, or as a smaller .spz or .splat, in the
+    coordinates of its dataset."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
-    """The Gaussians: a .ply file, or the folder of a run."""
+    """The Gaussians: a .ply or .spz file, or the folder of a run."""
     out: Annotated[Positional[Path], arg(metavar="OUT.ply")]
-    """The file to write; folders above it are created."""
+    """The file to write: .ply, .spz, about a fifth as large, or .splat, without
+    harmonics; folders above it are created."""
     sh_degree: Literal[0, 1, 2, 3, 4] | None = None
     """Degree of the spherical harmonics: higher ones are cut, lower ones filled up
     with zeros (some viewers read degree 3 only)."""

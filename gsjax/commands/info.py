@@ -16,7 +16,7 @@ class InfoCommand(HeavyCommand):
     """Say what a scene consists of, and how a run went."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
-    """The Gaussians: a .ply file, or the folder of a run."""
+    """The Gaussians: a .ply or .spz file, or the folder of a run."""
     json: bool = False
     """Print JSON."""
     plot: Annotated[Path | None, arg(metavar="OUT.png")] = None

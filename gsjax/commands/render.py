@@ -26,7 +26,7 @@ class RenderCommand(HeavyCommand):
     """Render a scene from a list of cameras or along a path: images or a movie."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
-    """The Gaussians: a .ply file, or the folder of a run."""
+    """The Gaussians: a .ply or .spz file, or the folder of a run."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|MOVIE")]
     """Folder for the images, created if missing; or a movie: .gif, .webp or .webm."""
     cameras: Path | None = None

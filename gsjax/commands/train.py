@@ -56,7 +56,7 @@ class TrainCommand(HeavyCommand):
     initial: Literal["points", "dense", "random"] | Path | None = None
     """Start from the dataset's points; from those and many more on which the
     photographs agree (the default); from anywhere in view; or from a scene of this
-    dataset, by the folder of its run or its .ply."""
+    dataset, by the folder of its run or its .ply or .spz."""
     antialias: bool = False
     """Compensate thin splats for the blur of a pixel, to look right at other sizes."""
     absgrad: bool = False
@@ -215,7 +215,7 @@ class TrainCommand(HeavyCommand):
         if not given.suffix and not given.exists():
             raise UsageError(
                 f"--initial {given}: points, dense, random, the folder of a run, or a "
-                ".ply is wanted"
+                ".ply or .spz is wanted"
             )
         splat = splat_file(given).resolve()
         if splat == run_files(self.out).splat.resolve():

@@ -19,7 +19,7 @@ class ViewCommand(HeavyCommand):
     """Look at a scene in the browser; needs the extra gsjax[viewer]."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
-    """The Gaussians: a .ply file, or the folder of a run."""
+    """The Gaussians: a .ply or .spz file, or the folder of a run."""
     html: Annotated[Path | None, arg(metavar="OUT.html")] = None
     """Write one page that opens offline instead of serving."""
     min_opacity: float = 0.0

@@ -43,7 +43,7 @@ def save(
     path: str | PathLike[str], gaussians: Gaussians, *, overwrite: bool = False
 ) -> None:
     """Write the active Gaussians, in the format of the suffix of ``path``: .ply as they
-    are; .spz, a tenth as large, and .splat rounded.
+    are; .spz, a fifth as large, and .splat rounded.
 
     Args:
       path: the file to write; it appears complete or not at all.

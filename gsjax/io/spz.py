@@ -1,4 +1,4 @@
-"""Gaussians in SPZ files, a tenth as large as a PLY.
+"""Gaussians in SPZ files, a fifth as large as a PLY.
 
 A gzip stream of a header and then, each for all Gaussians: means in 24 bits a number,
 opacities, colours and log scales in 8, quaternions in 32 bits together, and harmonics

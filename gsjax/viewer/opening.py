@@ -51,7 +51,7 @@ def open_exhibit(
     A dataset that is not there any more costs the cameras, and a warning.
 
     Args:
-      path: a .ply file, or the folder of a run.
+      path: a .ply or .spz file, or the folder of a run.
       up: of the world, of `UPS`; None takes it from the cameras, or else −y, which is
         up in most scenes from COLMAP.
       preset: as `open_subject`.
