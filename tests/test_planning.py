@@ -65,7 +65,7 @@ def planned(gaussians, views, **options):
 def as_fitting(monkeypatch):
     """No programs are compiled to ask for capacities."""
 
-    def fit(gaussians, _, config):
+    def fit(gaussians, _, config, __):
         return config.replace(visible_capacity=gaussians.capacity), []
 
     monkeypatch.setattr(planning, "with_capacities", fit)

@@ -253,7 +253,7 @@ def write_spz(
     header = _HEADER.pack(_MAGIC, 3, count, degree, fraction, 0, 0)
     with (
         replacing(path, durable=True) as file,
-        gzip.GzipFile("", "wb", fileobj=file, mtime=0) as stream,
+        gzip.GzipFile("", "wb", 6, file, mtime=0) as stream,
     ):
         stream.write(header)
         whole = np.ascontiguousarray(means.astype("<i4")).view(np.uint8)

@@ -1,6 +1,7 @@
 """The coarsest α cut, cap and stop that keep within an error."""
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,7 @@ from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.planning import bounds
 from gsjax.planning.types import Reason
 from gsjax.raster.render import exact_config, render_exact
-from gsjax.raster.types import RasterConfig
+from gsjax.raster.types import Demand, RasterConfig
 
 # Two roundings of one picture in float32 were up to 2e-5 apart.
 ROUNDING = 2e-5
@@ -22,14 +23,27 @@ _REFERENCE_CUT, _REFERENCE_STOP = 1e-5, 1e-6
 _LARGEST_CUT = 0.05
 
 
+class Measured(NamedTuple):
+    """What was found with an α cut.
+
+    Attributes:
+      error: largest of a colour, on the cameras given.
+      demands: what each of these views wants.
+    """
+
+    error: float
+    demands: list[Demand]
+
+
 def within_budget(
     gaussians: Gaussians,
     views: list[Camera],
     config: RasterConfig,
     background: Sequence[float],
     budget: float,
-) -> tuple[RasterConfig, list[Reason], float | None]:
-    """``config`` with the coarsest cut and stop that keep within ``budget``.
+) -> tuple[RasterConfig, list[Reason], Measured | None]:
+    """``config`` with the coarsest cut and stop that keep within ``budget``, why, and
+    what was measured with these; None where bounds alone decided.
 
     Raises:
       InputError: if colours are so far apart that not even the finest do.
@@ -76,10 +90,10 @@ def within_budget(
         gaussians, views, config, background, (budget / margin, least)
     )
     why = (
-        f"{cut:.3g}: {255 * measured:.3g}/255 off at most on {len(views)} "
+        f"{cut:.3g}: {255 * measured.error:.3g}/255 off at most on {len(views)} "
         f"camera{'s' * (len(views) != 1)}, times {margin:.2g} for those not seen"
     )
-    told.append(Reason("alpha_cut", why, margin * measured, "estimate"))
+    told.append(Reason("alpha_cut", why, margin * measured.error, "estimate"))
     return config.replace(alpha_cut=cut), told, measured
 
 
@@ -114,8 +128,8 @@ def _measured_cut(
     config: RasterConfig,
     background: Sequence[float],
     limits: tuple[float, float],
-) -> tuple[float, float]:
-    """(cut, error) of the coarsest cut found with an error of at most ``limits[0]``.
+) -> tuple[float, Measured]:
+    """The coarsest cut found with an error of at most ``limits[0]``.
 
     The error is nearly in proportion to the cut, so a few rounds do. ``limits[1]`` is
     the cut of the reference, and what remains if none does.
@@ -127,31 +141,33 @@ def _measured_cut(
     # Finer than all trials: what it has room for is room enough for them.
     fitted = exact_config(gaussians, views[0], exact).pair_capacity or 1
     room = capacity_bucket(fitted)
-    wanted = list(_pictures(gaussians, views, exact, background, room))
-    best = least
-    error = float("inf")
+    wanted, demands = zip(*_pictures(gaussians, views, exact, background, room))
+    best, found = least, Measured(float("inf"), list(demands))
     # Coarser has failed, or would be coarser than is sensible.
     failed, cut = _LARGEST_CUT * 1.01, _rounded(max(allowed / 12, 2 * least))
     for _ in range(_ROUNDS):
         trial = config.replace(alpha_cut=cut, outputs=("rgb",))
-        found = _pictures(gaussians, views, trial, background, room)
-        largest = max(float(np.abs(a - b).max()) for a, b in zip(found, wanted))
+        largest, demands = 0.0, []
+        trials = _pictures(gaussians, views, trial, background, room)
+        for (picture, demand), exactly in zip(trials, wanted):
+            largest = max(largest, float(np.abs(picture - exactly).max()))
+            demands.append(demand)
         # The error is about in proportion to the cut, and so is the reference's own.
         largest *= cut / (cut - least)
         if largest <= allowed:
-            best, error = cut, largest
+            best, found = cut, Measured(largest, demands)
             if largest > 0.7 * allowed:
                 break
         else:
             failed = cut
             if best == least:
-                error = largest * least / cut
+                found = found._replace(error=largest * least / cut)
         step = 0.9 * allowed / max(largest, allowed / 20)
         aim = min(cut * step, np.sqrt(best * failed) if failed < cut * step else 1)
         cut = _rounded(float(np.clip(aim, best, _LARGEST_CUT)))
         if cut <= best * 1.05:
             break
-    return best, error
+    return best, found
 
 
 def _pictures(
@@ -160,11 +176,12 @@ def _pictures(
     config: RasterConfig,
     background: Sequence[float],
     room: int,
-) -> Iterator[np.ndarray]:
-    """rgb [H, W, 3] of each camera, with ``room`` for pairs, or more."""
+) -> Iterator[tuple[np.ndarray, Demand]]:
+    """rgb [H, W, 3] of each camera, with ``room`` for pairs, or more, and what it
+    wants."""
     behind = jnp.asarray(background, gaussians.params.means.dtype)
     for view in views:
         config = config.replace(rungs=1, pair_capacity=room, visible_capacity=None)
         result = render_exact(gaussians, view, config, behind)
         room = max(room, capacity_bucket(int(result.demand.capacity)))
-        yield np.asarray(result.rgb)
+        yield np.asarray(result.rgb), result.demand

@@ -90,9 +90,11 @@ def plan(
             f"of {jax.default_backend()}, not timed (tune=True does)",
         )
     reasons.append(told)
-    config, told = with_capacities(gaussians, views, config)
+    demands = None if measured is None or tune else measured.demands
+    config, told = with_capacities(gaussians, views, config, demands)
     reasons += told
-    return Plan(gaussians, config, tuple(reasons), budget, measured)
+    error = None if measured is None else measured.error
+    return Plan(gaussians, config, tuple(reasons), budget, error)
 
 
 def trimmed(gaussians: Gaussians, config: RasterConfig) -> Gaussians:

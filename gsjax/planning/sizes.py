@@ -1,18 +1,21 @@
 """Slots, capacities, tiles and chunks for a scene and its cameras."""
 
 from collections.abc import Sequence
-from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gsjax.cameras import Camera
-from gsjax.gaussians import Gaussians, capacity_bucket, compact, select
+from gsjax.gaussians import Gaussians, compact, select
 from gsjax.memory import size_text
 from gsjax.planning import bounds
 from gsjax.planning.types import Reason
-from gsjax.raster.render import exact_config, render, render_estimate, render_exact
+from gsjax.raster.render import (
+    count_demand,
+    exact_config,
+    render_estimate,
+    render_exact,
+)
 from gsjax.raster.types import Demand, RasterConfig
 from gsjax.timing import time_ms
 
@@ -38,21 +41,21 @@ def shown(
 
 
 def with_capacities(
-    gaussians: Gaussians, views: list[Camera], config: RasterConfig
+    gaussians: Gaussians,
+    views: list[Camera],
+    config: RasterConfig,
+    demands: Sequence[Demand] | None = None,
 ) -> tuple[RasterConfig, list[Reason]]:
-    """``config`` with room for what the cameras ask for and an eighth more."""
-    fitted = exact_config(gaussians, views[0], config)
-    room = fitted.pair_capacity or 1
-    light = config.replace(outputs=("alpha",), rungs=1, visible_capacity=None)
-    pairs = seen = 1
-    for view in views:
-        while True:
-            demand = _demand(gaussians, view, light.replace(pair_capacity=room))
-            wanted = int(demand.capacity)
-            if wanted <= room:
-                break
-            room = capacity_bucket(wanted)
-        pairs, seen = max(pairs, wanted), max(seen, int(demand.visible))
+    """``config`` with room for what the cameras ask for and an eighth more.
+
+    Args:
+      demands: of these cameras with that config, where they are known.
+    """
+    if demands is None:
+        unlimited = config.replace(visible_capacity=None)
+        demands = [count_demand(gaussians, view, unlimited) for view in views]
+    pairs = max(1, *(int(demand.capacity) for demand in demands))
+    seen = max(1, *(int(demand.visible) for demand in demands))
     visible = min(_roomy(seen), gaussians.capacity)
     reasons = [
         Reason("visible_capacity", f"{visible:,}: at most {seen:,} are in a view"),
@@ -64,11 +67,6 @@ def with_capacities(
     estimate = render_estimate(gaussians.capacity, bases, size, config)
     told = f"about {size_text(estimate.total)} for a picture of {size[0]} × {size[1]}"
     return config, [*reasons, Reason("memory", told)]
-
-
-@partial(jax.jit, static_argnames="config")
-def _demand(gaussians: Gaussians, camera: Camera, config: RasterConfig) -> Demand:
-    return render(gaussians, camera, config).demand
 
 
 def _roomy(count: int) -> int:
