@@ -12,6 +12,8 @@ from gsjax.commands.common import UsageError, parse_budget
 from gsjax.errors import InputError
 from gsjax.planning import accuracy, bounds
 from gsjax.planning import plan as planning
+from gsjax.raster import render as render_module
+from gsjax.raster.render import count_demand, render_at_cut
 from gsjax.sh import sh_basis
 from gsjax.subjects import Subject
 from gsjax.views import prepared
@@ -89,6 +91,45 @@ def test_fog_keeps_its_budget_on_cameras_not_seen(foggy, report):
     assert error > 0.05 * BUDGET
     assert reason(made, "alpha_cut").basis == "estimate"
     assert not made.bounded
+
+
+@pytest.mark.parametrize(
+    ("platform", "config"), [("cpu", EXACT.replace(occlusion=True)), ("gpu", CONFIG)]
+)
+def test_one_program_draws_with_any_cut(platform, config, monkeypatch):
+    """What it draws is what the cut's own program draws."""
+    monkeypatch.setattr(jax, "default_backend", lambda: platform)
+    scene = fog({"cpu": 300, "gpu": 310}[platform])  # each is traced by itself
+    (view,), behind = looking(1, 2), jnp.asarray(BEHIND)
+    before = render_module._at_cut_jit._cache_size()
+    fine, coarse = (render_at_cut(scene, view, config, behind, c) for c in (1e-5, 0.01))
+    assert render_module._at_cut_jit._cache_size() == before + 1
+    wanted = gsjax.render_exact(scene, view, config.replace(alpha_cut=0.01), behind)
+    np.testing.assert_allclose(coarse.rgb, wanted.rgb, rtol=0, atol=1e-12)
+    assert int(coarse.demand.capacity) == int(wanted.demand.capacity)
+    assert float(jnp.abs(coarse.rgb - fine.rgb).max()) > 0.01
+
+
+def test_a_plan_compiles_one_program_to_measure(foggy):
+    """And none to ask for capacities: the pictures tell what they want."""
+    scene, made = foggy
+    before = render_module._at_cut_jit._cache_size(), _demands()
+    again = planned(scene, looking(4, 0), budget=0.7 * BUDGET)
+    assert again.config.alpha_cut < made.config.alpha_cut
+    # Where it stops is another, and these splats want more room than most.
+    assert render_module._at_cut_jit._cache_size() <= before[0] + 2
+    assert _demands() == before[1]
+    unlimited = again.config.replace(visible_capacity=None)
+    views = looking(4, 0)
+    counted = [count_demand(again.gaussians, view, unlimited) for view in views]
+    pairs = max(int(demand.capacity) for demand in counted)
+    assert f"views ask for {pairs:,} at most" in reason(again, "pair_capacity").why
+    seen = max(int(demand.visible) for demand in counted)
+    assert f"at most {seen:,} are in" in reason(again, "visible_capacity").why
+
+
+def _demands() -> int:
+    return render_module._demand_jit._cache_size()
 
 
 def test_reasons_add_up_and_are_told(foggy):

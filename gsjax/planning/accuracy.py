@@ -1,6 +1,7 @@
 """The coarsest α cut, cap and stop that keep within an error."""
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.planning import bounds
 from gsjax.planning.types import Reason
-from gsjax.raster.render import exact_config, render_exact
+from gsjax.raster.render import render_at_cut
 from gsjax.raster.types import Demand, RasterConfig
 
 # Two roundings of one picture in float32 were up to 2e-5 apart.
@@ -19,8 +20,9 @@ ROUNDING = 2e-5
 _ROUNDS = 5
 _STOP_SHARE = 1 / 16
 _CAP = 1 - 1e-6
-_REFERENCE_CUT, _REFERENCE_STOP = 1e-5, 1e-6
+_REFERENCE_CUT, _LEAST_STOP = 1e-5, 1e-6
 _LARGEST_CUT = 0.05
+_TILES = 8  # of a Gaussian, to begin with
 
 
 class Measured(NamedTuple):
@@ -50,7 +52,7 @@ def within_budget(
     """
     spread = bounds.color_range(gaussians, background)
     share = _STOP_SHARE * budget
-    stop = float(np.clip(share / max(spread, 1e-9), _REFERENCE_STOP, 1e-2))
+    stop = float(np.clip(share / max(spread, 1e-9), _LEAST_STOP, 1e-2))
     stop = _rounded(stop)
     config = config.replace(alpha_cap=_CAP, stop=stop, stop_rule="after")
     stopping = bounds.stop_error(stop, "after", _CAP, spread)
@@ -135,21 +137,17 @@ def _measured_cut(
     the cut of the reference, and what remains if none does.
     """
     allowed, least = limits
-    exact = config.replace(
-        alpha_cut=least, stop=min(config.stop, _REFERENCE_STOP), outputs=("rgb",)
-    )
-    # Finer than all trials: what it has room for is room enough for them.
-    fitted = exact_config(gaussians, views[0], exact).pair_capacity or 1
-    room = capacity_bucket(fitted)
-    wanted, demands = zip(*_pictures(gaussians, views, exact, background, room))
+    draw = partial(_pictures, gaussians, views, config, background)
+    # Of all cuts the finest wants most: what it has room for is enough for the others.
+    room = capacity_bucket(_TILES * gaussians.capacity)
+    wanted, demands = zip(*draw(room, least))
+    room = max(room, *(capacity_bucket(int(demand.capacity)) for demand in demands))
     best, found = least, Measured(float("inf"), list(demands))
     # Coarser has failed, or would be coarser than is sensible.
     failed, cut = _LARGEST_CUT * 1.01, _rounded(max(allowed / 12, 2 * least))
     for _ in range(_ROUNDS):
-        trial = config.replace(alpha_cut=cut, outputs=("rgb",))
         largest, demands = 0.0, []
-        trials = _pictures(gaussians, views, trial, background, room)
-        for (picture, demand), exactly in zip(trials, wanted):
+        for (picture, demand), exactly in zip(draw(room, cut), wanted):
             largest = max(largest, float(np.abs(picture - exactly).max()))
             demands.append(demand)
         # The error is about in proportion to the cut, and so is the reference's own.
@@ -176,12 +174,14 @@ def _pictures(
     config: RasterConfig,
     background: Sequence[float],
     room: int,
+    cut: float,
 ) -> Iterator[tuple[np.ndarray, Demand]]:
-    """rgb [H, W, 3] of each camera, with ``room`` for pairs, or more, and what it
-    wants."""
+    """rgb [H, W, 3] of each camera with an α cut, by one program for any, and what it
+    wants; with ``room`` for pairs, or more."""
     behind = jnp.asarray(background, gaussians.params.means.dtype)
+    config = config.replace(rungs=1, outputs=("rgb",), visible_capacity=None)
     for view in views:
-        config = config.replace(rungs=1, pair_capacity=room, visible_capacity=None)
-        result = render_exact(gaussians, view, config, behind)
+        config = config.replace(pair_capacity=room)
+        result = render_at_cut(gaussians, view, config, behind, cut)
         room = max(room, capacity_bucket(int(result.demand.capacity)))
         yield np.asarray(result.rgb), result.demand

@@ -30,8 +30,8 @@ class Plan(NamedTuple):
       config: static settings for it.
       reasons: for each of them.
       budget: as asked for, or None.
-      measured: largest error of rgb seen on the cameras given, of the α cut and the
-        stop together; None where bounds alone decided.
+      measured: largest error of rgb seen on the cameras given, of the α cut; None where
+        bounds alone decided.
     """
 
     gaussians: Gaussians

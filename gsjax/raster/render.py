@@ -4,6 +4,7 @@ Nothing here is jitted: wrap `render` with ``config`` static. `render_exact` is 
 exception: it jits, looks at the counts on the host, and regrows.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -165,10 +166,41 @@ def render_exact(
         is (see `gsjax.memory`).
       InputError: as `render`, and under `jax.jit`, `vmap` or `scan`.
     """
+    draw = partial(_render_jit, background=background, **kwargs)
+    return _regrown(draw, gaussians, camera, config, max_capacity)
+
+
+def render_at_cut(
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RasterConfig,
+    background: Array,
+    alpha_cut: float,
+) -> Render:
+    """`render_exact` with ``alpha_cut`` in place of that of ``config``, as a number of
+    the program's input: one program draws with any. Pictures alone: no derivative goes
+    through it."""
+    cut = jnp.asarray(alpha_cut, gaussians.params.means.dtype)
+    draw = partial(_at_cut_jit, background=background, cut=cut)
+    return _regrown(draw, gaussians, camera, config, 2**30 - 1)
+
+
+@partial(jax.jit, static_argnames="config")
+def _at_cut_jit(gaussians, camera, config: RasterConfig, background, cut) -> Render:
+    return render(gaussians, camera, config.at_cut(cut), background)
+
+
+def _regrown(
+    draw: Callable[..., Render],
+    gaussians: Gaussians,
+    camera: Camera,
+    config: RasterConfig,
+    max_capacity: int,
+) -> Render:
     config = _for_active(gaussians, config)
     while True:
         _check_memory(gaussians, camera, config)
-        result = _render_jit(gaussians, camera, config, background, **kwargs)
+        result = draw(gaussians, camera, config)
         if not bool(result.overflowed):
             return result
         config = _regrow(config, result.demand, max_capacity)

@@ -4,6 +4,7 @@ Axis legend: N Gaussians (capacity), R visible ranks (front to back), P pairs,
 S steps, G tiles of a step, K Gaussians of a chunk, H W image, B cameras, C channels.
 """
 
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -133,6 +134,13 @@ class RasterConfig:
     def replace(self, **changes) -> "RasterConfig":
         """A copy with some settings changed."""
         return replace(self, **changes)
+
+    def at_cut(self, alpha_cut: Array) -> "RasterConfig":
+        """A copy with an α cut that is traced, for use within what traces it alone: see
+        `gsjax.raster.render.render_at_cut`."""
+        config = copy(self)
+        object.__setattr__(config, "alpha_cut", alpha_cut)
+        return config
 
 
 class Projected(NamedTuple):
