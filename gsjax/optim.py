@@ -14,7 +14,6 @@ from gsjax.gaussians import GaussianParams
 
 Array = jax.Array
 _ADAM = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-15)
-_COOLING_FROM = 0.6  # of the run
 
 
 class Rates(NamedTuple):
@@ -25,8 +24,9 @@ class Rates(NamedTuple):
         equal; times the extent of the scene.
       log_scales, quats, logit_opacities: of each number.
       sh_dc, sh_rest: of degree 0, and of all above.
-      cooling: share of all but the means' that is left at the last step: constant to
-        60 % of the run, log-linear from there; 1 is constant throughout.
+      cooling: share of all but the means' that is left at the last step: constant at
+        first, log-linear from there; 1 is constant throughout.
+      cooling_from: share of the run after which they fall, 0 to below 1.
     """
 
     means: tuple[float, float] = (1.6e-4, 1.6e-6)
@@ -36,11 +36,12 @@ class Rates(NamedTuple):
     sh_dc: float = 2.5e-3
     sh_rest: float = 1.25e-4
     cooling: float = 1.0
+    cooling_from: float = 0.6
 
     def times(self, factor: float) -> "Rates":
         """All rates, multiplied; the cooling as it was."""
         first, last = self.means
-        others = self._fields[1:-1]
+        others = [name for name in self._fields[1:] if "cooling" not in name]
         return self._replace(
             means=(factor * first, factor * last),
             **{name: factor * getattr(self, name) for name in others},
@@ -58,7 +59,7 @@ def means_rate(rates: Rates, fraction: Array, extent: float | Array) -> Array:
 
 def cooled(rates: Rates, fraction: Array) -> Array:
     """Share of the rates but the means' that is left at ``fraction`` of the run."""
-    late = (jnp.clip(fraction, 0, 1) - _COOLING_FROM) / (1 - _COOLING_FROM)
+    late = (jnp.clip(fraction, 0, 1) - rates.cooling_from) / (1 - rates.cooling_from)
     return rates.cooling ** jnp.maximum(late, 0)
 
 

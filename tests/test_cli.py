@@ -217,7 +217,7 @@ BAD = {
     "json": (3, bad_json, "not JSON"),
     "ply": (3, bad_ply, "end_header"),
     "folder": (3, folder_is_file, "cannot be made a folder"),
-    "suffix": (3, lambda _s, _t: ["info", "a.spz"], "no known format"),
+    "suffix": (3, lambda _s, _t: ["info", "a.ksplat"], "no known format"),
     "command": (2, lambda _s, _t: ["xyz"], "xyz: no such command (there are demo"),
     "like a command": (2, lambda _s, _t: ["rendr", "x"], "(did you mean render?); see"),
     "like a command, with more": (

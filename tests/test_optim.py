@@ -93,6 +93,8 @@ def test_schedule_of_the_others():
     wanted = [1.0, 1.0, 1.0, np.sqrt(0.2), 0.2, 0.2]
     np.testing.assert_allclose(cooled(RATES, fractions), wanted, rtol=1e-6)
     assert (cooled(Rates(), fractions) == 1).all()
+    early = RATES._replace(cooling_from=0.0)
+    np.testing.assert_allclose(cooled(early, fractions), 0.2 ** fractions.clip(0, 1))
 
 
 @pytest.mark.parametrize("garbage", [0.0, -1.5, np.nan, np.inf, 1e30])
@@ -124,7 +126,7 @@ def test_without_gradient_nothing_moves(garbage):
 
 def test_times_multiplies_every_rate():
     rates = RATES.times(3.0)
-    assert rates.cooling == RATES.cooling
-    for found, one in zip(jax.tree.leaves(rates[:-1]), jax.tree.leaves(RATES[:-1])):
+    assert rates[-2:] == RATES[-2:]  # when they fall, and how far
+    for found, one in zip(jax.tree.leaves(rates[:-2]), jax.tree.leaves(RATES[:-2])):
         assert found == pytest.approx(3 * one)
     assert isinstance(rates.means, tuple)

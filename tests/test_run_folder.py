@@ -599,10 +599,13 @@ def test_pictures_of_a_run_are_of_its_settings_and_search_for_what_is_hidden(who
 
 
 def test_settings_of_before_there_was_a_cooling():
-    """One number fewer in the rates; they are constant then."""
-    data = json.loads(to_json(CONFIG))
-    del data["rates"][-1]
-    assert from_json(json.dumps(data)).rates == CONFIG.rates._replace(cooling=1.0)
+    """A number or two fewer in the rates: they fall where they did, or not at all."""
+    rates = CONFIG.rates._replace(cooling=0.5, cooling_from=0.3)
+    data = json.loads(to_json(CONFIG.replace(rates=rates)))
+    assert from_json(json.dumps(data)).rates == rates
+    for wanted in (rates._replace(cooling_from=0.6), CONFIG.rates):
+        del data["rates"][-1]
+        assert from_json(json.dumps(data)).rates == wanted
     del data["rates"][-1]
     with pytest.raises(InputError, match="not the settings"):
         from_json(json.dumps(data))

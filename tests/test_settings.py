@@ -124,6 +124,8 @@ RATES = TrainConfig().rates
         RATES._replace(sh_dc="fast"),
         RATES._replace(cooling=0.0),
         RATES._replace(cooling=1.5),
+        RATES._replace(cooling_from=1.0),
+        RATES._replace(cooling_from=-0.1),
     ],
     ids=str,
 )

@@ -53,7 +53,7 @@ class TrainCommand(HeavyCommand):
     background: Literal["auto", "black", "white", "random"] | None = None
     """Behind the scene; default: auto, which is random where photographs are
     transparent, else black."""
-    initial: Literal["points", "dense", "random"] | Path | None = None
+    initial: Annotated[str | None, arg(metavar="points|dense|random|SCENE")] = None
     """Start from the dataset's points; from those and many more on which the
     photographs agree (the default); from anywhere in view; or from a scene of this
     dataset, by the folder of its run or its .ply or .spz."""
@@ -209,9 +209,9 @@ class TrainCommand(HeavyCommand):
         from gsjax.subjects import is_run, splat_file
         from gsjax.train.folder import load_settings, run_files
 
-        given = self.initial
-        if not isinstance(given, Path):
+        if self.initial in (None, "points", "dense", "random"):
             return None
+        given = Path(self.initial)
         if not given.suffix and not given.exists():
             raise UsageError(
                 f"--initial {given}: points, dense, random, the folder of a run, or a "

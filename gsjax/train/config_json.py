@@ -38,8 +38,8 @@ def from_json(text: str) -> TrainConfig:
         check_kinds(TrainConfig, data)
         if "rates" in data:  # a NamedTuple: a list in JSON
             rates = data["rates"]
-            if len(rates) == len(Rates._fields) - 1:  # of before there was a cooling
-                rates = [*rates, Rates().cooling]
+            if len(rates) in (6, 7):  # of before there was a cooling, or from where
+                rates = [*rates, *Rates()[len(rates) :]]
             check_kinds(Rates, dict(zip(Rates._fields, rates, strict=True)))
             data["rates"] = Rates(tuple(rates[0]), *rates[1:])
         for name, kind in (("adaptive", AdaptiveSettings), ("mcmc", McmcSettings)):
