@@ -8,9 +8,11 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.files import make_folder
-from gsjax.gaussians import num_active, select, with_sh_degree
+from gsjax.gaussians import Gaussians, num_active, select, with_sh_degree
 from gsjax.io import load, save
-from gsjax.subjects import splat_file
+from gsjax.io.spz import write_spz
+from gsjax.subjects import is_run, splat_file
+from gsjax.train.folder import load_settings
 
 
 def export_scene(
@@ -41,12 +43,23 @@ def export_scene(
         raise InputError(f"{out}: exists; pass --overwrite, or another name")
     path = splat_file(source)
     with jax.enable_x64(True):  # what is stored in float64 stays so
-        return _thinned(path, out, sh_degree, min_opacity)
+        gaussians, found = _thinned(path, min_opacity)
+        if sh_degree is not None:
+            gaussians = with_sh_degree(gaussians, sh_degree)
+        if out.suffix.lower() != ".ply":  # which others do not hold
+            turned = np.any(np.asarray(gaussians.params.quats) != 0, axis=1)
+            gaussians = select(gaussians, jnp.asarray(turned))
+        make_folder(out.parent)
+        if out.suffix.lower() == ".spz":
+            antialias = is_run(source) and load_settings(source).config.raster.antialias
+            write_spz(out, gaussians, overwrite=True, antialias=antialias)
+        else:
+            save(out, gaussians, overwrite=True)
+        return int(num_active(gaussians)), found
 
 
-def _thinned(
-    path: Path, out: Path, sh_degree: int | None, min_opacity: float
-) -> tuple[int, int]:
+def _thinned(path: Path, min_opacity: float) -> tuple[Gaussians, int]:
+    """Those of a file that are so opaque, and how many there were."""
     gaussians = load(path)
     found = int(num_active(gaussians))
     logits = np.asarray(gaussians.params.logit_opacities, np.float64)
@@ -59,8 +72,4 @@ def _thinned(
             f"{path}: none of {found:,} Gaussians has an opacity of {min_opacity:g}; "
             f"the greatest is {opacities.max():.3g}"
         )
-    if sh_degree is not None:
-        gaussians = with_sh_degree(gaussians, sh_degree)
-    make_folder(out.parent)
-    save(out, gaussians, overwrite=True)
-    return written, found
+    return gaussians, found

@@ -110,9 +110,9 @@ def test_empty_slots_take_no_room(monkeypatch):
     taken = []
 
     def recorded(call):
-        def one(gaussians, camera, config, *more):
+        def one(gaussians, camera, config, **more):
             taken.append(config.visible_capacity)
-            return call(gaussians, camera, config, *more)
+            return call(gaussians, camera, config, **more)
 
         return one
 

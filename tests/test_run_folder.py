@@ -327,6 +327,7 @@ def test_a_run_starts_from_a_scene(made, capsys):
     begun, *_ = read_metrics(made / "run" / "metrics.jsonl")
     assert first["loss"] < begun["loss"]
     assert first["gaussians"] == last["gaussians"]
+    assert "views held out were trained on" not in told
     before = (run / "splat.ply").read_bytes()
     shutil.rmtree(run / "checkpoints")
     (run / "splat.ply").unlink()
@@ -342,6 +343,12 @@ def test_a_scene_of_elsewhere_is_refused(made, tmp_path, monkeypatch, capsys):
     """And one of too many, before photographs are read."""
     monkeypatch.setattr(run_module, "load_photos", None)
     given = gsjax.load(made / "run" / "splat.ply")
+    settings = load_settings(made / "run")
+    run_module._tell_seen(made / "run" / "splat.ply", (*settings.trained, "new"))
+    told = f"{len(settings.trained)} of the {len(settings.trained) + 1} views held out"
+    assert told in capsys.readouterr().err
+    run_module._tell_seen(made / "run" / "splat.ply", settings.held_out)
+    assert capsys.readouterr().err == ""
     count, means = given.capacity, given.params.means + 1e3  # far out
     gsjax.save(
         tmp_path / "far.ply", given.replace(params=given.params.replace(means=means))
@@ -542,6 +549,11 @@ def test_a_scene_to_start_from_is_named(made, monkeypatch, capsys):
         for other in ("dense", str(made / "other.ply")):
             assert cli.main([*args, "--initial", other, "--resume"]) == 2
             assert "leave out --steps, --initial" in capsys.readouterr().err
+        if given != splat:  # gone since: it is not needed any more
+            given.rename(made / "moved")
+            assert cli.main([*args, "--initial", str(given), "--resume"]) == 130
+            (made / "moved").rename(given)
+            begun.clear()
         (run / "config.json").unlink()
     refined = made / "run" / "cameras.json"
     refined.write_text("[]")

@@ -11,6 +11,7 @@ from base64 import b64decode
 from itertools import pairwise
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -19,6 +20,7 @@ import gsjax
 from gsjax import cli
 from gsjax.errors import InputError
 from gsjax.io.common import to_bytes
+from gsjax.io.spz import write_spz
 
 pytestmark = pytest.mark.usefixtures("float32")
 
@@ -75,8 +77,8 @@ def assert_alike(found: gsjax.Gaussians, wanted: gsjax.Gaussians, sh: float) -> 
 
 
 def test_what_another_program_writes_is_read(tmp_path):
-    (tmp_path / "a.spz").write_bytes(gzip.compress(THEIRS))
-    found = gsjax.load(tmp_path / "a.SPZ".lower())
+    (tmp_path / "a.SPZ").write_bytes(gzip.compress(THEIRS))
+    found = gsjax.load(tmp_path / "a.SPZ")
     assert found.sh_degree == 3
     # Its harmonics above degree 1 are rounded to 4 bits.
     assert_alike(found, given(), 1 / 16)
@@ -221,6 +223,12 @@ def test_what_follows_is_told_of(tmp_path, flags, told):
     assert_alike(found, given(), 1 / 16)
 
 
+def test_antialiasing_is_told_of(tmp_path):
+    write_spz(tmp_path / "a.spz", given(0), antialias=True)
+    with pytest.warns(UserWarning, match=r"looks right with RasterConfig\(antialias"):
+        gsjax.load(tmp_path / "a.spz")
+
+
 def test_opacities_of_zero_and_one_stay_so(tmp_path):
     gsjax.save(tmp_path / "a.spz", given(0, logit_opacities=[-np.inf, np.inf, -9.0]))
     found = gsjax.load(tmp_path / "a.spz").params.logit_opacities
@@ -341,6 +349,14 @@ def test_a_colour_beyond_white_is_told_of(tmp_path):
     assert {raw[32 * k + 25] for k in range(3)} == {128, 255}
 
 
+def test_a_splat_file_far_from_the_origin_is_told_of(tmp_path):
+    means = np.asarray([[5e6 + 0.3, 0, 0], [0, 0, 0], [1, 2, 3]])
+    with jax.enable_x64(True):
+        far = given(0, means=means)
+        with pytest.warns(UserWarning, match="1 of 3 Gaussians have means rounded by"):
+            gsjax.save(tmp_path / "a.splat", far)
+
+
 def test_a_splat_file_is_not_read(tmp_path):
     gsjax.save(tmp_path / "a.splat", given(0))
     with pytest.raises(InputError, match=r"known: \.ply, \.spz; convert"):
@@ -363,5 +379,9 @@ def test_scenes_are_exported_by_suffix(tmp_path, capsys):
     assert "degree 1 to 3 are left out" in capsys.readouterr().err
     assert cli.main([*args, "--overwrite", "--sh-degree", "0"]) == 0
     assert capsys.readouterr().err == ""
+    quats = np.asarray([[1, 0, 0, 0], [0, 0, 0, 0], [0, 1, 0, 0]])
+    gsjax.save(tmp_path / "e.ply", given(quats=quats))
+    assert cli.main(["export", str(tmp_path / "e.ply"), str(tmp_path / "e.spz")]) == 0
+    assert "2 of 3 Gaussians" in capsys.readouterr().out
     assert cli.main(["export", str(out), str(tmp_path / "d.xyz")]) == 3
     assert "known: .ply, .splat, .spz; " in capsys.readouterr().err

@@ -23,7 +23,7 @@ _SIZE = (400, 300)
 def open_trial(
     name: str, *, cameras: Path | None = None, size: tuple[int, int] | None = None
 ) -> Trial:
-    """A scene that is built in, a .ply file or a run, with one camera.
+    """A scene that is built in, a file or a run, with one camera.
 
     Args:
       name: of `TRIALS`, unless there is a file or a folder of that name.
@@ -42,7 +42,7 @@ def open_trial(
         return trial._replace(camera=_first(cameras, entries))
     if not path.exists():
         raise InputError(
-            f"{name}: neither a run nor a .ply file, nor one of {', '.join(TRIALS)}"
+            f"{name}: neither a run nor a .ply or .spz, nor one of {', '.join(TRIALS)}"
         )
     origin = camera = None
     if cameras is not None:

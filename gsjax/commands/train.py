@@ -181,7 +181,7 @@ class TrainCommand(HeavyCommand):
             and getattr(self, field.name) != field.default
         ]
         # What is left open was decided when the run began.
-        if self.initial is None:
+        if self.initial is None or self._is_start(settings.start):
             mine = self._settings(settings.start)
             config = mine.config.replace(initial=settings.config.initial)
             mine = replace(mine, config=config)
@@ -204,8 +204,15 @@ class TrainCommand(HeavyCommand):
                     f"--{name.replace('_', '-')} {value}: {least} to {2**31 - 2:,}"
                 )
 
+    def _is_start(self, start: Path | None) -> bool:
+        """Whether ``--initial`` names that file or its run, be they there or not."""
+        from gsjax.train.folder import run_files
+
+        given = Path(self.initial or "")
+        return start in (given.resolve(), run_files(given).splat.resolve())
+
     def _start(self) -> Path | None:
-        """The PLY of the scene to start from, if that is what is wanted."""
+        """The file of the scene to start from, if that is what is wanted."""
         from gsjax.subjects import is_run, splat_file
         from gsjax.train.folder import load_settings, run_files
 

@@ -8,6 +8,7 @@ import numpy as np
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 
+MAX_SHIFT = 0.1  # of a Gaussian's size by rounding, before it is told
 _TINY = np.finfo(np.float64).tiny
 
 

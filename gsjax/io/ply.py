@@ -21,14 +21,13 @@ import numpy as np
 from gsjax.errors import InputError
 from gsjax.files import opened, replacing
 from gsjax.gaussians import Gaussians, make_gaussians
-from gsjax.io.common import require_new, warn
+from gsjax.io.common import MAX_SHIFT, require_new, warn
 from gsjax.io.ply_header import Header, check_properties, check_size, read_header
 from gsjax.io.ply_rows import CHUNK_ROWS, read_rows
 from gsjax.memory import Estimate, require
 
 _NORMALS = ("nx", "ny", "nz")
 _FILTER = "filter_3D"  # of Mip-Splatting: σ by which a Gaussian is to be smoothed
-_MAX_SHIFT = 0.1  # of a Gaussian's size by rounding, before it is told
 # Exporters write ±inf for opacities of exactly 0 and 1; the range of `logit`.
 _MAX_LOGIT = math.log((1 - 2.0**-23) / 2.0**-23)
 
@@ -114,7 +113,7 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
             if wide and dtype == np.float32:
                 shift = np.max([abs(columns[a] - views[a][rows]) for a in "xyz"], 0)
                 sizes = np.exp(np.max([views[f"scale_{i}"][rows] for i in range(3)], 0))
-                moved = np.isfinite(shift) & (shift > _MAX_SHIFT * sizes)
+                moved = np.isfinite(shift) & (shift > MAX_SHIFT * sizes)
                 displaced += int(moved.sum())
                 furthest = max(furthest, shift[moved].max(initial=0.0))
             start += size
@@ -124,7 +123,7 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
         warn(
             f"{header.path}: {displaced} of {start} Gaussians lie so far from the "
             f"origin that float32 moves them, by up to {furthest:.3g}, more than "
-            f"{_MAX_SHIFT:g} of their size; read the file with jax_enable_x64, or move "
+            f"{MAX_SHIFT:g} of their size; read the file with jax_enable_x64, or move "
             "the scene to the origin"
         )
     return fields

@@ -14,7 +14,14 @@ import numpy as np
 
 from gsjax.files import replacing
 from gsjax.gaussians import Gaussians
-from gsjax.io.common import drawn_rows, opacity_bytes, require_new, to_bytes, warn
+from gsjax.io.common import (
+    MAX_SHIFT,
+    drawn_rows,
+    opacity_bytes,
+    require_new,
+    to_bytes,
+    warn,
+)
 from gsjax.sh import C0
 
 _ROW = np.dtype(
@@ -36,7 +43,7 @@ def write_splat(
       overwrite: whether an existing file may be replaced.
 
     Raises:
-      InputError: as `write_ply`; if a value is NaN or infinite.
+      InputError: as `write_ply`; if a value is NaN, or infinite and no opacity.
     """
     path = Path(path)
     require_new(path, overwrite)
@@ -54,9 +61,18 @@ def write_splat(
             "brighter than white, and clipped"
         )
     table = np.zeros(len(colors), _ROW)
-    table["means"] = rows["means"]
+    sizes = np.exp(np.clip(rows["log_scales"].astype(np.float64), -80, 80))
+    table["scales"] = sizes
     with np.errstate(over="ignore"):
-        table["scales"] = np.minimum(np.exp(rows["log_scales"]), np.finfo("<f4").max)
+        table["means"] = rows["means"]
+    shift = np.abs(table["means"] - rows["means"].astype(np.float64)).max(1, initial=0)
+    moved = shift > MAX_SHIFT * sizes.max(1, initial=0)
+    if moved.any():
+        warn(
+            f"{path}: {moved.sum():,} of {len(moved):,} Gaussians have "
+            "means rounded by a tenth of their size; move the scene nearer to the "
+            "origin, or write a .ply"
+        )
     table["rgba"][:, :3] = to_bytes(255 * colors)
     table["rgba"][:, 3] = opacity_bytes(rows["logit_opacities"])
     table["quats"] = to_bytes(128 + 128 * rows["quats"])

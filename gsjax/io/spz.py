@@ -21,18 +21,21 @@ from gsjax.errors import InputError
 from gsjax.files import opened, replacing
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.io.common import (
+    MAX_SHIFT,
     drawn_rows,
     opacity_bytes,
     require_new,
     to_bytes,
     warn,
 )
+from gsjax.io.ply_rows import CHUNK_ROWS
 from gsjax.memory import Estimate, require
 from gsjax.sh import num_bases, sh_basis
 
 _MAGIC = b"NGSP"
 _HEADER = Struct("<4sIIBBBB")
-_EXTENSIONS = 2  # a flag: what follows the harmonics
+# Flags: opacities are to be compensated; there is more behind the harmonics.
+_ANTIALIASED, _EXTENSIONS = 1, 2
 _MOST_DEGREE = 3  # of what is written, as most programs read no more
 # A mean is a whole number of 24 bits over 2 to the power of so many.
 _MOST_FRACTION, _LARGEST = 20, 2**23 - 1
@@ -41,7 +44,6 @@ _BITS = (6, 5)  # kept of harmonics of degree 1, and above: what is zero packs w
 _MOST_RATIO = 1032  # of any deflated bytes
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
 _LEAST_OPACITY = 0.25 / 255  # which rounds to 0
-_MAX_SHIFT = 0.1  # of a Gaussian's size by rounding, before it is told
 
 
 class _Header(NamedTuple):
@@ -55,7 +57,8 @@ class _Header(NamedTuple):
 def read_spz(path: str | PathLike[str]) -> Gaussians:
     """Gaussians of an SPZ file of version 2 or 3, of SH degree 0 to 4.
 
-    Trailing bytes are warned of, and so are extensions, which are not read.
+    Trailing bytes are warned of, and so are extensions, which are not read, and a scene
+    that says it was trained with antialiasing, which is for `RasterConfig` to know.
 
     Returns:
       Gaussians with capacity max(N, 1), in the order of the file.
@@ -98,7 +101,7 @@ def _read(stream: BinaryIO, path: Path, size: int) -> Gaussians:
             "hold so many: truncated or damaged; a whole file is wanted"
         )
     require(
-        Estimate({"values as read": count * (sum(widths.values()) + 8 * 3 * bases)}),
+        Estimate({"values as read": count * (220 + 16 * 3 * bases)}),
         f"{path}: {count:,} Gaussians",
         "make the file smaller where it was made",
     )
@@ -116,6 +119,11 @@ def _read(stream: BinaryIO, path: Path, size: int) -> Gaussians:
         if not header.flags & _EXTENSIONS:
             what = "bytes behind the last Gaussian are ignored"
         warn(f"{path}: {what}")
+    if header.flags & _ANTIALIASED:
+        warn(
+            f"{path}: says that it was trained with antialiasing, and looks right with "
+            "RasterConfig(antialias=True)"
+        )
     signs = _signs(header.degree)
     sh = np.zeros((count, bases, 3), np.float32)
     sh[:, 0] = (parts["colors"] / 255 - 0.5) / _COLOR
@@ -209,11 +217,15 @@ def _signs(degree: int) -> np.ndarray:
         np.asarray(sh_basis(degree, *jnp.asarray(d)))
         for d in (direction, direction * _HALF_TURN)
     )
-    return np.sign(here * there)
+    return np.sign(here * there).astype(np.float32)
 
 
 def write_spz(
-    path: str | PathLike[str], gaussians: Gaussians, *, overwrite: bool = False
+    path: str | PathLike[str],
+    gaussians: Gaussians,
+    *,
+    overwrite: bool = False,
+    antialias: bool = False,
 ) -> None:
     """Write the active Gaussians as an SPZ file of version 3.
 
@@ -225,10 +237,12 @@ def write_spz(
       path: the file to write; it appears complete or not at all.
       gaussians: the scene, of SH degree 0 to 3; inactive slots are left out.
       overwrite: whether an existing file may be replaced.
+      antialias: whether it was trained with that, which the file says then.
 
     Raises:
-      InputError: as `write_ply`; if a value is NaN or infinite, a mean larger than
-        8 million, or the degree 4.
+      InputError: as `write_ply`; if a value is NaN, or infinite and no opacity, a mean
+        larger than 8 million, or the degree 4.
+      CapacityError: if the memory would not hold what is made.
     """
     path, degree = Path(path), gaussians.sh_degree
     require_new(path, overwrite)
@@ -237,6 +251,12 @@ def write_spz(
             f"{path}: SH degree {degree}; SPZ has up to {_MOST_DEGREE}: cut it with "
             "gsjax.with_sh_degree (--sh-degree)"
         )
+    slots, bases = gaussians.capacity, num_bases(degree)
+    require(
+        Estimate({"values to be written": slots * (300 + 16 * 3 * bases)}),
+        f"{path}: {slots:,} Gaussians",
+        "leave some out (export --min-opacity), or write a .ply",
+    )
     rows = drawn_rows(path, gaussians)
     largest = float(np.abs(rows["means"]).max(initial=0))
     if largest > _LARGEST:
@@ -250,7 +270,8 @@ def write_spz(
     means = np.rint(rows["means"].astype(np.float64) * 2.0**fraction * _HALF_TURN)
     colors = 255 * (0.5 + _COLOR * rows["sh"][:, 0])
     count = len(means)
-    header = _HEADER.pack(_MAGIC, 3, count, degree, fraction, 0, 0)
+    flags = _ANTIALIASED * antialias
+    header = _HEADER.pack(_MAGIC, 3, count, degree, fraction, flags, 0)
     with (
         replacing(path, durable=True) as file,
         gzip.GzipFile("", "wb", 6, file, mtime=0) as stream,
@@ -263,7 +284,9 @@ def write_spz(
         scales = _SCALE * (rows["log_scales"].astype(np.float64) + _SHIFT)
         stream.write(to_bytes(scales).tobytes())
         stream.write(_packed_quats(rows["quats"]).tobytes())
-        stream.write(_harmonics(rows["sh"], degree).tobytes())
+        for start in range(0, count, CHUNK_ROWS):
+            some = rows["sh"][start : start + CHUNK_ROWS]
+            stream.write(_harmonics(some, degree).tobytes())
 
 
 def _harmonics(sh: np.ndarray, degree: int) -> np.ndarray:
@@ -284,7 +307,7 @@ def _warn_of_values(path: Path, rows: dict[str, np.ndarray], fraction: int) -> N
         "colours beyond -0.44 to 1.44": (np.abs(sh[:, 0]) > 3.35).any(1),
         "harmonics beyond -1 to 1": (np.abs(sh[:, 1:]) > 1.05).any((1, 2)),
         "means rounded by a tenth of their size": 2.0**-fraction / 2
-        > _MAX_SHIFT * sizes,
+        > MAX_SHIFT * sizes,
     }
     for what, wrong in told.items():
         if wrong.any():

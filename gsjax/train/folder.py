@@ -50,8 +50,8 @@ class RunSettings:
       images, factor, skip_missing: as for `load_dataset`.
       every: hold out every so many-th view; 0 for none, None as the dataset says.
       test_images: hold out these instead.
-      start: a PLY, in the dataset's coordinates: the Gaussians to start from, instead
-        of what the config says.
+      start: a file of Gaussians in the dataset's coordinates to start from, instead of
+        what the config says.
       trained, held_out: names of the views, once they were split; they stay so, and
         what a dataset holds later is held against them.
     """

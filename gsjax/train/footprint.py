@@ -168,5 +168,19 @@ def check_memory(scene: Scene, config: TrainConfig, state: TrainState | None) ->
         )
 
 
+def check_state_memory(count: int, config: TrainConfig) -> None:
+    """Refuse a state of so many Gaussians that would not fit.
+
+    Raises:
+      CapacityError: with the numbers.
+    """
+    size = state_bytes(slots_for(max(1, count), 0, config), config)
+    require(
+        Estimate({"of Gaussians and their moments": size}),
+        f"a run from {_gaussians(count)}",
+        "leave some out (export --min-opacity)",
+    )
+
+
 def _gaussians(count: int) -> str:
     return "1 Gaussian" if count == 1 else f"{count:,} Gaussians"

@@ -107,8 +107,8 @@ def check_in_view(scene: Scene, means: np.ndarray, source: str) -> None:
       InputError: if the centre of none is: they are no scene of these photographs.
     """
     for view in scene.views:
-        x, y, z = view.viewmat[:3, :3] @ means.T + view.viewmat[:3, 3:]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            x, y, z = view.viewmat[:3, :3] @ means.T + view.viewmat[:3, 3:]
             u, v, _ = view.K @ np.stack([x / z, y / z, np.ones_like(z)])
         inside = (z > view.near) & (u >= 0) & (u <= view.width)
         if np.any(inside & (v >= 0) & (v <= view.height)):

@@ -32,7 +32,7 @@ from gsjax.train.folder import (
     save_settings,
     with_views,
 )
-from gsjax.train.footprint import check_memory
+from gsjax.train.footprint import check_memory, check_state_memory
 from gsjax.train.health import check_in_view
 from gsjax.train.history import keep_steps, read_metrics, write_curves
 from gsjax.train.sitting import (
@@ -220,18 +220,35 @@ def _given_state(settings: RunSettings, data: Data) -> TrainState | None:
     path, config = settings.start, settings.config
     if path is None:
         return None
-    gaussians, scene = (
-        load_scene(path, data.scene.origin),
-        subset(data.scene, data.train),
-    )
-    check_in_view(scene, np.asarray(gaussians.params.means), str(path))
+    scene = subset(data.scene, data.train)
+    gaussians = load_scene(path, scene.origin)
+    active = np.asarray(gaussians.active)
+    check_state_memory(int(active.sum()), config)
     had, has = gaussians.sh_degree, config.sh_degree
     cut = f", of whose SH degree {had} the run has {has} (--sh-degree)"
     note(f"starting from the scene of {path}{cut if had > has else ''}")
     try:
-        return initial_state(scene, config, gaussians)
+        state = initial_state(scene, config, gaussians)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    check_in_view(scene, np.asarray(gaussians.params.means)[active], str(path))
+    _tell_seen(path, with_views(settings, data).held_out)
+    return state
+
+
+def _tell_seen(start: Path, held_out: tuple[str, ...]) -> None:
+    """Of held-out views that the scene to start from has learnt from, if a run made
+    it."""
+    folder = start.parent
+    if run_files(folder).splat != start or not run_files(folder).config.exists():
+        return
+    seen = set(load_settings(folder).trained) & set(held_out)
+    if seen:
+        note(
+            f"warning: {len(seen)} of the {len(held_out)} views held out were trained "
+            f"on by {folder}: what is measured on them is too good; hold out those "
+            "that it did (--test-images, --test-every)"
+        )
 
 
 def _last_checkpoint(files: RunFiles, config: TrainConfig, scene: Scene) -> Start:

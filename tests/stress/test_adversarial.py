@@ -335,7 +335,7 @@ def train(tmp_path, monkeypatch, capsys):
     """`gsjax train` of a small dataset: its code, and the lines on stderr."""
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     settings = settings_of(tmp_path, harmless(), "mcmc")
-    monkeypatch.setattr(TrainCommand, "_settings", lambda _: settings)
+    monkeypatch.setattr(TrainCommand, "_settings", lambda *_: settings)
 
     def run(folder, *more):
         code = cli.main(["train", str(settings.dataset), "-o", str(folder), *more])
