@@ -162,6 +162,15 @@ def float32():
     jax.config.update("jax_enable_x64", True)
 
 
+def as_compiled(config):
+    """A `TrainConfig` without what no program of a step depends on."""
+    host = ("seed", "max_size", "levels", "drop_unseen", "every_eval")
+    begun = ("initial", "initial_count", "dense_count", "max_initial")
+    names = (*host, *begun, "every_checkpoint")
+    same = type(config)()
+    return config.replace(**{name: getattr(same, name) for name in names})
+
+
 @pytest.fixture(scope="module")
 def shared_programs():
     """A program for each strategy and shape of the photographs, whosever run it is.
@@ -174,7 +183,7 @@ def shared_programs():
 
     def program(self, state, frames, raster):
         extent = np.float32(fit_module.extent_of(self.scene))
-        key = (Programs.kind, self.config, extent, frames.valid is None)
+        key = (Programs.kind, as_compiled(self.config), extent, frames.valid is None)
         compiler = self.compiler
         compiler.by_sizes, compiler.by_slots = compiled.setdefault(key, ({}, {}))
         return compile_one(self, state, frames, raster)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import on_cpu
+from conftest import as_compiled, on_cpu
 from training import (
     EXTENT,
     HEIGHT,
@@ -231,7 +231,7 @@ def test_too_few_pairs_and_slots_are_grown(shared_programs):
     assert int(result.gaussians.active.sum()) == 64
     assert bits(state) == before  # the caller's is still there
     # What does not look at the pairs is compiled once for all of them.
-    (compiled,) = [v for k, v in shared_programs.items() if limited in k]
+    (compiled,) = [v for k, v in shared_programs.items() if as_compiled(limited) in k]
     assert [len(programs) for programs in compiled] == [3, 2]
 
 

@@ -16,6 +16,7 @@ import pytest
 from hostile import HOSTILE, harmless, write_hostile
 
 import gsjax
+import gsjax.train.beginning as beginning
 import gsjax.train.run as run_module
 from gsjax import cli
 from gsjax.densify.mcmc import McmcSettings
@@ -39,7 +40,7 @@ from gsjax.train.history import read_metrics
 from gsjax.train.run import RunResult, resume_run, start_run
 from gsjax.train.start import initial_state
 
-pytestmark = pytest.mark.usefixtures("float32")
+pytestmark = pytest.mark.usefixtures("float32", "shared_programs")
 
 CONFIG = TrainConfig(
     steps=3,
@@ -344,10 +345,10 @@ def test_a_scene_of_elsewhere_is_refused(made, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(run_module, "load_photos", None)
     given = gsjax.load(made / "run" / "splat.ply")
     settings = load_settings(made / "run")
-    run_module._tell_seen(made / "run" / "splat.ply", (*settings.trained, "new"))
+    beginning._tell_seen(made / "run" / "splat.ply", (*settings.trained, "new"))
     told = f"{len(settings.trained)} of the {len(settings.trained) + 1} views held out"
     assert told in capsys.readouterr().err
-    run_module._tell_seen(made / "run" / "splat.ply", settings.held_out)
+    beginning._tell_seen(made / "run" / "splat.ply", settings.held_out)
     assert capsys.readouterr().err == ""
     count, means = given.capacity, given.params.means + 1e3  # far out
     gsjax.save(
@@ -378,7 +379,7 @@ def test_looking_for_points_counts_as_training(whole, tmp_path, monkeypatch, cap
         colors = np.concatenate([scene.colors, scene.colors[:7]])
         return replace(scene, points=points, colors=colors)
 
-    monkeypatch.setattr(run_module, "with_dense", found)
+    monkeypatch.setattr(beginning, "with_dense", found)
     settings = RunSettings(whole / "data", CONFIG.replace(initial="dense"))
     start_run(settings, tmp_path / "run")
     assert "7 more points, after " in capsys.readouterr().err

@@ -303,6 +303,23 @@ def test_what_is_never_drawn_is_left_out(tmp_path, suffix):
         assert gsjax.load(path).capacity == 2
 
 
+@pytest.mark.parametrize("suffix", [".spz", ".splat"])
+def test_what_would_draw_nothing_is_refused(tmp_path, suffix):
+    nothing = given(0, quats=np.zeros((3, 4)))
+    with pytest.raises(InputError, match="quaternions of all 3 Gaussians are zero"):
+        gsjax.save(tmp_path / f"a{suffix}", nothing)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_means_beyond_float32_have_no_place_in_splat(tmp_path):
+    means = 1e39 * np.asarray([[1, 0, 0], [0, 0, 0], [0, 0, -1]])
+    with jax.enable_x64(True):
+        far = given(0, means=means)
+        with pytest.raises(InputError, match="2 of 3 means are beyond float32"):
+            gsjax.save(tmp_path / "a.splat", far)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_has_no_place_in_spz_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"SH degree 4; SPZ has up to 3.*--sh-degree"):
         gsjax.save(tmp_path / "a.spz", gsjax.with_sh_degree(given(), 4))

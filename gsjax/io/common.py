@@ -48,7 +48,7 @@ def drawn_rows(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
     quaternions of norm 1, and no zero ones; of these it is warned.
 
     Raises:
-      InputError: if a value is NaN, or infinite and no logit.
+      InputError: if a value is NaN, or infinite and no logit, or none is drawn.
     """
     params = gaussians.params.__dict__
     arrays = {name: np.asarray(array) for name, array in params.items()}
@@ -71,6 +71,11 @@ def drawn_rows(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
     rows["quats"] = quats / np.where(drawn, norms, 1)[:, None]
     if drawn.all():
         return rows
+    if not drawn.any():
+        raise InputError(
+            f"{path}: the quaternions of all {len(drawn)} Gaussians are zero, which "
+            "draws nothing; is the scene damaged?"
+        )
     warn(
         f"{path}: {(~drawn).sum()} of {len(drawn)} quaternions are zero; such "
         "Gaussians are not drawn, and left out"

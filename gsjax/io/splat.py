@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsjax.errors import InputError
 from gsjax.files import replacing
 from gsjax.gaussians import Gaussians
 from gsjax.io.common import (
@@ -43,7 +44,8 @@ def write_splat(
       overwrite: whether an existing file may be replaced.
 
     Raises:
-      InputError: as `write_ply`; if a value is NaN, or infinite and no opacity.
+      InputError: as `write_ply`; if a value is NaN, or infinite and no opacity, or a
+        mean is beyond float32, or none of the Gaussians is drawn.
     """
     path = Path(path)
     require_new(path, overwrite)
@@ -65,6 +67,12 @@ def write_splat(
     table["scales"] = sizes
     with np.errstate(over="ignore"):
         table["means"] = rows["means"]
+    far = np.any(~np.isfinite(table["means"]), axis=1)
+    if far.any():
+        raise InputError(
+            f"{path}: {far.sum()} of {len(far)} means are beyond float32, which .splat "
+            "stores; move the scene nearer to the origin, or write a .ply"
+        )
     shift = np.abs(table["means"] - rows["means"].astype(np.float64)).max(1, initial=0)
     moved = shift > MAX_SHIFT * sizes.max(1, initial=0)
     if moved.any():

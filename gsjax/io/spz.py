@@ -241,7 +241,7 @@ def write_spz(
 
     Raises:
       InputError: as `write_ply`; if a value is NaN, or infinite and no opacity, a mean
-        larger than 8 million, or the degree 4.
+        larger than 8 million, or the degree 4, or none of the Gaussians is drawn.
       CapacityError: if the memory would not hold what is made.
     """
     path, degree = Path(path), gaussians.sh_degree

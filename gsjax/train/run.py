@@ -1,7 +1,6 @@
 """A training run from a dataset to its folder: started, gone on with, saved."""
 
 import shutil
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -15,25 +14,22 @@ from gsjax.errors import DivergedError, InputError
 from gsjax.evaluation import Summary
 from gsjax.files import alone_in, make_folder, writing
 from gsjax.raster.render import device_count
-from gsjax.scene.initialise import has_points
 from gsjax.scene.photos import load_photos
 from gsjax.scene.types import Photo, Scene
+from gsjax.train.beginning import first_state, given_state, with_beginning
 from gsjax.train.checkpoint import latest_step, load_latest, restore
 from gsjax.train.config import TrainConfig
 from gsjax.train.fit import Progress, fit, subset
 from gsjax.train.folder import (
-    Data,
     RunFiles,
     RunSettings,
     load_data,
-    load_scene,
     load_settings,
     run_files,
     save_settings,
     with_views,
 )
-from gsjax.train.footprint import check_memory, check_state_memory
-from gsjax.train.health import check_in_view
+from gsjax.train.footprint import check_memory
 from gsjax.train.history import keep_steps, read_metrics, write_curves
 from gsjax.train.sitting import (
     Sitting,
@@ -43,13 +39,7 @@ from gsjax.train.sitting import (
     save_result,
     saved_text,
 )
-from gsjax.train.start import (
-    empty_state,
-    extent_of,
-    initial_state,
-    with_dense,
-    with_initial,
-)
+from gsjax.train.start import empty_state, extent_of
 from gsjax.train.state import TrainState
 
 
@@ -107,11 +97,11 @@ def start_run(
             f"{folder}: is the dataset's own folder; pass another one with -o"
         )
     data = load_data(settings)
-    settings = replace(with_views(settings, data), config=_begun(settings, data))
-    start = Start(_given_state(settings, data))
+    settings = with_beginning(with_views(settings, data), data)
+    start = Start(given_state(settings, data))
     sitting = Sitting(settings.config, data, run_files(folder), start)
     photos = _photographs(sitting)
-    state = start.state or _first_state(sitting, photos)
+    state = start.state or first_state(sitting, photos)
     make_folder(folder)
     with alone_in(folder):
         # By now another may have been here.
@@ -153,17 +143,6 @@ def _remove(path: Path) -> None:
             path.unlink()
 
 
-def _begun(settings: RunSettings, data: Data) -> TrainConfig:
-    """With what the run starts from, which it keeps when it is gone on with."""
-    config = settings.config
-    if settings.start is not None:
-        return config
-    decided = with_initial(subset(data.scene, data.train), config)
-    if config.initial == "auto" and decided.initial == "random":
-        note("the dataset has no points: starting from random ones (--initial random)")
-    return decided
-
-
 def resume_run(
     folder: Path, *, dataset: Path | None = None, watch: Watch | None = None
 ) -> RunResult:
@@ -203,52 +182,11 @@ def _resumed(folder: Path, dataset: Path | None, watch: Watch | None) -> RunResu
                 f"(--initial {folder})"
             )
     else:
-        start = Start(_given_state(settings, data))
+        start = Start(given_state(settings, data))
     sitting = Sitting(settings.config, data, files, start)
     photos = _photographs(sitting)
-    state = start.state or _first_state(sitting, photos)
+    state = start.state or first_state(sitting, photos)
     return _train(sitting, photos, state, watch)
-
-
-def _given_state(settings: RunSettings, data: Data) -> TrainState | None:
-    """A run before its first step, where it starts from a scene.
-
-    Raises:
-      InputError: if that is not there, or damaged, or of another dataset, or more than
-        there may be.
-    """
-    path, config = settings.start, settings.config
-    if path is None:
-        return None
-    scene = subset(data.scene, data.train)
-    gaussians = load_scene(path, scene.origin)
-    active = np.asarray(gaussians.active)
-    check_state_memory(int(active.sum()), config)
-    had, has = gaussians.sh_degree, config.sh_degree
-    cut = f", of whose SH degree {had} the run has {has} (--sh-degree)"
-    note(f"starting from the scene of {path}{cut if had > has else ''}")
-    try:
-        state = initial_state(scene, config, gaussians)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    check_in_view(scene, np.asarray(gaussians.params.means)[active], str(path))
-    _tell_seen(path, with_views(settings, data).held_out)
-    return state
-
-
-def _tell_seen(start: Path, held_out: tuple[str, ...]) -> None:
-    """Of held-out views that the scene to start from has learnt from, if a run made
-    it."""
-    folder = start.parent
-    if run_files(folder).splat != start or not run_files(folder).config.exists():
-        return
-    seen = set(load_settings(folder).trained) & set(held_out)
-    if seen:
-        note(
-            f"warning: {len(seen)} of the {len(held_out)} views held out were trained "
-            f"on by {folder}: what is measured on them is too good; hold out those "
-            "that it did (--test-images, --test-every)"
-        )
 
 
 def _last_checkpoint(files: RunFiles, config: TrainConfig, scene: Scene) -> Start:
@@ -283,24 +221,6 @@ def _photographs(sitting: Sitting) -> list[Photo]:
     )
     check_memory(sitting.scene, config, sitting.start.state)
     return load_photos(sitting.scene.views, config.max_size)
-
-
-def _first_state(sitting: Sitting, photos: list[Photo]) -> TrainState:
-    """The run before its first step; what it takes counts as training."""
-    scene, config, begun = sitting.scene, sitting.config, time.perf_counter()
-    if config.initial == "dense":
-        note("looking for points on which the photographs agree (--initial dense)")
-    dense = with_dense(scene, photos, config)
-    if config.initial == "dense":
-        found = len(dense.points) - len(scene.points)
-        note(f"{found:,} more points, after {time.perf_counter() - begun:.1f} s")
-        if not has_points(dense):
-            note("too few, and the dataset has no points: starting from random ones")
-            check_memory(scene, config.replace(initial="random"), None)
-    state = initial_state(dense, config)
-    seconds = time.perf_counter() - begun
-    sitting.start = sitting.start._replace(seconds=seconds)
-    return state
 
 
 def _train(
