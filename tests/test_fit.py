@@ -461,6 +461,32 @@ def test_slots_are_no_more_than_will_be_used():
     assert slots_for(60_000, 0, few) == 61_440  # those that there are fit
 
 
+def test_an_accelerator_grows_once_for_each_size_of_the_photographs(monkeypatch):
+    """What is empty costs it next to nothing: room for all that may come until a
+    program is due anyway."""
+    steps, finer, first, most = 40_000, 4000, 50_000, 190_000
+    known = McmcSettings(
+        start=0, stop=steps, every=1, growth=1.0003, max_gaussians=most
+    )
+    config = CONFIG.replace(strategy="mcmc", mcmc=known, steps=steps)
+    config = config.replace(levels=(Level(0.0, 2), Level(finer / steps, 1)))
+    state = initial_state(scene(), config)
+
+    def room():
+        slots = [slots_for(first, step, config) for step in (0, finer, steps)]
+        return *slots, roomy_pairs(300_000, state, config)
+
+    coarse, fine, last, pairs = room()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    coarse_there, fine_there, last_there, pairs_there = room()
+    assert coarse < known.likely(first, 0, finer) <= coarse_there < most
+    assert fine < most <= fine_there
+    assert pairs < pairs_there
+    assert last == last_there
+    # But for the sake of memory no more than four times those that there are.
+    assert slots_for(most // 10, finer, config) <= 4.5 * most / 10
+
+
 @pytest.mark.parametrize(("step", "slots"), [(7, 1024), (49, 64), (50, 64), (60, 64)])
 def test_slots_are_grown_for_edits_to_come(step, slots):
     config = CONFIGS["adaptive"].replace(levels=(Level(0.0, 1),))

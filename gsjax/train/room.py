@@ -2,7 +2,7 @@
 
 Each growth compiles anew: of pairs most of a step, of slots all of it. That takes
 longer than all its steps take for a little room beyond what is wanted, and less than
-for a lot.
+for a lot; on an accelerator, where what is empty costs next to nothing, hardly ever.
 """
 
 import math
@@ -23,20 +23,32 @@ from gsjax.train.state import TrainState
 
 # Slots grow before an edit may run short of them.
 _SLOT_MARGIN = 1.1
-# A program takes as long to compile as so many empty slots take in one step: 13 s at
-# 1.3 µs each (harmonics of degree 2), on two cores.
-_SLOTS_OF_PROGRAM = 1e7
 _FEWEST_SLOTS = 1024
 # For pairs: of a scene that does not grow, and from less to more of one that does.
 _PAIR_MARGIN, _GROWING_MARGINS = 1.5, (2.5, 4.0)
 _PER_GROWTH = 1.2  # pairs grow with Gaussians, and views not probed may want more
 _WIDENING = 2.0  # and Gaussians begin narrow, half as wide as they are apart
-# A program takes as long to compile as so many empty pairs take in one view: 22 s at
-# 0.12 µs each, on two cores.
-_PAIRS_OF_PROGRAM = 1.8e8
 _MAX_PROBED_VIEWS = 6
 # What the steps of the compositor want room in where tiles hold few pairs.
 _PAIRS_OF_TILE = 7
+
+
+class _Price(NamedTuple):
+    """Of a program: as long as it takes to compile, so many empty slots take in one
+    step (harmonics of degree 2), and so many empty pairs in one view. And how many
+    slots there may be, for the sake of memory, for each Gaussian."""
+
+    slots: float
+    pairs: float
+    most: float
+
+
+_ON_CPU = _Price(13 / 1.3e-6, 22 / 0.12e-6, math.inf)  # seconds, on two cores
+_ON_ACCELERATOR = _Price(16 / 1e-9, 16 / 0.3e-9, 4.0)  # an H100
+
+
+def _price() -> _Price:
+    return _ON_CPU if jax.default_backend() == "cpu" else _ON_ACCELERATOR
 
 
 def pairs_for(state: TrainState, frames: Frames, config: TrainConfig) -> int:
@@ -132,7 +144,7 @@ def roomy_pairs(wanted: int, state: TrainState, config: TrainConfig) -> int:
     if step < config.chosen.stop:
         # Room until the next program is due anyway, at the price of one.
         views = config.batch * _steps_of_program(step, config)
-        worth = _PAIRS_OF_PROGRAM / views
+        worth = _price().pairs / views
         growing = float(np.clip(1 + worth / wanted, *_GROWING_MARGINS))
         count = max(1, _count(state))
         room = min(_likely(count, step, config), state.gaussians.capacity)
@@ -164,12 +176,13 @@ def slots_for(count: int, step: int, config: TrainConfig) -> int:
 
     If r come with every step, room for m lasts m / r steps, in which half of it is
     empty on average. Compiling and what is empty cost least together at m = √(2 r p),
-    p being `_SLOTS_OF_PROGRAM` (the lot size of Harris 1913). But no more than come
-    until a program is due anyway.
+    p being the price of a program in slots (the lot size of Harris 1913). But no more
+    than come until a program is due anyway.
     """
-    to_come = _likely(count, step, config) - count
+    price, to_come = _price(), _likely(count, step, config) - count
     growing = min(_steps_of_program(step, config), config.chosen.stop - step)
-    room = min(to_come, math.sqrt(2 * _SLOTS_OF_PROGRAM * to_come / max(1, growing)))
+    room = min(to_come, math.sqrt(2 * price.slots * to_come / max(1, growing)))
+    room = min(room, price.most * max(1, count) - count)
     wanted = max(_FEWEST_SLOTS, math.ceil(count + room))
     unit = 2 ** max(0, wanted.bit_length() - 4)  # an eighth or less of it
     return -(-wanted // unit) * unit
