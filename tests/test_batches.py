@@ -26,8 +26,6 @@ from pictures import images, largest_difference
 import gsjax
 from gsjax.raster.batches import any_of_batch, least_of_batch
 
-pytestmark = pytest.mark.new_emitters
-
 
 @pytest.mark.parametrize(("dtype", "bar"), [(jnp.float32, 1e-6), (jnp.float64, 4e-15)])
 def test_single_batch_and_vmap(dtype, bar, report):
