@@ -13,6 +13,8 @@ Folders of runs, as further arguments, are timed too, at one view each. With
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,8 +39,29 @@ from gsjax.raster.order import depth_order
 from gsjax.raster.project import conics_of, project
 
 
-def stages(case: scenes.Case, config: gsjax.RasterConfig):
-    """Jitted stages of one view, each with its inputs ready: a dict of functions."""
+class Prepared(NamedTuple):
+    """A view up to the lists of its tiles, on every device.
+
+    Attributes:
+      spread: (function, whether each argument has a device's part) → that, of the
+        arguments, with ``function(device, *arguments)`` on every device.
+      grid, room: what `composite` is told.
+      project, bin: the stages.
+      projected, lists, schedule: what they come to.
+    """
+
+    spread: Callable[..., Callable[..., Any]]
+    grid: bins.Grid
+    room: int
+    project: Callable[..., Any]
+    bin: Callable[..., Any]
+    projected: Any
+    lists: Any
+    schedule: Any
+
+
+def prepare(case: scenes.Case, config: gsjax.RasterConfig) -> Prepared:
+    """What comes before the compositor, jitted and done."""
     gaussians, camera = case.gaussians, case.camera
     devices = jax.local_device_count()
     grid = bins.make_grid(camera.width, camera.height, config.tile_size, devices)
@@ -76,6 +99,23 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
         lists = bins.make_lists(projected, spans, grid, device, pairs)
         return lists, schedules.make_schedule(lists, grid, group, chunk, steps)
 
+    binning = jax.jit(spread(bin_local, False))
+    # On every device beforehand, as within one program.
+    projected = projected_of(gaussians, camera)
+    projected = jax.device_put(projected, NamedSharding(mesh, PartitionSpec()))
+    lists, schedule = binning(projected)
+    return Prepared(
+        spread, grid, steps, projected_of, binning, projected, lists, schedule
+    )
+
+
+def stages(case: scenes.Case, config: gsjax.RasterConfig):
+    """Jitted stages of one view, each with its inputs ready: a dict of functions."""
+    gaussians, camera = case.gaussians, case.camera
+    spread, grid, steps, projected_of, binning, *given = prepare(case, config)
+    projected, lists, schedule = given
+    group, chunk = schedule.tiles.shape[-1], config.chunk_size
+
     def composite_local(device, projected, lists, schedule):
         return composite(projected, lists, schedule, device, grid, steps, config)
 
@@ -108,14 +148,9 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
         inputs = (work.first, work.live, work.block, work.ranks)
         return lax.scan(step, open_, inputs)[1]
 
-    binning = jax.jit(spread(bin_local, False))
     counting = jax.jit(spread(count_local, False, True, True))
     spread_composite = spread(composite_local, False, True, True)
     compositing = jax.jit(spread_composite)
-    # On every device beforehand, as within one program.
-    projected = projected_of(gaussians, camera)
-    projected = jax.device_put(projected, NamedSharding(mesh, PartitionSpec()))
-    lists, schedule = binning(projected)
     image = compositing(projected, lists, schedule)
     cotangent = jax.random.normal(jax.random.key(0), image["sums"].shape)
 
