@@ -1,4 +1,4 @@
-"""Claim: one compiled loop over single Gaussians composites about as fast as C++.
+"""Claim: one compiled loop over single Gaussians takes no longer than plain C++.
 
 ``python benchmarks/one_kernel.py [RUN …]`` times three compositors of one view in turn,
 forward: that of the library, chunk by chunk; the C++ of `yardstick`; and a loop that
@@ -6,8 +6,8 @@ blends one Gaussian into one tile a turn, in plain JAX, until its pixels have st
 XLA makes one kernel of a loop whose turn touches little, by default less than 1 kB
 (`gsjax.raster.loops`). A turn of 64 pixels touches three, so this process raises that
 limit, by an option that is read when JAX starts. It is an experiment: the library has
-no such compositor. The pictures are held against one another, and the program fails if
-they differ, or if XLA made no single kernel.
+no such compositor. Its picture is held against that of the chunks, and the program
+fails if they differ, or if XLA made no single kernel.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def by_gaussian(
 ) -> Array:
     """Colours and alpha [T, C, P] of a device's tiles, before the background.
 
-    ``ones`` [P] are 1 in a way that XLA does not know: it works anew in every kernel
-    what it takes for cheap, α for each channel, but not a quotient.
+    ``ones`` [P] are 1 in a way that XLA does not know: it works out anew in every
+    kernel what it takes for cheap, α for each channel, but not a quotient.
     """
     columns = columns_of(projected._replace(probe=None), config)
     rows = table_of([column for some in columns.values() for column in some])

@@ -71,7 +71,7 @@ def main(
             logged = read_metrics(run_files(run).metrics)[-1]
             last = {key: logged[key] for key in ("compilations", "compile_seconds")}
             rows += [{"strategy": strategy + more, **record} for record in found]
-            rows[-1] |= {**last, "date": machine["date"]}
+            rows[-1] |= {**last, "date": machine["date"], "cpu": machine["cpu"]}
     content = {"machine": machine, "claim": __doc__, "held out": held_out}
     files.write_json(measure.path_of(stem), {**content, "rows": rows})
     for row in rows:

@@ -401,9 +401,10 @@ def test_a_photograph_for_each_view():
         fit(subset(scene(), []), [], CONFIG)
 
 
-def test_more_room_while_gaussians_are_added():
+def test_more_room_while_gaussians_are_added(monkeypatch):
     """Fewer programs then: each lasts longer. Not for more than may come, nor, where
     there are many steps ahead, so much that it costs more than a program."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     many = 100 * int(num_active(initial_state(scene(), CONFIG).gaussians))
 
     def margin(pairs, step, most, steps, stop=5000, batch=1):
@@ -433,9 +434,10 @@ def test_more_room_while_gaussians_are_added():
 
 
 @pytest.mark.parametrize("steps", [1000, 4000, 30_000])
-def test_slots_cost_least(steps):
+def test_slots_cost_least(monkeypatch, steps):
     """Of all lots in which a growing run could add slots, no other costs a tenth less:
     a program is 10⁷ empty slots in a step."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     first, last = 20_000, 200_000
     mcmc = McmcSettings(start=0, stop=steps, every=1, growth=2, max_gaussians=last)
     config = CONFIG.replace(strategy="mcmc", mcmc=mcmc, steps=steps)
@@ -476,6 +478,7 @@ def test_an_accelerator_grows_once_for_each_size_of_the_photographs(monkeypatch)
         slots = [slots_for(first, step, config) for step in (0, finer, steps)]
         return *slots, roomy_pairs(300_000, state, config)
 
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     coarse, fine, last, pairs = room()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     coarse_there, fine_there, last_there, pairs_there = room()
