@@ -31,6 +31,10 @@ from gsjax.settings import whole
 # Programs are a few hundred kB each; a folder of more than this loses its oldest.
 _MAX_KEPT_BYTES = 500_000_000
 
+# What a turn of a loop may touch for XLA's CPU backend to make one kernel of the loop.
+KERNEL_BYTES = 131_072
+_KERNEL_OPTION = "xla_cpu_small_while_loop_byte_threshold"
+
 # Names and numbers of `mallopt`, from <malloc.h> of glibc.
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
 
@@ -76,7 +80,22 @@ def use_all_cores(count: int | None = None, *, queued: bool = True) -> int:
                 "use_all_cores came after JAX had started; call it before the first "
                 "computation, right after import gsjax"
             ) from error
+        make_kernels_of_loops()
         return jax.local_device_count()  # starts JAX
+
+
+def make_kernels_of_loops() -> None:
+    """Let XLA's CPU backend make one kernel of a loop whose turn touches no more than
+    `KERNEL_BYTES`, unless its flags say otherwise; by default it is 1 kB.
+
+    It reads them when JAX starts. They stay as they are for good: JAX keeps compiled
+    programs by them.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if _KERNEL_OPTION in flags or flags and not flags.startswith("--"):
+        return  # or it is the name of a file that has the flags
+    option = f"--xla_backend_extra_options={_KERNEL_OPTION}={KERNEL_BYTES}"
+    os.environ["XLA_FLAGS"] = f"{flags} {option}".strip()
 
 
 @contextmanager

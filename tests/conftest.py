@@ -41,6 +41,7 @@ from gsjax.stress.scenes import fields_at
 gc.set_threshold(200_000, 20, 50)
 # Thousands of programs of all sizes in one process: memory kept would only pile up.
 gsjax.devices.keep_memory = lambda: False
+gsjax.devices.make_kernels_of_loops()  # as the command line does
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -29,7 +29,7 @@ _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
 def running_product(alpha: Array) -> tuple[Array, Array]:
     """(Π over all K, Π over those before k [G, K, P]) of 1 − alpha [G, K, P]."""
-    return _running(_pass, _pass_both, jnp.ones_like(alpha[:, :1]), alpha)
+    return _running(pass_through, _pass_both, jnp.ones_like(alpha[:, :1]), alpha)
 
 
 def _running_sum(values: Array) -> tuple[Array, Array]:
@@ -37,7 +37,7 @@ def _running_sum(values: Array) -> tuple[Array, Array]:
     return _running(jnp.add, _add_both, jnp.zeros_like(values[:, :1]), values)
 
 
-def _pass(product: Array, alpha: Array) -> Array:
+def pass_through(product: Array, alpha: Array) -> Array:
     """T (1 − α): as T − T α where that rounds less; from a half on 1 − α is exact."""
     return jnp.where(alpha < 0.5, product - product * alpha, product * (1 - alpha))
 
@@ -46,7 +46,7 @@ def _pass_both(product: Array, first: Array, second: Array) -> Array:
     """T (1 − α) (1 − β), which rounds T once: what both take is α + β − αβ."""
     both = first + second * (1 - first)
     product = jnp.where(both < 0.5, product, product * (1 - first))
-    return _pass(product, jnp.where(both < 0.5, both, second))
+    return pass_through(product, jnp.where(both < 0.5, both, second))
 
 
 def _add_both(total: Array, first: Array, second: Array) -> Array:

@@ -45,6 +45,7 @@ from gsjax.raster.schedules import (
     make_work,
     ranks_at,
 )
+from gsjax.raster.single import composite_singly, suits
 from gsjax.raster.types import Array, Projected, RasterConfig
 
 T = TypeVar("T")
@@ -83,7 +84,9 @@ def composite(
     # and every turn of a loop copy the images of all.
     @sequential_vmap
     def one(projected, lists, schedule, device):
-        return _by_blocks(projected, lists, schedule, device, grid, config)
+        if suits(projected, grid):
+            return composite_singly(projected, lists, device, grid, config)
+        return by_blocks(projected, lists, schedule, device, grid, config)
 
     return one(projected, lists, schedule, device)
 
@@ -104,7 +107,7 @@ def _composite_jvp(grid, room, config, primals, tangents):
     return jax.jvp(by_moving, [leaves[i] for i in moving], [slopes[i] for i in moving])
 
 
-def _by_blocks(
+def by_blocks(
     projected: Projected,
     lists: Lists,
     schedule: Schedule,

@@ -11,14 +11,30 @@ a batch goes one after another.
 Axis legend: I items, T tiles.
 """
 
+from functools import cache
+
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import sequential_vmap
 
+from gsjax.devices import KERNEL_BYTES
 from gsjax.raster.types import Array
 
 STRETCH = 256  # slots that `places` looks at or leaves out together
 _ADDED = 4  # counts that `running_total` adds in a turn; of 16 it is no kernel
+
+
+@cache
+def large_are_kernels() -> bool:
+    """Whether this process's XLA makes one kernel also of a loop whose turn touches
+    `KERNEL_BYTES`; see `gsjax.use_all_cores`. Found out by compiling one."""
+    numbers = jax.ShapeDtypeStruct((KERNEL_BYTES // 10,), jnp.float32)  # 8 bytes each
+
+    def loop(x):
+        return _each(0, 9, lambda _, x: 2 * x + 1, x)
+
+    return "xla_cpu_small_call" in jax.jit(loop).lower(numbers).compile().as_text()
 
 
 def _at(values: Array, index: Array) -> Array:
