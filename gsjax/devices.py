@@ -92,7 +92,7 @@ def make_kernels_of_loops() -> None:
     programs by them.
     """
     flags = os.environ.get("XLA_FLAGS", "")
-    if _KERNEL_OPTION in flags or flags and not flags.startswith("--"):
+    if _KERNEL_OPTION in flags or (flags and not flags.startswith("--")):
         return  # or it is the name of a file that has the flags
     option = f"--xla_backend_extra_options={_KERNEL_OPTION}={KERNEL_BYTES}"
     os.environ["XLA_FLAGS"] = f"{flags} {option}".strip()

@@ -163,7 +163,8 @@ def test_it_is_one_kernel_wherever_it_suits(tile, dtype):
     assert inside.count(" while(") == 3  # over tiles, looks and Gaussians
     # Nothing large is copied, and α is evaluated once for each Gaussian of a turn.
     assert f"[64,{most + 2},{tile * tile}]{{2,1,0}} copy(" not in inside
-    assert len(re.findall(r" (exponential|round-nearest-even)\(", inside)) == single.TURN
+    exponents = re.findall(r" (exponential|round-nearest-even)\(", inside)
+    assert len(exponents) == single.TURN
 
 
 def test_too_small_a_tile_does_not_suit():
