@@ -5,6 +5,7 @@ of the default settings (8 × 8 tiles, its own lists) against a C++ compositor w
 threads over the standard exact 16 × 16 lists of the same scene, without early
 termination; forward, and value and gradient. The C++ gradient comes in two forms: by
 Gaussian with the pixels vectorised (tuned), and by pixel, as GPU code has it (plain).
+Forward also by chunks, as where XLA makes no single kernel of the loops.
 
 Folders of runs, as further arguments, are timed too, at one view each. With
 ``--queued`` JAX has the threads that queued calls need: the price of that.
@@ -27,14 +28,14 @@ from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import gsjax
-from gsjax.raster import bins, schedules
+from gsjax.raster import bins, schedules, single
 from gsjax.raster.alpha import alphas, pixel_centres
 from gsjax.raster.blend import (
     running_product,
     splats_of,
     tables_of,
 )
-from gsjax.raster.composite import composite, take_rows
+from gsjax.raster.composite import by_chunks, composite, take_rows
 from gsjax.raster.order import depth_order
 from gsjax.raster.project import conics_of, project
 
@@ -114,43 +115,55 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     gaussians, camera = case.gaussians, case.camera
     spread, grid, steps, projected_of, binning, *given = prepare(case, config)
     projected, lists, schedule = given
-    group, chunk = schedule.tiles.shape[-1], config.chunk_size
+    group = schedule.tiles.shape[-1]
+    share = -(-config.pair_capacity // jax.local_device_count())
 
     def composite_local(device, projected, lists, schedule):
         return composite(projected, lists, schedule, device, grid, steps, config)
 
-    def count_local(device, projected, lists, schedule):
+    def chunks_local(device, projected, lists, schedule):
+        return by_chunks(projected, lists, schedule, device, grid, config)
+
+    # A look at who is open is a level of a schedule of chunks as small.
+    look = single.LOOK
+    looks = schedules.step_capacity(share, grid, group, look)
+
+    def count_local(device, projected, lists):
         """[steps] each: evaluations made, and those of them that change the image."""
         tables = tables_of(projected, config)
-        unrolled = schedules.make_steps(schedule, steps)
+        by_look = schedules.make_schedule(lists, grid, group, look, looks)
+        unrolled = schedules.make_steps(by_look, looks)
         none = projected.u.shape[0]
-        work = schedules.make_work(lists, schedule, unrolled, chunk, none, steps)
+        work = schedules.make_work(lists, by_look, unrolled, look, none, looks)
         pixels = pixel_centres(grid.tile, projected.u.dtype)
 
         def step(carried, inputs):
             first, live, block, ranks = inputs
-            corner = bins.corners(schedule.tiles[block], grid, device, pixels.dtype)
+            corner = bins.corners(by_look.tiles[block], grid, device, pixels.dtype)
             splats = take_rows(tables.splats, ranks)
             carried = jnp.where(first, 1, carried)
-            go = live & jnp.any(carried > config.stop)
+            go = live & jnp.any(carried > config.stop, 1)
             alpha = alphas(splats_of(splats, corner), pixels, config)
             total, before = running_product(alpha)
             reached = carried[:, None] * before
             if config.stop_rule == "before":
                 reached = reached * (1 - alpha)
             blended = (alpha > 0) & (reached > config.stop)
-            # Lists of few go through a shorter chunk.
-            length = jnp.where(block < schedule.few, chunk, min(schedules.FEW, chunk))
-            made = go * length * (alpha.size // chunk)
-            return carried * total, (made, go * jnp.sum(blended))
+            count = jnp.sum(ranks < none, 1)
+            made = -(-count // single.TURN) * single.TURN * alpha.shape[2]
+            changed = jnp.sum(blended, (1, 2))
+            return carried * total, (jnp.sum(go * made), jnp.sum(go * changed))
 
         open_ = jnp.ones((group, pixels.shape[1]), projected.u.dtype)
         inputs = (work.first, work.live, work.block, work.ranks)
         return lax.scan(step, open_, inputs)[1]
 
-    counting = jax.jit(spread(count_local, False, True, True))
+    if not single.suits(projected, grid):
+        raise SystemExit("XLA makes no single kernel of the loops in this process")
+    counting = jax.jit(spread(count_local, False, True))
     spread_composite = spread(composite_local, False, True, True)
     compositing = jax.jit(spread_composite)
+    by_chunk = jax.jit(spread(chunks_local, False, True, True))
     image = compositing(projected, lists, schedule)
     cotangent = jax.random.normal(jax.random.key(0), image["sums"].shape)
 
@@ -169,12 +182,13 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     training = jax.jit(jax.value_and_grad(render_loss))
     evaluations, contributions = (
         float(np.sum(np.asarray(number), dtype=np.float64))
-        for number in counting(projected, lists, schedule)
+        for number in counting(projected, lists)
     )
     functions = {
         "project": lambda: projected_of(gaussians, camera),
         "bin": lambda: binning(projected),
         "composite": lambda: compositing(projected, lists, schedule),
+        "composite by chunks": lambda: by_chunk(projected, lists, schedule),
         "composite v+g": lambda: gradient(projected, lists, schedule, cotangent),
         "render": lambda: render(gaussians, camera, config=config),
         "render v+g": lambda: training(gaussians.params, camera, weight),
@@ -225,6 +239,7 @@ def main() -> None:
                 "scene": case.name,
                 **{f"{name} ms": value for name, value in ms.items()},
                 "forward / C++": ms["composite"] / ms["C++"],
+                "by chunks / forward": ms["composite by chunks"] / ms["composite"],
                 "v+g / C++ tuned": ms["composite v+g"] / ms["C++ v+g tuned"],
                 "v+g / C++ plain": ms["composite v+g"] / ms["C++ v+g plain"],
                 "render / composite": ms["render"] / ms["composite"],

@@ -97,7 +97,7 @@ def test_both_are_plain_blending(way, config, dtype, bar, report):
         if way == "single":
             assert single.suits(projected, grid)
             return single.composite_singly(projected, some, device, grid, config)
-        return composite.by_blocks(projected, some, schedule, device, grid, config)
+        return composite.by_chunks(projected, some, schedule, device, grid, config)
 
     found = blended(projected, some, schedule)
     wanted = plain(projected, lists(), grid, config)

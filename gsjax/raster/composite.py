@@ -86,7 +86,7 @@ def composite(
     def one(projected, lists, schedule, device):
         if suits(projected, grid):
             return composite_singly(projected, lists, device, grid, config)
-        return by_blocks(projected, lists, schedule, device, grid, config)
+        return by_chunks(projected, lists, schedule, device, grid, config)
 
     return one(projected, lists, schedule, device)
 
@@ -107,7 +107,7 @@ def _composite_jvp(grid, room, config, primals, tangents):
     return jax.jvp(by_moving, [leaves[i] for i in moving], [slopes[i] for i in moving])
 
 
-def by_blocks(
+def by_chunks(
     projected: Projected,
     lists: Lists,
     schedule: Schedule,
