@@ -225,13 +225,6 @@ def test_schedule_covers_every_chunk_once(chunk):
     ranks, block = np.asarray(work.ranks), np.asarray(work.block)
     live, first = np.asarray(work.live), np.asarray(work.first)
     assert live.sum() == int(schedule.steps)
-    # No block holds both tiles of few Gaussians and tiles of more.
-    lengths = np.append(lists.length, 0)[np.asarray(schedule.tiles)]
-    few = lengths <= (schedules.FEW if chunk > schedules.FEW else 0)
-    np.testing.assert_array_equal(
-        few.all(1) | (lengths == 0).all(1), np.arange(len(few)) >= schedule.few
-    )
-    assert not (~few & (np.arange(len(few)) >= schedule.few)[:, None]).any()
     assert (ranks[~live] == COUNT).all()
     rebuilt = np.zeros((grid.tiles, COUNT), int)
     last = np.full(grid.tiles + 1, -1)

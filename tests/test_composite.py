@@ -10,9 +10,7 @@ from gsjax.raster.alpha import pixel_centres
 from gsjax.raster.blend import (
     Chunk,
     Parts,
-    _sums_as_of,
     blend_chunk,
-    channel_sums,
     running_product,
 )
 
@@ -82,20 +80,3 @@ def test_products_of_any_number(size):
     np.testing.assert_allclose(total, passed[:, -1], rtol=size * 2.0**-23)
     np.testing.assert_allclose(before[:, 1:], passed[:, :-1], rtol=size * 2.0**-23)
     np.testing.assert_array_equal(before[:, 0], 1)
-
-
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize(
-    ("size", "few", "groups"),
-    [(32, 8, 64), (32, 8, 6), (32, 8, 1), (64, 8, 4), (20, 8, 4), (9, 8, 3)],
-)
-def test_few_are_summed_with_the_bits_of_a_whole_chunk(size, few, groups, dtype):
-    rng = np.random.default_rng(size * groups)
-    weight = rng.uniform(0, 0.3, (groups, few, 64)).astype(dtype)
-    channels = rng.normal(size=(groups, few, 5)).astype(dtype)
-    rest = ((0, 0), (0, size - few), (0, 0))
-    with jax.enable_x64(dtype == "float64"):
-        whole = jax.jit(channel_sums)(np.pad(weight, rest), np.pad(channels, rest))
-        short = jax.jit(_sums_as_of, static_argnums=0)(size, weight, channels)
-    assert short.dtype == dtype
-    np.testing.assert_array_equal(short, whole)

@@ -11,7 +11,6 @@ matrix products both ways, each with its operands as XLA wants them. What is lef
 running product.
 """
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -190,28 +189,6 @@ def _channel_sums_jvp(primals, tangents):
     return channel_sums(weight, channels), by_weight + by_channels
 
 
-def _sums_as_of(size: int, weight: Array, channels: Array) -> Array:
-    """`channel_sums` of K ≤ ``size`` Gaussians by products over ``size``: the bits are
-    those of a whole chunk.
-
-    Several tiles share a product where K is smaller. Each has columns of its own, in
-    which the Gaussians of the others are 0.
-    """
-    groups, few, pixels = weight.shape
-    if few == size:
-        return channel_sums(weight, channels)
-    tiles = math.gcd(size // few, groups)
-    apart = channels.reshape(-1, tiles, few, 1, channels.shape[2])
-    shape = groups // tiles, tiles, few, tiles, channels.shape[2]
-    mine, column = (lax.broadcasted_iota(jnp.int32, shape, axis) for axis in (1, 3))
-    apart = jnp.where(mine == column, apart, 0)
-    apart = apart.reshape(groups // tiles, tiles * few, -1)
-    weight = weight.reshape(groups // tiles, tiles * few, pixels)
-    rest = ((0, 0), (0, size - tiles * few), (0, 0))
-    sums = channel_sums(jnp.pad(weight, rest), jnp.pad(apart, rest))
-    return sums.reshape(groups, channels.shape[2], pixels)
-
-
 def blend_chunk(
     carried: Array, chunk: Chunk, pixels: np.ndarray, config: RasterConfig
 ) -> tuple[Array, dict[str, Array]]:
@@ -223,7 +200,9 @@ def blend_chunk(
       to add: "sums" [G, C, P], "median" [G, P] where asked for.
     """
     alpha = alphas_of(chunk, pixels, config)
-    return blend_alphas(carried, alpha, chunk.parts, config)
+    total, out = sums_behind(carried, alpha, chunk.parts, config)
+    # What is carried stands outside: its derivative then needs no sum over Gaussians.
+    return carried * total, {**out, "sums": carried[:, None] * out["sums"]}
 
 
 def alphas_of(chunk: Chunk, pixels: np.ndarray, config: RasterConfig) -> Array:
@@ -235,15 +214,6 @@ def alphas_of(chunk: Chunk, pixels: np.ndarray, config: RasterConfig) -> Array:
     return alpha
 
 
-def blend_alphas(
-    carried: Array, alpha: Array, parts: Parts, config: RasterConfig
-) -> tuple[Array, dict[str, Array]]:
-    """`blend_chunk` of Gaussians whose ``alpha`` [G, K, P] is known."""
-    total, out = sums_behind(carried, alpha, parts, config)
-    # What is carried stands outside: its derivative then needs no sum over Gaussians.
-    return carried * total, {**out, "sums": carried[:, None] * out["sums"]}
-
-
 def sums_behind(
     carried: Array,
     alpha: Array,
@@ -251,8 +221,9 @@ def sums_behind(
     config: RasterConfig,
     left: Array | None = None,
 ) -> tuple[Array, dict[str, Array]]:
-    """As `blend_alphas`, but what is returned is of the chunk by itself: ``carried``
-    tells who stops, and has no part in the transmittance or in "sums".
+    """As `blend_chunk` of Gaussians whose ``alpha`` [G, K, P] is known, but what is
+    returned is of the chunk by itself: ``carried`` tells who stops, and has no part in
+    the transmittance or in "sums".
 
     ``left`` [G, P] is what the chunk behind this one is told is carried; None for the
     product.
@@ -265,7 +236,7 @@ def sums_behind(
     behind = reached * (1 - alpha)
     blended = (behind if config.stop_rule == "before" else reached) > config.stop
     weight = jnp.where(blended, alpha * before, 0)
-    out = {"sums": _sums_as_of(config.chunk_size, weight, parts.channels)}
+    out = {"sums": channel_sums(weight, parts.channels)}
     if parts.depth is not None:
         # The last that more than half reaches, if less is left behind all. By their
         # number: rounding may let more reach one than the one before it.

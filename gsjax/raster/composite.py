@@ -1,17 +1,18 @@
-"""Front-to-back compositing of sorted tile lists, chunk by chunk, on a CPU; see
-`gsjax.raster.flat` for accelerators.
+"""Front-to-back compositing of sorted tile lists on a CPU; see `gsjax.raster.flat` for
+accelerators.
 
 Axis legend: S steps, G tiles of a step, K Gaussians of a chunk, P pixels of a tile,
 C channels, R ranks.
 
-There are two ways through the lists, and both blend the same chunks in the same order
-(`gsjax.raster.blend`). Where no derivative is taken, a block of tiles goes on for as
-long as there are chunks and pixels that have not stopped, and each chunk is gathered
-when it is due: nothing is kept, and nothing is paid for room. Loops of unknown length
-have no transpose, so where a derivative is taken the steps are a `lax.scan` over all
-there is room for, with the chunks gathered ahead. There chunks are recomputed in the
-backward pass instead of kept, and those behind pixels that have all stopped are
-skipped, in both directions, by `lax.cond`.
+There are three ways through the lists. Where no derivative is taken, nothing is kept,
+nothing is paid for room, and a Gaussian is looked up when it is due: one by one
+(`gsjax.raster.single`) where XLA makes one kernel of that, else chunk by chunk, for as
+long as a block of tiles has chunks and pixels that have not stopped. Loops of unknown
+length have no transpose, so where a derivative is taken the steps are a `lax.scan` over
+all there is room for, with the chunks gathered ahead. There chunks are recomputed in
+the backward pass instead of kept, and those behind pixels that have all stopped are
+skipped, in both directions, by `lax.cond`. Both ways by chunks blend the same chunks in
+the same order (`gsjax.raster.blend`).
 """
 
 from functools import partial
@@ -29,28 +30,17 @@ from gsjax.raster.bins import Grid, Lists, corners
 from gsjax.raster.blend import (
     Chunk,
     Parts,
-    alphas_of,
-    blend_alphas,
     blend_chunk,
     columns_of,
     table_of,
     tables_of,
 )
 from gsjax.raster.ladder import on_ladder
-from gsjax.raster.schedules import (
-    FEW,
-    Schedule,
-    Work,
-    make_steps,
-    make_work,
-    ranks_at,
-)
+from gsjax.raster.schedules import Schedule, Work, make_steps, make_work, ranks_at
 from gsjax.raster.single import composite_singly, suits
 from gsjax.raster.types import Array, Projected, RasterConfig
 
 T = TypeVar("T")
-
-_SEVERAL = 4  # blocks of tiles with few Gaussians are composited so many at once
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6))
@@ -115,7 +105,7 @@ def by_chunks(
     grid: Grid,
     config: RasterConfig,
 ) -> dict[str, Array]:
-    """`composite` by loops that are as long as need be."""
+    """`composite` without a derivative, by loops that are as long as need be."""
     columns = columns_of(projected._replace(probe=None), config)
     # In one table: a Gaussian is looked up once.
     rows = table_of([column for some in columns.values() for column in some])
@@ -156,46 +146,10 @@ def by_chunks(
         *_, image = lax.while_loop(more, advance, start)
         return jax.tree.map(lambda all_, one: all_.at[block].set(one), images, image)
 
-    # Past the last block there are tiles with no list.
-    tiles = jnp.pad(
-        schedule.tiles, ((0, 2 * _SEVERAL), (0, 0)), constant_values=grid.tiles
-    )
-
-    def several(i):
-        """Rows of the table, and α."""
-        block = many + i * _SEVERAL
-        tile = lax.dynamic_slice_in_dim(tiles, block, _SEVERAL).ravel()
-        mine = take_rows(rows, ranks_at(lists, tile, jnp.int32(0), FEW, none))
-        chunk = Chunk(parts_of(mine), corners(tile, grid, device, rows.dtype))
-        return mine, alphas_of(chunk, pixels, config)
-
-    def of_several(i, state):
-        (mine, alpha), images = state
-        whole = jnp.ones_like(alpha[:, 0])
-        _, image = blend_alphas(whole, alpha, parts_of(mine), config)
-        at = jnp.where(i < 0, tiles.shape[0] - _SEVERAL, many + i * _SEVERAL)
-
-        def put(all_, more):
-            more = more.reshape(_SEVERAL, *all_.shape[1:])
-            return lax.dynamic_update_slice_in_dim(all_, more, at, 0)
-
-        # From one turn to the next: within one, XLA would evaluate α again for each
-        # place of the running product that it goes into. So the first has none yet,
-        # and its image goes where none is looked for.
-        return several(i + 1), jax.tree.map(put, images, image)
-
     used = jnp.sum(schedule.levels > 0, dtype=jnp.int32)
-    many = jnp.minimum(schedule.few, used)
-    images = {
-        name: jnp.zeros((tiles.shape[0], *v.shape), v.dtype)
-        for name, v in nothing.items()
-    }
-    images = lax.fori_loop(0, many, of_block, images)
-    if config.chunk_size > FEW:
-        turns = -((many - used) // _SEVERAL)
-        none_yet = jax.tree.map(jnp.zeros_like, jax.eval_shape(several, many))
-        first = -jnp.minimum(turns, 1)
-        _, images = lax.fori_loop(first, turns, of_several, (none_yet, images))
+    blocks = schedule.tiles.shape[0]
+    images = {k: jnp.zeros((blocks, *v.shape), v.dtype) for k, v in nothing.items()}
+    images = lax.fori_loop(0, used, of_block, images)
     return _in_grid_order(images, schedule, grid)
 
 

@@ -18,8 +18,6 @@ from gsjax.raster.counts import COUNT_LIMIT, owners, running_total, take, total_
 from gsjax.raster.sorting import argsort_descending
 from gsjax.raster.types import Array, RasterConfig
 
-FEW = 8  # Gaussians, which go through a chunk that is as small
-
 
 class Schedule(NamedTuple):
     """Blocks of G tiles of like length, each taking ``levels`` steps.
@@ -28,14 +26,11 @@ class Schedule(NamedTuple):
       tiles: [blocks, G]; places past the last tile hold T, whose list is empty.
       levels: [blocks] steps of each block, falling; all 0 if there is no room.
       steps: [] how many are wanted, saturating.
-      few: [] the first block of tiles with no more than `FEW` Gaussians, which
-        a chunk of as many holds.
     """
 
     tiles: Array
     levels: Array
     steps: Array
-    few: Array
 
 
 class Steps(NamedTuple):
@@ -71,27 +66,19 @@ def make_schedule(
 ) -> Schedule:
     """Tiles by falling length, in blocks of ``group``, ``chunk`` Gaussians a step.
 
-    Tiles of few Gaussians begin a block, so that which way a tile goes depends on its
-    own list alone. Nothing is to be done if there are more than ``room`` steps, or the
-    lists did not fit.
+    Nothing is to be done if there are more than ``room`` steps, or the lists did not
+    fit.
     """
-    few = FEW if chunk > FEW else 0
-    blocks = 1 + -(-grid.tiles // group)
+    blocks = -(-grid.tiles // group)
     order = argsort_descending(lists.length)
-    many = jnp.sum(lists.length > few, dtype=jnp.int32)
-    first_few = -(-many // group)
-    place = lax.iota(jnp.int32, blocks * group)
-    gap = first_few * group - many
-    index = jnp.where(place < many, place, place - gap)
-    there = (place < many) | (place >= many + gap) & (index < grid.tiles)
-    tiles = jnp.where(there, take(order, index), grid.tiles).reshape(blocks, group)
+    gap = (0, blocks * group - grid.tiles)
+    tiles = jnp.pad(order, gap, constant_values=grid.tiles).reshape(blocks, group)
     levels = -(-take(lists.length, tiles[:, 0]) // chunk)
     steps, _ = total_count(levels)
     return Schedule(
         tiles=tiles,
         levels=jnp.where(lists.fit & (steps <= room), levels, 0),
         steps=steps,
-        few=first_few,
     )
 
 
