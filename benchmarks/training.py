@@ -29,6 +29,7 @@ from gsjax.train.history import read_metrics
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 EVERY = 50
+LEAST = 0.5  # dB that a picture spans: runs that differ by nothing are 0.4 apart
 STRATEGIES = ("mcmc", "adaptive")
 CHANGES = ("preset", "steps", "max-gaussians")
 
@@ -133,7 +134,9 @@ def write(
     if series:
         # The names of the lines stand beside the title.
         size = (720 if len(series) < 4 else 1200, 420)
-        picture = curves(series, title=title, x_label=x_label, size=size, log_x=log_x)
+        picture = curves(
+            series, title=title, x_label=x_label, size=size, log_x=log_x, least=LEAST
+        )
         files.write_file(path, images.encode_png(picture))
 
 

@@ -65,6 +65,7 @@ def curves(
     size: tuple[int, int] = (720, 420),
     marks: Sequence[Mark] = (),
     log_x: bool = False,
+    least: float = 0.0,
 ) -> np.ndarray:
     """A plot [H, W, 3] uint8 of all series in one frame, with a legend.
 
@@ -75,6 +76,7 @@ def curves(
       size: (width, height) in px, at least 200 × 120.
       marks: by ``x``; those that lie within the frame are drawn, behind the series.
       log_x: whether ``x`` is logarithmic; what is not above 0 is left out then.
+      least: how much of ``y`` is shown at least, lest noise look like a rise or a fall.
 
     Raises:
       InputError: if ``x`` and ``y`` differ in length, or the size is too small.
@@ -90,7 +92,7 @@ def curves(
     finite = np.concatenate(
         [np.zeros((0, 2)), *(p[np.isfinite(p).all(axis=1)] for p in lines)]
     )
-    ranges = _range(finite[:, 0], 0.0), _range(finite[:, 1], 0.06)
+    ranges = _range(finite[:, 0], 0.0), _range(finite[:, 1], 0.06, least)
     plot, place = axes(
         *ranges, title=title, x_label=x_label, size=size, log=(log_x, False)
     )
@@ -192,11 +194,13 @@ def _points(line: Series) -> np.ndarray:
     return np.stack([x, y], axis=1)
 
 
-def _range(values: np.ndarray, margin: float) -> tuple[float, float]:
-    """Least and greatest, a margin beyond; never empty."""
+def _range(values: np.ndarray, margin: float, least: float = 0) -> tuple[float, float]:
+    """Least and greatest, a margin beyond, and ``least`` apart; never empty."""
     if not len(values):
         return 0.0, 1.0
     low, high = float(values.min()), float(values.max())
+    short = max(0.0, least - (high - low)) / 2
+    low, high = low - short, high + short
     spread = high - low
     if spread <= 1e-9 * max(abs(low), abs(high), 1e-300):
         return low - 0.5 * (abs(low) or 1), high + 0.5 * (abs(high) or 1)
@@ -211,7 +215,10 @@ def _ticks(low: float, high: float, most: int, log: bool) -> list[tuple[float, s
     power = 10 ** np.floor(np.log10(least))
     step = power * next((m for m in (1, 2, 5) if m * power >= least), 10)
     places = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
-    return [(float(place), short_number(place)) for place in places]
+    # As many digits as tell one from the next.
+    digits = np.log10(max(abs(low), abs(high), step)) - np.log10(step)
+    digits = max(4, 1 + int(np.ceil(digits)))
+    return [(float(place), short_number(place, digits)) for place in places]
 
 
 def _decades(low: float, high: float, most: int) -> list[tuple[float, str]]:
@@ -231,12 +238,12 @@ def _decades(low: float, high: float, most: int) -> list[tuple[float, str]]:
     ]
 
 
-def short_number(value: float) -> str:
+def short_number(value: float, digits: int = 4) -> str:
     """Short: 1500 is 1.5k; the rounding of the ticks is not shown."""
     for size, letter in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
-            return f"{value / size:.4g}{letter}"
-    return f"{value + 0.0:.4g}" if abs(value) > 1e-12 else "0"
+            return f"{value / size:.{digits}g}{letter}"
+    return f"{value + 0.0:.{digits}g}" if abs(value) > 1e-12 else "0"
 
 
 def legend(plot: np.ndarray, labels: list[str], faint: Sequence[bool] = ()) -> None:

@@ -2,7 +2,8 @@
 and how work is shared by the devices.
 
 One host device for each core: XLA's CPU backend hardly uses a second core inside the
-compositor's loop, so the tiles are spread over several devices instead.
+compositor's loop, so the tiles are spread over several devices instead. And an option of
+XLA's, by which that loop is one kernel.
 
 And memory that is kept: XLA allocates the temporaries of a program anew at each call.
 From 32 MB on, glibc takes them from the system every time, page by page, which is a
@@ -46,7 +47,8 @@ def use_all_cores(count: int | None = None, *, queued: bool = True) -> int:
     control groups give it, as in a container: more devices than that only wait.
     Call it before the first computation: ``import gsjax; gsjax.use_all_cores()``. On
     a GPU or TPU it changes nothing that matters. `RasterConfig.devices` then
-    defaults to all of them; images do not depend on it. It also calls `keep_memory`.
+    defaults to all of them; images do not depend on it, but for rounding. It also calls
+    `keep_memory` and `make_kernels_of_loops`.
 
     Args:
       count: how many.
@@ -88,8 +90,8 @@ def make_kernels_of_loops() -> None:
     """Let XLA's CPU backend make one kernel of a loop whose turn touches no more than
     `KERNEL_BYTES`, unless its flags say otherwise; by default it is 1 kB.
 
-    It reads them when JAX starts. They stay as they are for good: JAX keeps compiled
-    programs by them.
+    A picture is then composited by one such loop. XLA reads ``XLA_FLAGS`` when JAX
+    starts. They stay as they are for good: JAX keeps compiled programs by them.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if _KERNEL_OPTION in flags or (flags and not flags.startswith("--")):

@@ -220,6 +220,29 @@ def test_marks_stand_where_they_say_and_their_names_apart(monkeypatch):
     assert all(frame[0] < u and u + wide <= frame[1] for (u, _), wide in boxes)
 
 
+@pytest.mark.parametrize(
+    ("low", "high"), [(24.3582, 24.3684), (1e6, 1.0001e6), (-0.001, 0.002), (3, 5e4)]
+)
+def test_no_two_ticks_say_the_same(low, high, monkeypatch):
+    said = []
+    monkeypatch.setattr("gsjax.curves.put_text", lambda _, text, *__: said.append(text))
+    curves([Series("", [777, 778], [low, high])], size=(400, 600))
+    upright = said[: said.index("777")]  # those along x begin there
+    assert len(upright) >= 5
+    assert len(set(upright)) == len(upright)
+
+
+@pytest.mark.parametrize(("y", "wanted"), [((3, 3.01), (0.2, 0.4)), ((3, 5), (0.8, 1))])
+def test_noise_is_not_drawn_as_a_rise(y, wanted):
+    """Two ends nearer to one another than is shown at least are drawn near, too."""
+    plain, shown = (
+        inked(curves([Series("a", [0, 1], y)], size=(400, 300), least=least))
+        for least in (0, 0.04)
+    )
+    assert 0.8 < np.ptp(np.nonzero(plain)[0]) / 226 < 1
+    assert wanted[0] < np.ptp(np.nonzero(shown)[0]) / 226 < wanted[1]
+
+
 def test_the_curves_of_a_run_mark_the_size_of_its_images(tmp_path, monkeypatch):
     """And say of which moment the count is."""
     told = {}

@@ -43,7 +43,7 @@ class RasterConfig:
 
     Attributes:
       tile_size: pixels along the side of a tile.
-      chunk_size: Gaussians of a tile composited in one go.
+      chunk_size: Gaussians of a tile composited in one go, where it goes by chunks.
       tiles_per_step: chunks of tiles composited side by side; None chooses by
         platform.
       pair_capacity: room for (tile, Gaussian) pairs of a camera; None chooses from
