@@ -124,12 +124,15 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     def chunks_local(device, projected, lists, schedule):
         return by_chunks(projected, lists, schedule, device, grid, config)
 
-    # A look at who is open is a level of a schedule of chunks as small.
-    look = single.LOOK
-    looks = schedules.step_capacity(share, grid, group, look)
+    # From one look at who is open to the next it takes so many Gaussians of each tile,
+    # or of a block of tiles, a whole number of turns.
+    singly = single.suits(projected, grid)
+    look, turn = (single.LOOK, single.TURN) if singly else (config.chunk_size,) * 2
+    looks = 2 * schedules.step_capacity(share, grid, group, look)
 
     def count_local(device, projected, lists):
-        """[steps] each: evaluations made, and those of them that change the image."""
+        """[steps] each: evaluations made, and those of them that change the image; and
+        whether there was room for all."""
         tables = tables_of(projected, config)
         by_look = schedules.make_schedule(lists, grid, group, look, looks)
         unrolled = schedules.make_steps(by_look, looks)
@@ -142,24 +145,23 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
             corner = bins.corners(by_look.tiles[block], grid, device, pixels.dtype)
             splats = take_rows(tables.splats, ranks)
             carried = jnp.where(first, 1, carried)
-            go = live & jnp.any(carried > config.stop, 1)
+            go = live & jnp.any(carried > config.stop, 1, keepdims=True)
+            go = (go if singly else jnp.any(go)) & jnp.ones((group, 1), bool)
             alpha = alphas(splats_of(splats, corner), pixels, config)
             total, before = running_product(alpha)
             reached = carried[:, None] * before
             if config.stop_rule == "before":
                 reached = reached * (1 - alpha)
             blended = (alpha > 0) & (reached > config.stop)
-            count = jnp.sum(ranks < none, 1)
-            made = -(-count // single.TURN) * single.TURN * alpha.shape[2]
-            changed = jnp.sum(blended, (1, 2))
-            return carried * total, (jnp.sum(go * made), jnp.sum(go * changed))
+            count = jnp.sum(ranks < none, 1, keepdims=True)
+            made = -(-count // turn) * turn if singly else turn
+            made = jnp.sum(go * made) * alpha.shape[2]
+            return carried * total, (made, jnp.sum(go[..., None] & blended))
 
         open_ = jnp.ones((group, pixels.shape[1]), projected.u.dtype)
         inputs = (work.first, work.live, work.block, work.ranks)
-        return lax.scan(step, open_, inputs)[1]
+        return *lax.scan(step, open_, inputs)[1], by_look.steps <= looks
 
-    if not single.suits(projected, grid):
-        raise SystemExit("XLA makes no single kernel of the loops in this process")
     counting = jax.jit(spread(count_local, False, True))
     spread_composite = spread(composite_local, False, True, True)
     compositing = jax.jit(spread_composite)
@@ -180,9 +182,11 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
 
     weight = jax.random.normal(jax.random.key(1), (camera.height, camera.width, 3))
     training = jax.jit(jax.value_and_grad(render_loss))
+    *counts, fits = counting(projected, lists)
+    if not np.all(fits):
+        raise SystemExit(f"{case.name}: no room for all looks to count by")
     evaluations, contributions = (
-        float(np.sum(np.asarray(number), dtype=np.float64))
-        for number in counting(projected, lists)
+        float(np.sum(np.asarray(number), dtype=np.float64)) for number in counts
     )
     functions = {
         "project": lambda: projected_of(gaussians, camera),

@@ -2,8 +2,8 @@
 and how work is shared by the devices.
 
 One host device for each core: XLA's CPU backend hardly uses a second core inside the
-compositor's loop, so the tiles are spread over several devices instead. And an option of
-XLA's, by which that loop is one kernel.
+compositor's loop, so the tiles are spread over several devices instead. And an option
+of XLA's, by which that loop is one kernel.
 
 And memory that is kept: XLA allocates the temporaries of a program anew at each call.
 From 32 MB on, glibc takes them from the system every time, page by page, which is a
@@ -33,7 +33,7 @@ from gsjax.settings import whole
 _MAX_KEPT_BYTES = 500_000_000
 
 # What a turn of a loop may touch for XLA's CPU backend to make one kernel of the loop.
-KERNEL_BYTES = 131_072
+KERNEL_BYTES = 65_536
 _KERNEL_OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
 # Names and numbers of `mallopt`, from <malloc.h> of glibc.
@@ -48,7 +48,8 @@ def use_all_cores(count: int | None = None, *, queued: bool = True) -> int:
     Call it before the first computation: ``import gsjax; gsjax.use_all_cores()``. On
     a GPU or TPU it changes nothing that matters. `RasterConfig.devices` then
     defaults to all of them; images do not depend on it, but for rounding. It also calls
-    `keep_memory` and `make_kernels_of_loops`.
+    `keep_memory`, and `make_kernels_of_loops`, which other programs of this process may
+    notice.
 
     Args:
       count: how many.
@@ -87,17 +88,19 @@ def use_all_cores(count: int | None = None, *, queued: bool = True) -> int:
 
 
 def make_kernels_of_loops() -> None:
-    """Let XLA's CPU backend make one kernel of a loop whose turn touches no more than
-    `KERNEL_BYTES`, unless its flags say otherwise; by default it is 1 kB.
+    """Let XLA's CPU backend make one kernel, on one thread, of every loop whose turn
+    touches no more than `KERNEL_BYTES`; by default it does so up to 1 kB.
 
-    A picture is then composited by one such loop. XLA reads ``XLA_FLAGS`` when JAX
-    starts. They stay as they are for good: JAX keeps compiled programs by them.
+    A picture is then composited by one such loop. XLA reads ``XLA_FLAGS``, to which
+    this adds an option, when JAX starts; later it has no effect. They stay as they are
+    for good, as JAX keeps compiled programs by them. Flags that set the option already
+    (``--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1024`` is the
+    default) are left alone, and so is the name of a file of flags.
     """
-    flags = os.environ.get("XLA_FLAGS", "")
-    if _KERNEL_OPTION in flags or (flags and not flags.startswith("--")):
-        return  # or it is the name of a file that has the flags
-    option = f"--xla_backend_extra_options={_KERNEL_OPTION}={KERNEL_BYTES}"
-    os.environ["XLA_FLAGS"] = f"{flags} {option}".strip()
+    flags = os.environ.get("XLA_FLAGS", "").strip()
+    if _KERNEL_OPTION not in flags and (flags.startswith("-") or not flags):
+        option = f"--xla_backend_extra_options={_KERNEL_OPTION}={KERNEL_BYTES}"
+        os.environ["XLA_FLAGS"] = f"{flags} {option}".strip()
 
 
 @contextmanager

@@ -7,6 +7,8 @@ of Gaussians and the same image size, and all tests call the same jitted functio
 import gc
 import os
 import signal
+import subprocess
+import sys
 import tempfile
 from functools import cache, partial
 from pathlib import Path
@@ -192,6 +194,27 @@ def shared_programs():
     fit_module._Run.program = program
     yield compiled
     fit_module._Run.program = compile_one
+
+
+@pytest.fixture
+def without_option():
+    """``without_option(code)``: what Python code prints in a process whose JAX makes
+    kernels of small loops alone, as where `gsjax.use_all_cores` was not called."""
+
+    def printed(code: str) -> str:
+        folder = Path(__file__).parent
+        path = os.pathsep.join(map(str, (folder, folder.parent)))
+        bare = "import gsjax.devices as d; d.make_kernels_of_loops = lambda: None; "
+        done = subprocess.run(
+            [sys.executable, "-c", bare + code],
+            env={**os.environ, "XLA_FLAGS": "", "PYTHONPATH": path},
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stderr[-2000:]
+        return done.stdout
+
+    return printed
 
 
 needs_two_devices = pytest.mark.skipif(

@@ -71,12 +71,8 @@ def test_places_of_what_is_chosen(share):
     assert (np.asarray(index[len(wanted) : ROOM]) == SIZE).all()
 
 
-@on_cpu
-@pytest.mark.parametrize("name", ["running_total", "append", "places", "deal"])
-def test_each_is_one_kernel_that_copies_nothing_in_a_turn(name):
-    """What XLA compiled: no `while` is left to be run turn by turn, and within one no
-    array is copied. Where this fails, a turn takes a hundred times as long.
-    """
+def compiled(name: str) -> str:
+    """The program of one of the loops, as text."""
     many = jnp.zeros(SIZE, jnp.int32)
     one, some = jnp.zeros(1, jnp.int32), jnp.ones(SIZE, bool)
     rows = jnp.zeros((SIZE, 3), jnp.int32)
@@ -86,13 +82,26 @@ def test_each_is_one_kernel_that_copies_nothing_in_a_turn(name):
         "places": (some, jnp.ones(-(-SIZE // loops.STRETCH), bool), many),
         "deal": (rows, jnp.int32(SIZE), many, many),
     }[name]
-    program = jax.jit(getattr(loops, name)).lower(*arguments).compile().as_text()
-    entry = program[program.index("ENTRY") :]
-    assert "xla_cpu_small_call" in entry
-    assert " while(" not in entry
-    inside = program[: program.index("ENTRY")]
-    padded = SIZE + 3  # of counts: a multiple of four
-    assert not re.search(rf"\[({SIZE}|{padded})[^ ]* copy\(", inside)
+    return jax.jit(getattr(loops, name)).lower(*arguments).compile().as_text()
+
+
+@on_cpu
+def test_each_is_one_kernel_that_copies_nothing_in_a_turn(without_option):
+    """What XLA compiled: no `while` is left to be run turn by turn, and within one no
+    array is copied. Where this fails, a turn takes a hundred times as long. So it is
+    where XLA is told nothing, as in a program that has not called `use_all_cores`.
+    """
+    names = "running_total", "append", "places", "deal"
+    programs = without_option(
+        f"import test_loops; print(chr(0).join(map(test_loops.compiled, {names})))"
+    ).split(chr(0))
+    assert len(programs) == len(names)
+    for program in programs:
+        inside, entry = program.split("ENTRY")
+        assert "xla_cpu_small_call" in entry
+        assert not loops.has_loop_by_turns(program)
+        padded = SIZE + 3  # of counts: a multiple of four
+        assert not re.search(rf"\[({SIZE}|{padded})[^ ]* copy\(", inside)
 
 
 def test_a_batch_goes_one_after_another():

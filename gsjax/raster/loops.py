@@ -1,12 +1,12 @@
 """Loops over single numbers, for CPUs: each is one compiled kernel.
 
-XLA's CPU backend makes one kernel of a `while` whose turn touches less than 1 kB (its
-`SmallWhileLoopHoistingPass`), arrays of any size among what it carries: a turn then
-takes a nanosecond or two, and some hundred times as long where it does not. So a turn
-holds arithmetic on numbers, slices and updates of a few, and no gather, scatter or
-sort; and what it reads of an array that it also writes, it carries over from the
-turn before: else XLA copies that array in every turn. No derivative is taken here, and
-a batch goes one after another.
+XLA's CPU backend makes one kernel of a `while` whose turn touches less than 1 kB, if it
+is not told otherwise (its `SmallWhileLoopHoistingPass`), arrays of any size among what
+it carries: a turn then takes a nanosecond or two, and some hundred times as long where
+it does not. So a turn holds arithmetic on numbers, slices and updates of a few, and no
+gather, scatter or sort; and what it reads of an array that it also writes, it carries
+over from the turn before: else XLA copies that array in every turn. No derivative is
+taken here, and a batch goes one after another.
 
 Axis legend: I items, T tiles.
 """
@@ -22,20 +22,27 @@ from gsjax.devices import KERNEL_BYTES
 from gsjax.raster.types import Array
 
 STRETCH = 256  # slots that `places` looks at or leaves out together
-_ADDED = 4  # counts that `running_total` adds in a turn; of 16 it is no kernel
+_ADDED = 4  # counts that `running_total` adds in a turn; of 16 it is above 1 kB
 
 
 @cache
 def large_are_kernels() -> bool:
     """Whether this process's XLA makes one kernel also of a loop whose turn touches
     `KERNEL_BYTES`; see `gsjax.use_all_cores`. Found out by compiling one."""
-    numbers = jax.ShapeDtypeStruct((KERNEL_BYTES // 10,), jnp.float32)  # 8 bytes each
+    numbers = jax.ShapeDtypeStruct((KERNEL_BYTES // 9,), jnp.float32)  # 8 bytes each
 
     def loop(x):
         return _each(0, 9, lambda _, x: 2 * x + 1, x)
 
-    program = jax.jit(loop).lower(numbers).compile().as_text()
-    return "xla_cpu_small_call" in (program or "")
+    with jax.disable_jit(False):
+        program = jax.jit(loop).lower(numbers).compile().as_text() or ""
+    return "xla_cpu_small_call" in program and not has_loop_by_turns(program)
+
+
+def has_loop_by_turns(program: str) -> bool:
+    """Whether a `while` of a compiled program's entry is left to be run turn by turn,
+    given its text."""
+    return " while(" in program[program.index("ENTRY") :]
 
 
 def _at(values: Array, index: Array) -> Array:
