@@ -175,8 +175,6 @@ def test_what_does_not_suit():
 
 
 CHOICE = """
-import re, sys
-from functools import partial
 import jax, gsjax
 from conftest import LIGHT, camera_of, frustum_points, gaussians_at, np
 scene = gaussians_at(frustum_points(np.random.default_rng(0), 16), 0.1, 0.5)
