@@ -33,7 +33,7 @@ from gsjax.settings import whole
 _MAX_KEPT_BYTES = 500_000_000
 
 # What a turn of a loop may touch for XLA's CPU backend to make one kernel of the loop.
-KERNEL_BYTES = 65_536
+KERNEL_BYTES = 131_072
 _KERNEL_OPTION = "xla_cpu_small_while_loop_byte_threshold"
 
 # Names and numbers of `mallopt`, from <malloc.h> of glibc.

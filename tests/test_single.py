@@ -1,5 +1,6 @@
-"""Compositing on a CPU, Gaussian by Gaussian and chunk by chunk, is plain blending; and
-the first is one compiled kernel wherever it is chosen.
+"""Compositing on a CPU, Gaussian by Gaussian and chunk by chunk, is plain blending, and
+the way back Gaussian by Gaussian its transpose; each of those by Gaussians is one
+compiled kernel wherever it is chosen.
 """
 
 import os
@@ -16,7 +17,7 @@ import pytest
 from conftest import on_cpu
 
 from gsjax import RasterConfig, devices
-from gsjax.raster import composite, loops, schedules, single
+from gsjax.raster import adjoint, composite, loops, schedules, single
 from gsjax.raster.bins import Lists, corners, make_grid
 from gsjax.raster.types import Projected
 
@@ -77,8 +78,7 @@ def plain(p: Projected, lists: Lists, grid, config) -> dict[str, np.ndarray]:
     return {"sums": sums, "median": median}
 
 
-@pytest.mark.parametrize("way", ["single", "chunks"])
-@pytest.mark.parametrize(
+of_stops = pytest.mark.parametrize(
     "config",
     [
         RasterConfig(outputs=ALL),
@@ -89,6 +89,10 @@ def plain(p: Projected, lists: Lists, grid, config) -> dict[str, np.ndarray]:
     ],
     ids=["before", "after", "opaque before", "opaque after", "to the last"],
 )
+
+
+@pytest.mark.parametrize("way", ["single", "chunks"])
+@of_stops
 @pytest.mark.parametrize(("dtype", "bar"), [("float32", 1e-5), ("float64", 1e-13)])
 def test_both_are_plain_blending(way, config, dtype, bar, report):
     grid = make_grid(WIDTH, HEIGHT, config.tile_size, DEVICES)
@@ -100,7 +104,8 @@ def test_both_are_plain_blending(way, config, dtype, bar, report):
     def blended(projected, some, schedule):
         if way == "single":
             assert single.suits(projected, grid)
-            return single.composite_singly(projected, some, device, grid, config)
+            given = projected, some, device, grid, config
+            return single.composite_singly(*given)[0]
         return composite.by_chunks(projected, some, schedule, device, grid, config)
 
     found = blended(projected, some, schedule)
@@ -116,14 +121,67 @@ def test_both_are_plain_blending(way, config, dtype, bar, report):
         assert error <= bar, name
 
 
+BY = {"all": {"splats", "channels"}, "splats": {"splats"}, "channels": {"channels"}}
+
+
+@of_stops
+@pytest.mark.parametrize(("dtype", "bar"), [("float32", 3e-5), ("float64", 1e-12)])
+def test_the_way_back_is_the_transpose_of_the_steps(config, dtype, bar, report):
+    """By everything, by splats and by channels alone."""
+    config = config.replace(outputs=("rgb", "depth"))
+    grid = make_grid(WIDTH, HEIGHT, config.tile_size, DEVICES)
+    some, device = jax.tree.map(jnp.asarray, lists()), jnp.int32(DEVICE)
+    schedule = schedules.make_schedule(some, grid, 4, config.chunk_size, 100)
+    shape = grid.tiles, CHANNELS + 2, grid.tile**2
+    cotangent = jnp.asarray(np.random.default_rng(2).normal(size=shape), dtype)
+
+    @jax.jit
+    def ways(projected, some, schedule, cotangent):
+        assert adjoint.suits(projected, grid, config)
+
+        def sums(projected):
+            given = projected, some, schedule, device, grid, 100, config
+            return composite._by_steps(*given)["sums"]
+
+        given = projected, some, device
+        images, kept = single.composite_singly(*given, grid, config, keeping=True)
+        given = *given, kept, cotangent, grid, config
+        found = {k: adjoint.pulled_back(*given, frozenset(v)) for k, v in BY.items()}
+        wanted, transpose = jax.vjp(sums, projected)
+        return images["sums"], wanted, found, transpose(cotangent)[0]
+
+    sums, same, found, wanted = ways(splats(dtype), some, schedule, cotangent)
+    np.testing.assert_allclose(sums, same, rtol=0, atol=bar)
+    none = {"var_y", "det", "reach", "compensation"}
+    for way, by in BY.items():
+        for name in set(Projected._fields) - {"probe"}:
+            kind = "channels" if name in {"colors", "depth"} else "splats"
+            a, b = (np.asarray(getattr(p, name)) for p in (found[way], wanted))
+            assert a.dtype == dtype
+            if name in none or kind not in by:
+                assert not a.any()
+                continue
+            assert np.linalg.norm(b) > 1
+            error = np.linalg.norm(a - b) / np.linalg.norm(b)
+            report(f"{way}, {name}, {dtype}", error, bar)
+            assert error <= bar, (way, name)
+
+
 def test_lists_that_did_not_fit_are_not_read():
     config = RasterConfig()
     grid = make_grid(WIDTH, HEIGHT, config.tile_size, DEVICES)
     wild = lists()._replace(start=np.full(9, 10**6, np.int32), fit=np.bool_(False))
-    found = jax.jit(
-        lambda p, some: single.composite_singly(p, some, jnp.int32(0), grid, config)
-    )(splats("float32"), wild)
-    assert not np.asarray(found["sums"]).any()
+
+    @jax.jit
+    def both(p, some):
+        given = p, some, jnp.int32(0)
+        images, kept = single.composite_singly(*given, grid, config, keeping=True)
+        ones = jnp.ones_like(images["sums"])
+        back = adjoint.pulled_back(*given, kept, ones, grid, config)
+        return images["sums"], kept.looks, back
+
+    for array in jax.tree.leaves(both(splats("float32"), wild)):
+        assert not np.asarray(array).any()
 
 
 def described(dtype, channels):
@@ -142,29 +200,64 @@ def described(dtype, channels):
     )
 
 
+def compiled(function, *shapes):
+    """Its program; asserts that it is one kernel."""
+    program = jax.jit(function).lower(*shapes).compile().as_text()
+    assert "xla_cpu_small_call" in program
+    assert not loops.has_loop_by_turns(program)
+    return program[: program.index("ENTRY")]
+
+
+def most_channels(suits, dtype):
+    """As many as it is chosen for, which are not any number."""
+    suiting = [n for n in range(99) if suits(described(dtype, n)[0])]
+    assert suiting == list(range(suiting[-1] + 1))
+    assert 3 <= suiting[-1] < 98
+    return suiting[-1]
+
+
+def exponents(inside):
+    return len(re.findall(r" (exponential|round-nearest-even)\(", inside))
+
+
+@pytest.mark.parametrize("keeping", [False, True])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_it_is_one_kernel_wherever_it_suits(dtype):
+def test_it_is_one_kernel_wherever_it_suits(dtype, keeping):
     """With as many channels as it is chosen for, and not for any number of them."""
     grid = make_grid(64, 64, 8, 1)
-    suiting = [n for n in range(99) if single.suits(described(dtype, n)[0], grid)]
-    most = suiting[-1]
-    assert suiting == list(range(most + 1))
-    assert 3 <= most < 98
+    most = most_channels(partial(single.suits, grid=grid), dtype)
 
     def composited(projected, lists, device, cut):
         config = RasterConfig(outputs=ALL).at_cut(cut)
-        return single.composite_singly(projected, lists, device, grid, config)
+        given = projected, lists, device, grid, config
+        return single.composite_singly(*given, keeping=keeping)
 
     given = *described(dtype, most), np.int32(0), jax.ShapeDtypeStruct((), dtype)
-    program = jax.jit(composited).lower(*given).compile().as_text()
-    assert "xla_cpu_small_call" in program
-    assert not loops.has_loop_by_turns(program)
-    inside = program[: program.index("ENTRY")]
-    assert inside.count(" while(") == 3  # over tiles, looks and Gaussians
+    inside = compiled(composited, *given)
+    # Over tiles, looks and Gaussians; and where the looks of each tile begin.
+    assert inside.count(" while(") == 3 + keeping
     # Nothing large is copied, and α is evaluated once for each Gaussian of a turn.
     assert f"[64,{most + 2},64]{{2,1,0}} copy(" not in inside
-    exponents = re.findall(r" (exponential|round-nearest-even)\(", inside)
-    assert len(exponents) == single.TURN
+    assert exponents(inside) == single.TURN
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_the_way_back_is_one_kernel_wherever_it_suits(dtype):
+    config, grid = RasterConfig(), make_grid(64, 64, 8, 1)
+    most = most_channels(partial(adjoint.suits, grid=grid, config=config), dtype)
+
+    def back(projected, lists, device, kept, cotangent):
+        given = projected, lists, device, kept, cotangent, grid, config
+        return adjoint.pulled_back(*given)
+
+    one, number = jax.ShapeDtypeStruct, jax.ShapeDtypeStruct((64,), np.int32)
+    kept = single.Kept(one((9000 // single.LOOK + 64, 64), dtype), number, number)
+    cotangent = one((64, most + 2, 64), dtype)
+    inside = compiled(back, *described(dtype, most), np.int32(0), kept, cotangent)
+    # Over tiles, looks, and Gaussians there and back.
+    assert inside.count(" while(") == 4
+    assert f"[5001,{most + 8}]{{1,0}} copy(" not in inside
+    assert exponents(inside) == adjoint.TURN
 
 
 def test_what_does_not_suit():
@@ -172,6 +265,11 @@ def test_what_does_not_suit():
     assert not single.suits(splats("float32"), make_grid(24, 24, 4, 1))
     assert not single.suits(splats("float32", 200), make_grid(24, 24, 8, 1))
     assert not single.suits(splats("float64"), make_grid(64, 64, 32, 1))
+    config, grid = RasterConfig(), make_grid(64, 64, 8, 1)
+    probed = splats("float32")._replace(probe=jnp.zeros((2, RANKS)))
+    assert adjoint.suits(splats("float32"), grid, config)
+    assert not adjoint.suits(probed, grid, config)
+    assert not adjoint.suits(splats("float32"), grid, config.replace(outputs=ALL))
 
 
 CHOICE = """
@@ -179,11 +277,18 @@ import jax, gsjax
 from conftest import LIGHT, camera_of, frustum_points, gaussians_at, np
 scene = gaussians_at(frustum_points(np.random.default_rng(0), 16), 0.1, 0.5)
 config = gsjax.RasterConfig(**{**LIGHT, "devices": 2}, outputs=("alpha",))
-def picture(scene, camera):
+def picture(scene, camera, config=config):
     return gsjax.render(scene, camera, config).alpha
-def blended(scene, camera):
-    return picture(scene, camera).sum()
-for function in (picture, jax.grad(blended, allow_int=True)):
+def blended(scene, camera, config=config):
+    return picture(scene, camera, config).sum()
+def slope(scene, camera):
+    def along(params):
+        return blended(scene.replace(params=params), camera)
+    return jax.jvp(along, (scene.params,), (scene.params,))
+def with_median(scene, camera):
+    return blended(scene, camera, config.replace(outputs=("alpha", "median_depth")))
+gradients = (jax.grad(f, allow_int=True) for f in (blended, with_median))
+for function in (picture, *gradients, slope):
     program = jax.jit(function).lower(scene, camera_of()).compile().as_text()
     lines = program[program.index("ENTRY") :].splitlines()
     print(sum("/composite/" in x and " while(" in x for x in lines))
@@ -191,8 +296,9 @@ for function in (picture, jax.grad(blended, allow_int=True)):
 
 
 def test_it_is_chosen_where_xla_was_told(without_option):
-    """By a process that draws at once: a picture leaves no loop to be run by turns, but
-    where there is no option, or a derivative is taken."""
+    """By a process that draws at once: a picture and its gradient leave no loop to be
+    run by turns, but where there is no option, the median is asked for, or a derivative
+    is taken forward."""
     told = "import gsjax; gsjax.use_all_cores(2)\n"
     done = subprocess.run(
         [sys.executable, "-c", told + CHOICE],
@@ -201,9 +307,10 @@ def test_it_is_chosen_where_xla_was_told(without_option):
         text=True,
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    picture, gradient = map(int, done.stdout.split())
-    assert picture == 0
-    assert gradient >= 1
+    picture, gradient, with_median, forward = map(int, done.stdout.split())
+    assert picture == gradient == 0
+    assert with_median >= 1
+    assert forward >= 1
     bare = without_option(told + CHOICE).split()
     assert all(int(number) >= 1 for number in bare)
 

@@ -22,8 +22,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import sequential_vmap
-from jax.custom_derivatives import SymbolicZero
+from jax.custom_derivatives import SymbolicZero, zero_from_primal
 
+from gsjax.raster import adjoint, single
 from gsjax.raster.alpha import pixel_centres
 from gsjax.raster.batches import any_of_batch
 from gsjax.raster.bins import Grid, Lists, corners
@@ -37,10 +38,14 @@ from gsjax.raster.blend import (
 )
 from gsjax.raster.ladder import on_ladder
 from gsjax.raster.schedules import Schedule, Work, make_steps, make_work, ranks_at
-from gsjax.raster.single import composite_singly, suits
+from gsjax.raster.single import Kept, composite_singly
+from gsjax.raster.transposed import moving_jvp, with_transpose
 from gsjax.raster.types import Array, Projected, RasterConfig
 
 T = TypeVar("T")
+# Under `jax.vmap`: side by side each would wait for the longest, and every turn of a
+# loop copy the images of all.
+_one_by_one = sequential_vmap
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6))
@@ -70,12 +75,10 @@ def composite(
     """
     del room
 
-    # Under `jax.vmap` one after another: side by side each would wait for the longest,
-    # and every turn of a loop copy the images of all.
-    @sequential_vmap
+    @_one_by_one
     def one(projected, lists, schedule, device):
-        if suits(projected, grid):
-            return composite_singly(projected, lists, device, grid, config)
+        if single.suits(projected, grid):
+            return composite_singly(projected, lists, device, grid, config)[0]
         return by_chunks(projected, lists, schedule, device, grid, config)
 
     return one(projected, lists, schedule, device)
@@ -83,18 +86,112 @@ def composite(
 
 @partial(composite.defjvp, symbolic_zeros=True)
 def _composite_jvp(grid, room, config, primals, tangents):
-    """Of the steps, by what is differentiated alone."""
+    """By what is differentiated alone."""
     leaves, tree = jax.tree.flatten(primals)
     slopes = tree.flatten_up_to(tangents)
+
+    def by_steps(*leaves):
+        return _by_steps(*jax.tree.unflatten(tree, leaves), grid, room, config)
+
+    if not adjoint.suits(primals[0], grid, config):
+        return moving_jvp(by_steps, leaves, slopes, SymbolicZero)
+    images, kept = _keeping(*primals, grid, room, config)
     moving = [i for i, s in enumerate(slopes) if not isinstance(s, SymbolicZero)]
+    count, by = len(leaves), _kinds(moving)
+    kept, of_kept = jax.tree.flatten(kept)
 
-    def by_moving(*values):
-        some = dict(zip(moving, values))
-        every = [some.get(i, leaf) for i, leaf in enumerate(leaves)]
-        projected, lists, schedule, device = jax.tree.unflatten(tree, every)
-        return _by_steps(projected, lists, schedule, device, grid, room, config)
+    def forward(*values):
+        slopes = dict(zip(moving, values[count + len(kept) :]))
+        slopes = [slopes.get(i) for i in range(count)]
+        return [moving_jvp(by_steps, values[:count], slopes, type(None))[1]["sums"]]
 
-    return jax.jvp(by_moving, [leaves[i] for i in moving], [slopes[i] for i in moving])
+    def transpose(*values):
+        primals = jax.tree.unflatten(tree, values[:count])
+        kept = jax.tree.unflatten(of_kept, values[count:-1])
+        back = _pulled_back(*primals, kept, values[-1], grid, room, config, by)
+        return [jax.tree.leaves(back)[i] for i in moving]
+
+    slopes = [slopes[i] for i in moving]
+    like = [images["sums"]]
+    (sums,) = with_transpose(forward, transpose, (*leaves, *kept), slopes, like)
+    return images, {"sums": sums}
+
+
+def _kinds(moving: list[int]) -> frozenset[str]:
+    """What `adjoint.pulled_back` is asked for, given which fields of `Projected`, its
+    probe None, are differentiated by."""
+    fields = {Projected._fields[i] for i in moving}
+    channels = {"colors", "depth"}
+    kinds = {"splats": fields - channels, "channels": fields & channels}
+    return frozenset(kind for kind, some in kinds.items() if some)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6))
+def _keeping(
+    projected: Projected,
+    lists: Lists,
+    schedule: Schedule,
+    device: Array,
+    grid: Grid,
+    room: int,
+    config: RasterConfig,
+) -> tuple[dict[str, Array], Kept]:
+    """`composite`, one by one, and what the way back needs, of which no derivative is
+    taken."""
+    del schedule, room
+
+    @_one_by_one
+    def one(projected, lists, device):
+        return composite_singly(projected, lists, device, grid, config, keeping=True)
+
+    return one(projected, lists, device)
+
+
+@partial(_keeping.defjvp, symbolic_zeros=True)
+def _keeping_jvp(grid, room, config, primals, tangents):
+    images, kept = _keeping(*primals, grid, room, config)
+    _, slopes = _composite_jvp(grid, room, config, primals, tangents)
+    return (images, kept), (slopes, jax.tree.map(zero_from_primal, kept))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(6, 7, 8, 9))
+def _pulled_back(
+    projected: Projected,
+    lists: Lists,
+    schedule: Schedule,
+    device: Array,
+    kept: Kept,
+    cotangent: Array,
+    grid: Grid,
+    room: int,
+    config: RasterConfig,
+    by: frozenset[str],
+) -> Projected:
+    """`adjoint.pulled_back`, whose own derivative is that of the steps."""
+    del schedule, room
+
+    @_one_by_one
+    def one(projected, lists, device, kept, cotangent):
+        given = projected, lists, device, kept, cotangent
+        return adjoint.pulled_back(*given, grid, config, by)
+
+    return one(projected, lists, device, kept, cotangent)
+
+
+@_pulled_back.defjvp
+def _pulled_back_jvp(grid, room, config, by, primals, tangents):
+    projected, lists, schedule, device, _, cotangent = primals
+
+    def by_steps(projected, cotangent):
+        def sums(projected):
+            given = projected, lists, schedule, device
+            return _by_steps(*given, grid, room, config)["sums"]
+
+        return jax.vjp(sums, projected)[1](cotangent)[0]
+
+    given, slopes = (projected, cotangent), (tangents[0], tangents[-1])
+    back = _pulled_back(*primals, grid, room, config, by)
+    return back, jax.jvp(by_steps, given, slopes)[1]
 
 
 def by_chunks(

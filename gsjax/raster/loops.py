@@ -11,6 +11,7 @@ taken here, and a batch goes one after another.
 Axis legend: I items, T tiles.
 """
 
+from collections.abc import Sequence
 from functools import cache
 
 import jax
@@ -45,16 +46,25 @@ def has_loop_by_turns(program: str) -> bool:
     return " while(" in program[program.index("ENTRY") :]
 
 
+def part_at(values: Array, start: Sequence[Array], shape: Sequence[int]) -> Array:
+    """What of ``values`` begins at ``start``, [] each and none below 0, and is of that
+    shape; the last that is, if there is not so much behind it."""
+    return lax.dynamic_slice(values, start, shape, allow_negative_indices=False)
+
+
+def with_part(values: Array, part: Array, start: Sequence[Array]) -> Array:
+    """``values`` with ``part`` in the place that `part_at` would take it from."""
+    return lax.dynamic_update_slice(values, part, start, allow_negative_indices=False)
+
+
 def _at(values: Array, index: Array) -> Array:
     """The number [1] at ``index`` [1]."""
-    return lax.dynamic_slice(values, (index[0],), (1,), allow_negative_indices=False)
+    return part_at(values, (index[0],), (1,))
 
 
 def _put(values: Array, number: Array, index: Array) -> Array:
     """``values`` with ``number`` [1] at ``index`` [1]; at the last if past it."""
-    return lax.dynamic_update_slice(
-        values, number, (index[0],), allow_negative_indices=False
-    )
+    return with_part(values, number, (index[0],))
 
 
 def _each(start, end, turn, state):
@@ -71,13 +81,11 @@ def running_total(counts: Array) -> Array:
     def turn(i, state):
         total, out = state
         start, sums = (i * _ADDED,), []
-        some = lax.dynamic_slice(counts, start, (_ADDED,), allow_negative_indices=False)
+        some = part_at(counts, start, (_ADDED,))
         for count in jnp.split(some, _ADDED):
             total = total + count
             sums.append(total)
-        out = lax.dynamic_update_slice(
-            out, jnp.concatenate(sums), start, allow_negative_indices=False
-        )
+        out = with_part(out, jnp.concatenate(sums), start)
         return total, out
 
     init = (jnp.zeros(1, jnp.int32), jnp.zeros_like(counts))
@@ -104,9 +112,7 @@ def append(
     def turn(i, state):
         count, kept = state
         row = jnp.concatenate([_at(column, i[None]) for column in columns])
-        kept = lax.dynamic_update_slice(
-            kept, row[None], (count[0], jnp.int32(0)), allow_negative_indices=False
-        )
+        kept = with_part(kept, row[None], (count[0], jnp.int32(0)))
         return count + _at(numbers, i[None]), kept
 
     numbers = chosen.astype(jnp.int32)
@@ -161,9 +167,7 @@ def deal(kept: Array, items: Array, place: Array, out: Array) -> Array:
 
     def of_item(i, state):
         place, out = state
-        item = lax.dynamic_slice(
-            kept, (i, jnp.int32(0)), (1, 3), allow_negative_indices=False
-        )[0]
+        item = part_at(kept, (i, jnp.int32(0)), (1, 3))[0]
         mine, tile, count = item[:1], item[1:2], item[2:]
 
         def one(state):

@@ -4,13 +4,16 @@ As plain code would have it: for each tile, for each Gaussian of its list, until
 pixel of the tile is open. It needs no schedule, looks up each Gaussian when it is due,
 and keeps the sums of a tile in the nearest cache. It is fast where XLA makes one kernel
 of the loops (`gsjax.raster.loops`), which it does of larger turns than by default only
-if the process was started so, as `gsjax.use_all_cores` does; `suits` tells. Derivatives
-are taken of the chunks of `gsjax.raster.composite`.
+if the process was started so, as `gsjax.use_all_cores` does; `suits` tells. The way
+back, for gradients, is `gsjax.raster.adjoint`.
 
-Axis legend: T tiles, P pixels of a tile, C channels, R ranks.
+Axis legend: T tiles, P pixels of a tile, C channels, R ranks, L looks.
 """
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from gsjax.devices import KERNEL_BYTES
@@ -18,6 +21,8 @@ from gsjax.raster import loops
 from gsjax.raster.alpha import alphas, pixel_centres
 from gsjax.raster.bins import Grid, Lists, corners
 from gsjax.raster.blend import columns_of, pass_through, table_of
+from gsjax.raster.counts import running_total
+from gsjax.raster.loops import part_at, with_part
 from gsjax.raster.types import Array, Projected, RasterConfig
 
 TURN = 2  # Gaussians: the sums are fetched and stored once for so many
@@ -26,6 +31,62 @@ _FEWEST = 64  # pixels: of fewer XLA hardly makes vector instructions
 # What a turn touches at most: arrays [P] of each Gaussian, without channels and for
 # each. XLA counts what every kernel reads and writes, in the loops around it as well.
 _ARRAYS, _OF_CHANNEL = 32, 4
+
+
+class Reading(NamedTuple):
+    """What the loops read.
+
+    Attributes:
+      rows: [R + 1, columns] the Gaussians; the last is nothing.
+      widths: how many columns are u, v, inv_sx, slope, inv_sy, opacity; the channels;
+        and the depth, where a median is asked for.
+      ranks: the lists, one behind the other.
+      start, end: [T] where each begins and ends.
+      left, top: [T] corners of the tiles, px.
+      pixels: [2, P] x and y of a tile's pixels, from its corner.
+      ones: [P] that XLA does not know to be 1.
+    """
+
+    rows: Array
+    widths: tuple[int, ...]
+    ranks: Array
+    start: Array
+    end: Array
+    left: Array
+    top: Array
+    pixels: np.ndarray
+    ones: Array
+
+    def row(self, place: Array, end: Array) -> tuple[Array, Array]:
+        """(Rank [1], row [columns]) of what stands at ``place`` [1] of the lists, or
+        nothing from ``end`` [1] on."""
+        none = self.rows.shape[0] - 1
+        rank = part_at(self.ranks, (place[0],), (1,))
+        rank = jnp.where(place < end, rank, none)
+        columns = self.rows.shape[1]
+        return rank, part_at(self.rows, (rank[0], jnp.int32(0)), (1, columns))[0]
+
+    def alpha(self, splat: Array, tile: Array, config: RasterConfig) -> Array:
+        """α [P] of a Gaussian [6] at the pixels of a tile []."""
+        u, v, *shape = (number[0] for number in lax.split(splat, [1] * 6))
+        offset = u - number_at(self.left, tile)[0], v - number_at(self.top, tile)[0]
+        # XLA would evaluate it anew for each channel, were it not for a division.
+        return alphas((*shape, *offset), self.pixels, config) / self.ones
+
+
+class Kept(NamedTuple):
+    """What the way back needs of the way forward.
+
+    Attributes:
+      carried: [L, P] transmittance before each look, of one tile after the other; 0
+        where a pixel has stopped.
+      first: [T] the first look of each tile.
+      looks: [T] how many were made.
+    """
+
+    carried: Array
+    first: Array
+    looks: Array
 
 
 def suits(projected: Projected, grid: Grid) -> bool:
@@ -37,45 +98,64 @@ def suits(projected: Projected, grid: Grid) -> bool:
     return fits and loops.large_are_kernels()
 
 
+def reading_of(
+    projected: Projected,
+    lists: Lists,
+    device: Array,
+    grid: Grid,
+    config: RasterConfig,
+) -> Reading:
+    """What the loops read, of one device's tiles."""
+    columns = columns_of(projected._replace(probe=None), config)
+    # In one table: a Gaussian is looked up once.
+    rows = table_of([column for some in columns.values() for column in some])
+    left, top = corners(lax.iota(jnp.int32, grid.tiles), grid, device, rows.dtype).T
+    pixels = pixel_centres(grid.tile, rows.dtype)
+    return Reading(
+        rows=rows,
+        widths=tuple(len(some) for some in columns.values()),
+        ranks=lists.ranks,
+        start=lists.start,
+        end=lists.start + jnp.where(lists.fit, lists.length, 0),
+        left=left,
+        top=top,
+        pixels=pixels,
+        ones=lax.optimization_barrier(jnp.ones_like(pixels[0])),
+    )
+
+
 def composite_singly(
     projected: Projected,
     lists: Lists,
     device: Array,
     grid: Grid,
     config: RasterConfig,
-) -> dict[str, Array]:
-    """Images of one device's tiles, before the background.
+    keeping: bool = False,
+) -> tuple[dict[str, Array], Kept | None]:
+    """Images of one device's tiles, before the background, and, if ``keeping``, what
+    the way back needs.
 
-    As `gsjax.raster.composite.composite`; no derivative can be taken backward.
+    As `gsjax.raster.composite.composite`; no derivative can be taken of it backward.
     """
-    columns = columns_of(projected._replace(probe=None), config)
-    # In one table: a Gaussian is looked up once.
-    rows = table_of([column for some in columns.values() for column in some])
-    widths = [len(some) for some in columns.values()]
-    none = jnp.full(1, rows.shape[0] - 1, jnp.int32)
-    pixels = pixel_centres(grid.tile, rows.dtype)
-    empty = jnp.zeros_like(pixels[0])
-    ones = lax.optimization_barrier(jnp.ones_like(empty))  # XLA is not to know them
-    nothing = {"sums": jnp.zeros((len(columns["channels"]), len(empty)), rows.dtype)}
-    if "depth" in columns:
+    read = reading_of(projected, lists, device, grid, config)
+    empty = jnp.zeros_like(read.ones)
+    nothing = {"sums": jnp.zeros((read.widths[1], len(empty)), empty.dtype)}
+    if "median_depth" in config.outputs:
         nothing["median"] = empty
-    every = lax.iota(jnp.int32, grid.tiles)
-    left, top = corners(every, grid, device, rows.dtype).T
-    lengths = jnp.where(lists.fit, lists.length, 0)
+    images = {
+        name: jnp.zeros((grid.tiles, *one.shape), one.dtype)
+        for name, one in nothing.items()
+    }
+    kept = _nothing_kept(read, empty) if keeping else None
 
-    def of_tile(tile, images):
-        start = _part(lists.start, tile)
-        end = start + _part(lengths, tile)
-        corner_x, corner_y = _part(left, tile), _part(top, tile)
+    def of_tile(tile, state):
+        images, kept = state
+        start, end = number_at(read.start, tile), number_at(read.end, tile)
 
         def blend(place, carried, image):
-            rank = jnp.where(place < end, _part(lists.ranks, place[0]), none)
-            row = _part(rows, rank[0], jnp.int32(0), size=(1, rows.shape[1]))[0]
-            splat, values, *depth = lax.split(row, widths)
-            u, v, *shape = (number[0] for number in lax.split(splat, [1] * len(splat)))
-            offset = u - corner_x[0], v - corner_y[0]
-            # It would be evaluated again for each channel, were it not for a division.
-            alpha = alphas((*shape, *offset), pixels, config) / ones
+            _, row = read.row(place, end)
+            splat, values, *depth = lax.split(row, read.widths)
+            alpha = read.alpha(splat, tile, config)
             # Stopped pixels carry nothing on, and are given nothing.
             passed = pass_through(carried, alpha)
             behind = jnp.where(passed > config.stop, passed, 0)
@@ -99,35 +179,48 @@ def composite_singly(
             return state[0][0] < state[1][0]
 
         def several(state):
-            place, _, carried, image = state
+            (place, _, carried, _), kept = state
+            if kept is not None:
+                look = number_at(kept.first, tile) + (place - start) // LOOK
+                rows = with_part(kept.carried, carried[None], (look[0], jnp.int32(0)))
+                kept = kept._replace(carried=rows)
             until = jnp.minimum(place + LOOK, end)
-            place, *_ = state = lax.while_loop(
-                unfinished, turn, (place, until, carried, image)
+            place, _, *blended = lax.while_loop(
+                unfinished, turn, (place, until, *state[0][2:])
             )
-            return place, end, *state[2:]
+            return (place, end, *blended), kept
 
         def open_(state):
-            return unfinished(state) & jnp.any(state[2] > 0)
+            return unfinished(state[0]) & jnp.any(state[0][2] > 0)
 
-        start = start, end, jnp.ones_like(empty), nothing
-        *_, image = lax.while_loop(open_, several, start)
-        return {name: _put(images[name], image[name], tile) for name in images}
+        begun = start, end, jnp.ones_like(empty), nothing
+        (place, *_, image), kept = lax.while_loop(open_, several, (begun, kept))
+        if kept is not None:
+            made = (place - start + LOOK - 1) // LOOK
+            kept = kept._replace(looks=with_part(kept.looks, made, (tile,)))
+        images = {name: _with_image(images[name], image[name], tile) for name in images}
+        return images, kept
 
-    images = {
-        name: jnp.zeros((grid.tiles, *one.shape), one.dtype)
-        for name, one in nothing.items()
-    }
-    return lax.fori_loop(jnp.int32(0), jnp.int32(grid.tiles), of_tile, images)
-
-
-def _part(values: Array, *start: Array, size: tuple[int, ...] = (1,)) -> Array:
-    """What begins at ``start``, which is there."""
-    return lax.dynamic_slice(values, start, size, allow_negative_indices=False)
+    tiles = jnp.int32(0), jnp.int32(grid.tiles)
+    return lax.fori_loop(*tiles, of_tile, (images, kept))
 
 
-def _put(images: Array, image: Array, tile: Array) -> Array:
+def number_at(values: Array, tile: Array) -> Array:
+    """[1] what stands in ``values`` [T] for a tile []."""
+    return part_at(values, (tile,), (1,))
+
+
+def _nothing_kept(read: Reading, empty: Array) -> Kept:
+    wanted = -(-(read.end - read.start) // LOOK)
+    room = read.ranks.shape[0] // LOOK + wanted.shape[0]
+    return Kept(
+        carried=jnp.zeros((room, len(empty)), empty.dtype),
+        first=running_total(wanted) - wanted,
+        looks=jnp.zeros_like(wanted),
+    )
+
+
+def _with_image(images: Array, image: Array, tile: Array) -> Array:
     """``images`` [T, …] with that of a tile."""
     start = tile, *(jnp.int32(0) for _ in image.shape)
-    return lax.dynamic_update_slice(
-        images, image[None], start, allow_negative_indices=False
-    )
+    return with_part(images, image[None], start)

@@ -1,0 +1,109 @@
+"""Linear maps whose transpose is computed in a way of its own.
+
+JAX has rules of one's own for what is differentiated forward (`jax.custom_jvp`, which
+reverse mode then transposes) or backward (`jax.custom_vjp`, which forward mode
+refuses), and for the transpose of a map there is `linear_call`, which knows neither
+batches nor a second derivative. So this is a primitive, by JAX's public means for
+those (`jax.extend`).
+"""
+
+from collections.abc import Callable, Sequence
+
+import jax
+from jax import lax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from gsjax.raster.types import Array
+
+Arrays = Sequence[Array]
+_apply = Primitive("linear_with_transpose")
+_apply.multiple_results = True
+
+
+def with_transpose(
+    forward: Callable[..., Arrays],
+    transpose: Callable[..., Arrays],
+    given: Arrays,
+    argument: Arrays,
+    like: Arrays,
+) -> list[Array]:
+    """``forward(*given, *argument)``, whose transpose is ``transpose``.
+
+    Args:
+      forward: (*given, *argument) → arrays, linear in the argument and differentiable.
+        Where only the transpose is wanted, it is not so much as traced.
+      transpose: (*given, *cotangents) → cotangents of the argument; differentiable.
+      given: arrays; what is differentiated of them is so by ``forward``.
+      argument: arrays.
+      like: what the results have the shapes and types of.
+
+    A batch goes one after another.
+    """
+    shapes = tuple(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in like)
+    return _apply.bind(
+        *given, *argument, forward=forward, transpose=transpose, count=len(given),
+        shapes=shapes,
+    )  # fmt: skip
+
+
+def moving_jvp(
+    function: Callable[..., Arrays], primals: Arrays, tangents: Sequence, still: type
+) -> tuple[Arrays, Arrays]:
+    """`jax.jvp` by what moves alone: all whose tangent is not ``still``."""
+    moving = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, still)]
+
+    def by_moving(*values):
+        some = dict(zip(moving, values))
+        return function(*(some.get(i, value) for i, value in enumerate(primals)))
+
+    return jax.jvp(
+        by_moving, [primals[i] for i in moving], [tangents[i] for i in moving]
+    )
+
+
+def _evaluated(*values, forward, transpose, count, shapes):
+    del transpose, count, shapes
+    return list(forward(*values))
+
+
+_apply.def_impl(_evaluated)
+mlir.register_lowering(_apply, mlir.lower_fun(_evaluated, multiple_results=True))
+
+
+@_apply.def_abstract_eval
+def _shapes_of(*values, forward, transpose, count, shapes):
+    del values, forward, transpose, count
+    return [jax.core.ShapedArray(one.shape, one.dtype) for one in shapes]
+
+
+def _jvp(primals, tangents, **params):
+    count = params["count"]
+    known, slopes = tangents[:count], tangents[count:]
+    if not all(isinstance(tangent, ad.Zero) for tangent in known):
+        return moving_jvp(params["forward"], primals, tangents, ad.Zero)
+    slopes = [ad.instantiate_zeros(slope) for slope in slopes]
+    values = _apply.bind(*primals, **params)
+    return values, _apply.bind(*primals[:count], *slopes, **params)
+
+
+def _transposed(cotangents, *values, transpose, count, **_):
+    cotangents = [ad.instantiate_zeros(cotangent) for cotangent in cotangents]
+    return [None] * count + list(transpose(*values[:count], *cotangents))
+
+
+def _batched(values, axes, *, shapes, **params):
+    at = [i for i, axis in enumerate(axes) if axis is not None]
+
+    def one(some):
+        every = dict(zip(at, some))
+        each = [every.get(i, value) for i, value in enumerate(values)]
+        return _apply.bind(*each, shapes=shapes, **params)
+
+    found = lax.map(one, [jax.numpy.moveaxis(values[i], axes[i], 0) for i in at])
+    return found, [0] * len(found)
+
+
+ad.primitive_jvps[_apply] = _jvp
+ad.primitive_transposes[_apply] = _transposed
+batching.primitive_batchers[_apply] = _batched
