@@ -5,7 +5,7 @@ of the default settings (8 × 8 tiles, its own lists) against a C++ compositor w
 threads over the standard exact 16 × 16 lists of the same scene, without early
 termination; forward, and value and gradient. The C++ gradient comes in two forms: by
 Gaussian with the pixels vectorised (tuned), and by pixel, as GPU code has it (plain).
-Forward also by chunks, as where XLA makes no single kernel of the loops.
+Both also by chunks, as where XLA makes no single kernel of the loops.
 
 Folders of runs, as further arguments, are timed too, at one view each. With
 ``--queued`` JAX has the threads that queued calls need: the price of that.
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -35,7 +36,8 @@ from gsjax.raster.blend import (
     splats_of,
     tables_of,
 )
-from gsjax.raster.composite import by_chunks, composite, take_rows
+from gsjax.raster.chunks import by_chunks, by_steps, take_rows
+from gsjax.raster.composite import composite
 from gsjax.raster.order import depth_order
 from gsjax.raster.project import conics_of, project
 
@@ -169,11 +171,15 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     image = compositing(projected, lists, schedule)
     cotangent = jax.random.normal(jax.random.key(0), image["sums"].shape)
 
-    def loss(projected, lists, schedule, cotangent):
-        image = spread_composite(projected, lists, schedule)
-        return jnp.sum(image["sums"] * cotangent)
+    def steps_local(device, projected, lists, schedule):
+        return by_steps(projected, lists, schedule, device, grid, steps, config)
+
+    def loss(projected, lists, schedule, cotangent, way=spread_composite):
+        return jnp.sum(way(projected, lists, schedule)["sums"] * cotangent)
 
     gradient = jax.jit(jax.value_and_grad(loss))
+    spread_steps = spread(steps_local, False, True, True)
+    by_step = jax.jit(jax.value_and_grad(partial(loss, way=spread_steps)))
     render = jax.jit(gsjax.render, static_argnames="config")
 
     def render_loss(params, camera, weight):
@@ -194,6 +200,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
         "composite": lambda: compositing(projected, lists, schedule),
         "composite by chunks": lambda: by_chunk(projected, lists, schedule),
         "composite v+g": lambda: gradient(projected, lists, schedule, cotangent),
+        "v+g by chunks": lambda: by_step(projected, lists, schedule, cotangent),
         "render": lambda: render(gaussians, camera, config=config),
         "render v+g": lambda: training(gaussians.params, camera, weight),
     }
@@ -244,6 +251,7 @@ def main() -> None:
                 **{f"{name} ms": value for name, value in ms.items()},
                 "forward / C++": ms["composite"] / ms["C++"],
                 "by chunks / forward": ms["composite by chunks"] / ms["composite"],
+                "v+g by chunks / v+g": ms["v+g by chunks"] / ms["composite v+g"],
                 "v+g / C++ tuned": ms["composite v+g"] / ms["C++ v+g tuned"],
                 "v+g / C++ plain": ms["composite v+g"] / ms["C++ v+g plain"],
                 "render / composite": ms["render"] / ms["composite"],

@@ -197,16 +197,17 @@ def shared_programs():
 
 
 @pytest.fixture
-def without_option():
-    """``without_option(code)``: what Python code prints in a process whose JAX makes
-    kernels of small loops alone, as where `gsjax.use_all_cores` was not called."""
+def in_a_process():
+    """``in_a_process(code, option=True)``: what Python code prints in a process of its
+    own that no flags of XLA's are told; without the ``option``, not by
+    `gsjax.use_all_cores` either, so that small loops alone are kernels."""
 
-    def printed(code: str) -> str:
+    def printed(code: str, option: bool = True) -> str:
         folder = Path(__file__).parent
         path = os.pathsep.join(map(str, (folder, folder.parent)))
         bare = "import gsjax.devices as d; d.make_kernels_of_loops = lambda: None; "
         done = subprocess.run(
-            [sys.executable, "-c", bare + code],
+            [sys.executable, "-c", code if option else bare + code],
             env={**os.environ, "XLA_FLAGS": "", "PYTHONPATH": path},
             capture_output=True,
             text=True,

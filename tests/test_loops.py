@@ -86,15 +86,14 @@ def compiled(name: str) -> str:
 
 
 @on_cpu
-def test_each_is_one_kernel_that_copies_nothing_in_a_turn(without_option):
+def test_each_is_one_kernel_that_copies_nothing_in_a_turn(in_a_process):
     """What XLA compiled: no `while` is left to be run turn by turn, and within one no
     array is copied. Where this fails, a turn takes a hundred times as long. So it is
     where XLA is told nothing, as in a program that has not called `use_all_cores`.
     """
     names = "running_total", "append", "places", "deal"
-    programs = without_option(
-        f"import test_loops; print(chr(0).join(map(test_loops.compiled, {names})))"
-    ).split(chr(0))
+    code = f"import test_loops; print(chr(0).join(map(test_loops.compiled, {names})))"
+    programs = in_a_process(code, option=False).split(chr(0))
     assert len(programs) == len(names)
     for program in programs:
         inside, entry = program.split("ENTRY")

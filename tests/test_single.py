@@ -5,10 +5,7 @@ compiled kernel wherever it is chosen.
 
 import os
 import re
-import subprocess
-import sys
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +14,7 @@ import pytest
 from conftest import on_cpu
 
 from gsjax import RasterConfig, devices
-from gsjax.raster import adjoint, composite, loops, schedules, single
+from gsjax.raster import adjoint, chunks, loops, schedules, single
 from gsjax.raster.bins import Lists, corners, make_grid
 from gsjax.raster.types import Projected
 
@@ -78,21 +75,18 @@ def plain(p: Projected, lists: Lists, grid, config) -> dict[str, np.ndarray]:
     return {"sums": sums, "median": median}
 
 
-of_stops = pytest.mark.parametrize(
-    "config",
-    [
-        RasterConfig(outputs=ALL),
-        RasterConfig.accurate(outputs=ALL),
-        RasterConfig(outputs=ALL, stop=0.02, alpha_cap=1.0),
-        RasterConfig(outputs=ALL, stop=0.6, alpha_cap=1.0, stop_rule="after"),
-        RasterConfig(outputs=ALL, stop=0.0, alpha_cap=1.0, stop_rule="after"),
-    ],
-    ids=["before", "after", "opaque before", "opaque after", "to the last"],
-)
+OPAQUE = RasterConfig(outputs=ALL, alpha_cap=1.0, stop_rule="after")
+STOPS = {
+    "before": RasterConfig(outputs=ALL),
+    "after": RasterConfig.accurate(outputs=ALL),
+    "opaque before": OPAQUE.replace(stop=0.02, stop_rule="before"),
+    "opaque after": OPAQUE.replace(stop=0.6),
+    "to the last": OPAQUE.replace(stop=0.0),
+}
 
 
 @pytest.mark.parametrize("way", ["single", "chunks"])
-@of_stops
+@pytest.mark.parametrize("config", STOPS.values(), ids=STOPS)
 @pytest.mark.parametrize(("dtype", "bar"), [("float32", 1e-5), ("float64", 1e-13)])
 def test_both_are_plain_blending(way, config, dtype, bar, report):
     grid = make_grid(WIDTH, HEIGHT, config.tile_size, DEVICES)
@@ -106,7 +100,7 @@ def test_both_are_plain_blending(way, config, dtype, bar, report):
             assert single.suits(projected, grid)
             given = projected, some, device, grid, config
             return single.composite_singly(*given)[0]
-        return composite.by_chunks(projected, some, schedule, device, grid, config)
+        return chunks.by_chunks(projected, some, schedule, device, grid, config)
 
     found = blended(projected, some, schedule)
     wanted = plain(projected, lists(), grid, config)
@@ -124,11 +118,16 @@ def test_both_are_plain_blending(way, config, dtype, bar, report):
 BY = {"all": {"splats", "channels"}, "splats": {"splats"}, "channels": {"channels"}}
 
 
-@of_stops
-@pytest.mark.parametrize(("dtype", "bar"), [("float32", 3e-5), ("float64", 1e-12)])
-def test_the_way_back_is_the_transpose_of_the_steps(config, dtype, bar, report):
+@pytest.mark.parametrize(
+    ("stop", "dtype", "bar"),
+    [
+        *((stop, "float64", 1e-12) for stop in STOPS),
+        *((stop, "float32", 3e-5) for stop in ("before", "after")),
+    ],
+)
+def test_the_way_back_is_the_transpose_of_the_steps(stop, dtype, bar, report):
     """By everything, by splats and by channels alone."""
-    config = config.replace(outputs=("rgb", "depth"))
+    config = STOPS[stop].replace(outputs=("rgb", "depth"))
     grid = make_grid(WIDTH, HEIGHT, config.tile_size, DEVICES)
     some, device = jax.tree.map(jnp.asarray, lists()), jnp.int32(DEVICE)
     schedule = schedules.make_schedule(some, grid, 4, config.chunk_size, 100)
@@ -141,7 +140,7 @@ def test_the_way_back_is_the_transpose_of_the_steps(config, dtype, bar, report):
 
         def sums(projected):
             given = projected, some, schedule, device, grid, 100, config
-            return composite._by_steps(*given)["sums"]
+            return chunks.by_steps(*given)["sums"]
 
         given = projected, some, device
         images, kept = single.composite_singly(*given, grid, config, keeping=True)
@@ -273,46 +272,28 @@ def test_what_does_not_suit():
 
 
 CHOICE = """
-import jax, gsjax
+import gsjax; gsjax.use_all_cores(2)
+import jax
 from conftest import LIGHT, camera_of, frustum_points, gaussians_at, np
 scene = gaussians_at(frustum_points(np.random.default_rng(0), 16), 0.1, 0.5)
 config = gsjax.RasterConfig(**{**LIGHT, "devices": 2}, outputs=("alpha",))
-def picture(scene, camera, config=config):
+def picture(scene, camera):
     return gsjax.render(scene, camera, config).alpha
-def blended(scene, camera, config=config):
-    return picture(scene, camera, config).sum()
-def slope(scene, camera):
-    def along(params):
-        return blended(scene.replace(params=params), camera)
-    return jax.jvp(along, (scene.params,), (scene.params,))
-def with_median(scene, camera):
-    return blended(scene, camera, config.replace(outputs=("alpha", "median_depth")))
-gradients = (jax.grad(f, allow_int=True) for f in (blended, with_median))
-for function in (picture, *gradients, slope):
+def blended(scene, camera):
+    return picture(scene, camera).sum()
+for function in (picture, jax.grad(blended, allow_int=True)):
     program = jax.jit(function).lower(scene, camera_of()).compile().as_text()
     lines = program[program.index("ENTRY") :].splitlines()
     print(sum("/composite/" in x and " while(" in x for x in lines))
 """
 
 
-def test_it_is_chosen_where_xla_was_told(without_option):
+@pytest.mark.parametrize("option", [True, False])
+def test_it_is_chosen_where_xla_was_told(option, in_a_process):
     """By a process that draws at once: a picture and its gradient leave no loop to be
-    run by turns, but where there is no option, the median is asked for, or a derivative
-    is taken forward."""
-    told = "import gsjax; gsjax.use_all_cores(2)\n"
-    done = subprocess.run(
-        [sys.executable, "-c", told + CHOICE],
-        env={**os.environ, "XLA_FLAGS": "", "PYTHONPATH": str(Path(__file__).parent)},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    picture, gradient, with_median, forward = map(int, done.stdout.split())
-    assert picture == gradient == 0
-    assert with_median >= 1
-    assert forward >= 1
-    bare = without_option(told + CHOICE).split()
-    assert all(int(number) >= 1 for number in bare)
+    run by turns; but both do where there is no option."""
+    picture, gradient = map(int, in_a_process(CHOICE, option).split())
+    assert (picture == 0) == (gradient == 0) == option
 
 
 @pytest.mark.parametrize(

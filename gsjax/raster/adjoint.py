@@ -76,8 +76,8 @@ def pulled_back(
         start, end = number_at(read.start, tile), number_at(read.end, tile)
         first = number_at(kept.first, tile)
         image = part_at(cotangent, (tile, zero, zero), (1, channels, pixels))[0]
-        middle = number_at(read.left, tile), number_at(read.top, tile)
-        middle = tuple(corner + grid.tile / 2 for corner in middle)
+        half = grid.tile / 2
+        middle = number_at(read.left, tile) + half, number_at(read.top, tile) + half
 
         def ahead(state):
             """α and T of the next Gaussians of a look."""

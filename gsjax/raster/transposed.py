@@ -8,14 +8,18 @@ those (`jax.extend`).
 """
 
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import jax
+import jax.numpy as jnp
 from jax import lax
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from gsjax.raster.types import Array
 
+T = TypeVar("T")
 Arrays = Sequence[Array]
 _apply = Primitive("linear_with_transpose")
 _apply.multiple_results = True
@@ -48,8 +52,8 @@ def with_transpose(
 
 
 def moving_jvp(
-    function: Callable[..., Arrays], primals: Arrays, tangents: Sequence, still: type
-) -> tuple[Arrays, Arrays]:
+    function: Callable[..., T], primals: Arrays, tangents: Sequence, still: type
+) -> tuple[T, T]:
     """`jax.jvp` by what moves alone: all whose tangent is not ``still``."""
     moving = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, still)]
 
@@ -74,7 +78,7 @@ mlir.register_lowering(_apply, mlir.lower_fun(_evaluated, multiple_results=True)
 @_apply.def_abstract_eval
 def _shapes_of(*values, forward, transpose, count, shapes):
     del values, forward, transpose, count
-    return [jax.core.ShapedArray(one.shape, one.dtype) for one in shapes]
+    return [ShapedArray(one.shape, one.dtype) for one in shapes]
 
 
 def _jvp(primals, tangents, **params):
@@ -100,7 +104,7 @@ def _batched(values, axes, *, shapes, **params):
         each = [every.get(i, value) for i, value in enumerate(values)]
         return _apply.bind(*each, shapes=shapes, **params)
 
-    found = lax.map(one, [jax.numpy.moveaxis(values[i], axes[i], 0) for i in at])
+    found = lax.map(one, [jnp.moveaxis(values[i], axes[i], 0) for i in at])
     return found, [0] * len(found)
 
 
