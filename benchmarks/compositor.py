@@ -128,7 +128,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
 
     # From one look at who is open to the next it takes so many Gaussians of each tile,
     # or of a block of tiles, a whole number of turns.
-    singly = single.suits(projected, grid)
+    singly = single.suits(3, projected.u.dtype.itemsize, grid)
     look, turn = (single.LOOK, single.TURN) if singly else (config.chunk_size,) * 2
     looks = 2 * schedules.step_capacity(share, grid, group, look)
 

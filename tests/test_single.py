@@ -97,7 +97,7 @@ def test_both_are_plain_blending(way, config, dtype, bar, report):
     @jax.jit
     def blended(projected, some, schedule):
         if way == "single":
-            assert single.suits(projected, grid)
+            assert single.suits(CHANNELS, np.dtype(dtype).itemsize, grid)
             given = projected, some, device, grid, config
             return single.composite_singly(*given)[0]
         return chunks.by_chunks(projected, some, schedule, device, grid, config)
@@ -136,7 +136,7 @@ def test_the_way_back_is_the_transpose_of_the_steps(stop, dtype, bar, report):
 
     @jax.jit
     def ways(projected, some, schedule, cotangent):
-        assert adjoint.suits(projected, grid, config)
+        assert adjoint.suits(CHANNELS, np.dtype(dtype).itemsize, grid, config)
 
         def sums(projected):
             given = projected, some, schedule, device, grid, 100, config
@@ -207,12 +207,20 @@ def compiled(function, *shapes):
     return program[: program.index("ENTRY")]
 
 
-def most_channels(suits, dtype):
-    """As many as it is chosen for, which are not any number."""
-    suiting = [n for n in range(99) if suits(described(dtype, n)[0])]
-    assert suiting == list(range(suiting[-1] + 1))
-    assert 3 <= suiting[-1] < 98
-    return suiting[-1]
+def largest(suits, dtype):
+    """Pairs of tiles' side and colours: the most colours of small tiles, and the
+    largest tiles of few colours, that it is chosen for; neither are any number."""
+    width = np.dtype(dtype).itemsize
+
+    def most(fits, first):
+        fitting = [n for n in range(first, 99) if fits(n)]
+        assert fitting == list(range(first, fitting[-1] + 1))
+        assert 3 <= fitting[-1] < 98
+        return fitting[-1]
+
+    colors = most(lambda n: suits(n, width, make_grid(64, 64, 8, 1)), 0)
+    side = most(lambda n: suits(CHANNELS, width, make_grid(64, 64, n, 1)), 8)
+    return (8, colors), (side, CHANNELS)
 
 
 def exponents(inside):
@@ -222,53 +230,53 @@ def exponents(inside):
 @pytest.mark.parametrize("keeping", [False, True])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_it_is_one_kernel_wherever_it_suits(dtype, keeping):
-    """With as many channels as it is chosen for, and not for any number of them."""
-    grid = make_grid(64, 64, 8, 1)
-    most = most_channels(partial(single.suits, grid=grid), dtype)
+    for side, colors in largest(single.suits, dtype):
+        grid = make_grid(8 * side, 8 * side, side, 1)
 
-    def composited(projected, lists, device, cut):
-        config = RasterConfig(outputs=ALL).at_cut(cut)
-        given = projected, lists, device, grid, config
-        return single.composite_singly(*given, keeping=keeping)
+        def composited(projected, lists, device, cut, grid=grid):
+            config = RasterConfig(outputs=ALL).at_cut(cut)
+            given = projected, lists, device, grid, config
+            return single.composite_singly(*given, keeping=keeping)
 
-    given = *described(dtype, most), np.int32(0), jax.ShapeDtypeStruct((), dtype)
-    inside = compiled(composited, *given)
-    # Over tiles, looks and Gaussians; and where the looks of each tile begin.
-    assert inside.count(" while(") == 3 + keeping
-    # Nothing large is copied, and α is evaluated once for each Gaussian of a turn.
-    assert f"[64,{most + 2},64]{{2,1,0}} copy(" not in inside
-    assert exponents(inside) == single.TURN
+        given = *described(dtype, colors), np.int32(0), jax.ShapeDtypeStruct((), dtype)
+        inside = compiled(composited, *given)
+        # Over tiles, looks and Gaussians; and where the looks of each tile begin.
+        assert inside.count(" while(") == 3 + keeping
+        # Nothing large is copied, and α is evaluated once for each Gaussian of a turn.
+        assert f"[64,{colors + 2},{side**2}]{{2,1,0}} copy(" not in inside
+        assert exponents(inside) == single.TURN
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_the_way_back_is_one_kernel_wherever_it_suits(dtype):
-    config, grid = RasterConfig(), make_grid(64, 64, 8, 1)
-    most = most_channels(partial(adjoint.suits, grid=grid, config=config), dtype)
-
-    def back(projected, lists, device, kept, cotangent):
-        given = projected, lists, device, kept, cotangent, grid, config
-        return adjoint.pulled_back(*given)
-
+    config = RasterConfig()
     one, number = jax.ShapeDtypeStruct, jax.ShapeDtypeStruct((64,), np.int32)
-    kept = single.Kept(one((9000 // single.LOOK + 64, 64), dtype), number, number)
-    cotangent = one((64, most + 2, 64), dtype)
-    inside = compiled(back, *described(dtype, most), np.int32(0), kept, cotangent)
-    # Over tiles, looks, and Gaussians there and back.
-    assert inside.count(" while(") == 4
-    assert f"[5001,{most + 8}]{{1,0}} copy(" not in inside
-    assert exponents(inside) == adjoint.TURN
+    for side, colors in largest(partial(adjoint.suits, config=config), dtype):
+        grid = make_grid(8 * side, 8 * side, side, 1)
+
+        def back(projected, lists, device, kept, cotangent, grid=grid):
+            given = projected, lists, device, kept, cotangent, grid, config
+            return adjoint.pulled_back(*given)
+
+        kept = one((9000 // single.LOOK + 64, side**2), dtype), number, number
+        given = single.Kept(*kept), one((64, colors + 2, side**2), dtype)
+        inside = compiled(back, *described(dtype, colors), np.int32(0), *given)
+        # Over tiles, looks, and Gaussians there and back.
+        assert inside.count(" while(") == 4
+        assert f"[5001,{colors + 8}]{{1,0}} copy(" not in inside
+        assert exponents(inside) == adjoint.TURN
 
 
 def test_what_does_not_suit():
-    """Few pixels, of which no vectors are made; and turns that touch too much."""
-    assert not single.suits(splats("float32"), make_grid(24, 24, 4, 1))
-    assert not single.suits(splats("float32", 200), make_grid(24, 24, 8, 1))
-    assert not single.suits(splats("float64"), make_grid(64, 64, 32, 1))
+    """Few pixels, of which no vectors are made; turns that touch too much; and of the
+    way back what it does not give."""
     config, grid = RasterConfig(), make_grid(64, 64, 8, 1)
-    probed = splats("float32")._replace(probe=jnp.zeros((2, RANKS)))
-    assert adjoint.suits(splats("float32"), grid, config)
-    assert not adjoint.suits(probed, grid, config)
-    assert not adjoint.suits(splats("float32"), grid, config.replace(outputs=ALL))
+    assert not single.suits(3, 4, make_grid(24, 24, 4, 1))
+    assert not single.suits(200, 4, grid)
+    assert not single.suits(3, 8, make_grid(64, 64, 32, 1))
+    assert adjoint.suits(3, 4, grid, config)
+    assert not adjoint.suits(3, 4, grid, config.replace(absgrad=True))
+    assert not adjoint.suits(3, 4, grid, config.replace(outputs=ALL))
 
 
 CHOICE = """

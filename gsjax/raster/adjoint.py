@@ -38,13 +38,13 @@ _product = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
 _ARRAYS, _OF_CHANNEL = 108, 7
 
 
-def suits(projected: Projected, grid: Grid, config: RasterConfig) -> bool:
-    """Whether `pulled_back` is one kernel here and gives all that is asked for."""
-    channels = projected.colors.shape[0] + 2  # depth, ones
-    row = projected.u.dtype.itemsize * grid.tile**2
-    touched = row * (_ARRAYS + _OF_CHANNEL * channels)
-    given = projected.probe is None and "median_depth" not in config.outputs
-    return given and touched <= KERNEL_BYTES and single.suits(projected, grid)
+def suits(colors: int, width: int, grid: Grid, config: RasterConfig) -> bool:
+    """Whether `pulled_back` is one kernel here and gives all that is asked for;
+    ``width`` is the bytes of a number."""
+    channels = colors + 2  # depth, ones
+    touched = width * grid.tile**2 * (_ARRAYS + _OF_CHANNEL * channels)
+    given = not config.absgrad and "median_depth" not in config.outputs
+    return given and touched <= KERNEL_BYTES and single.suits(colors, width, grid)
 
 
 def pulled_back(

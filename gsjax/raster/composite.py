@@ -57,7 +57,7 @@ def composite(
 
     @_one_by_one
     def one(projected, lists, schedule, device):
-        if single.suits(projected, grid):
+        if single.suits(*_sizes(projected), grid):
             return composite_singly(projected, lists, device, grid, config)[0]
         return by_chunks(projected, lists, schedule, device, grid, config)
 
@@ -75,7 +75,7 @@ def _composite_jvp(grid, room, config, primals, tangents):
         projected, lists, schedule, device = jax.tree.unflatten(tree, leaves)
         return by_steps(projected, lists, schedule, device, grid, room, config)
 
-    if not adjoint.suits(projected, grid, config):
+    if not adjoint.suits(*_sizes(projected), grid, config):
         return moving_jvp(stepped, leaves, slopes, SymbolicZero)
     images, kept = _keeping(projected, lists, schedule, device, grid, room, config)
     moving = [i for i, s in enumerate(slopes) if not isinstance(s, SymbolicZero)]
@@ -97,6 +97,11 @@ def _composite_jvp(grid, room, config, primals, tangents):
     like = [images["sums"]]
     (sums,) = with_transpose(forward, transpose, (*leaves, *kept), slopes, like)
     return images, {"sums": sums}
+
+
+def _sizes(projected: Projected) -> tuple[int, int]:
+    """(Colours, bytes of a number)."""
+    return projected.colors.shape[0], projected.u.dtype.itemsize
 
 
 def _kinds(moving: list[int]) -> frozenset[str]:

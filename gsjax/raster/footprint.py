@@ -4,7 +4,7 @@ Not measured but counted, and then held against what XLA says of its programs an
 processes came to: jax 0.10.2, one and two CPU devices. What binning and the gradient of
 compositing take goes with the pairs, what the loss takes with the pixels, and both are
 shared by the devices; what projection takes goes with the Gaussians, and each has its
-own. Without a gradient, compositing takes what a step of its loops does; on
+own. Without a gradient, compositing takes what a step of its loops does, at most; on
 accelerators it takes its share for every chunk (of one GPU a process took 3.5 GB, where
 4.1 are counted).
 
@@ -14,7 +14,7 @@ Axis legend: P pixels of a tile, K Gaussians of a chunk, C channels.
 import jax
 
 from gsjax.memory import Estimate
-from gsjax.raster import bins, flat, schedules
+from gsjax.raster import adjoint, bins, flat, schedules, single
 from gsjax.raster.rasterise import default_pair_capacity
 from gsjax.raster.types import RasterConfig
 
@@ -66,7 +66,11 @@ def render_estimate(
     numbers = 11 + 3 * bases
     by_turns = jax.default_backend() == "cpu"
     count = _by_turns if by_turns else _side_by_side
-    blended, kept = count(share, grid, config, channels, gradients)
+    singly = by_turns and adjoint.suits(3, width, grid, config)
+    if singly and gradients:
+        blended = kept = single.look_capacity(share, grid) * config.tile_size**2
+    else:
+        blended, kept = count(share, grid, config, channels, gradients)
     pairs = _IN_LISTS * 4 * share + width * blended
     of_gaussians = _PROJECTED + numbers
     if gradients:  # of one camera; of the others there is what is kept for it

@@ -89,13 +89,19 @@ class Kept(NamedTuple):
     looks: Array
 
 
-def suits(projected: Projected, grid: Grid) -> bool:
-    """Whether the loops are one kernel here, which vector instructions are made of."""
-    channels = projected.colors.shape[0] + 3  # depth, ones, the median
-    row = projected.u.dtype.itemsize * grid.tile**2
-    touched = row * TURN * (_ARRAYS + _OF_CHANNEL * channels)
+def suits(colors: int, width: int, grid: Grid) -> bool:
+    """Whether the loops are one kernel here, which vector instructions are made of;
+    ``width`` is the bytes of a number, beside ``colors`` of which depth may be asked
+    for, and the median."""
+    channels = colors + 3  # depth, ones, the median
+    touched = width * grid.tile**2 * TURN * (_ARRAYS + _OF_CHANNEL * channels)
     fits = grid.tile**2 >= _FEWEST and touched <= KERNEL_BYTES
     return fits and loops.large_are_kernels()
+
+
+def look_capacity(capacity: int, grid: Grid) -> int:
+    """Room for as many looks as the lists of so many pairs may want."""
+    return capacity // LOOK + grid.tiles
 
 
 def reading_of(
@@ -146,7 +152,7 @@ def composite_singly(
         name: jnp.zeros((grid.tiles, *one.shape), one.dtype)
         for name, one in nothing.items()
     }
-    kept = _nothing_kept(read, empty) if keeping else None
+    kept = _nothing_kept(read, empty, grid) if keeping else None
 
     def of_tile(tile, state):
         images, kept = state
@@ -210,9 +216,9 @@ def number_at(values: Array, tile: Array) -> Array:
     return part_at(values, (tile,), (1,))
 
 
-def _nothing_kept(read: Reading, empty: Array) -> Kept:
+def _nothing_kept(read: Reading, empty: Array, grid: Grid) -> Kept:
     wanted = -(-(read.end - read.start) // LOOK)
-    room = read.ranks.shape[0] // LOOK + wanted.shape[0]
+    room = look_capacity(read.ranks.shape[0], grid)
     return Kept(
         carried=jnp.zeros((room, len(empty)), empty.dtype),
         first=running_total(wanted) - wanted,

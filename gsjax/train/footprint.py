@@ -60,7 +60,10 @@ def step_estimate(
         slots,
         num_bases(config.sh_degree),
         size,
-        raster.replace(outputs=("rgb",)),
+        raster.replace(
+            outputs=("rgb",),
+            absgrad=config.strategy == "adaptive" and config.adaptive.absgrad,
+        ),
         cameras=config.batch,
         gradients=True,
     )
