@@ -57,9 +57,9 @@ class RasterConfig:
       rungs: how many sizes, each a quarter of the one before, sorting by depth is
         compiled for; the smallest that fits is run. Sorting pairs, on accelerators,
         has sizes between them; from 2 on there is a small size of projecting, from 4 on
-        the gradient of compositing has sizes too, two fewer, and on accelerators from 3
-        on all of compositing, one fewer. Each takes seconds to compile, and saves time
-        where a view needs a quarter of its capacity or less.
+        the gradient of compositing by chunks has sizes too, two fewer, and on
+        accelerators from 3 on all of compositing, one fewer. Each takes seconds to
+        compile, and saves time where a view needs a quarter of its capacity or less.
       devices: how many devices share the tiles (and on CPUs the projection, where
         colours turn with the view); None means all local ones. Within a
         `jax.shard_map` of your own: 1, and ``check_vma=False`` there; within
