@@ -12,7 +12,6 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -41,8 +40,6 @@ def with_transpose(
       given: arrays; what is differentiated of them is so by ``forward``.
       argument: arrays.
       like: what the results have the shapes and types of.
-
-    A batch goes one after another.
     """
     shapes = tuple(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in like)
     return _apply.bind(
@@ -96,15 +93,30 @@ def _transposed(cotangents, *values, transpose, count, **_):
     return [None] * count + list(transpose(*values[:count], *cotangents))
 
 
-def _batched(values, axes, *, shapes, **params):
-    at = [i for i, axis in enumerate(axes) if axis is not None]
-
-    def one(some):
-        every = dict(zip(at, some))
-        each = [every.get(i, value) for i, value in enumerate(values)]
-        return _apply.bind(*each, shapes=shapes, **params)
-
-    found = lax.map(one, [jnp.moveaxis(values[i], axes[i], 0) for i in at])
+def _batched(values, axes, *, forward, transpose, count, shapes):
+    """Both maps of a batch: each is as `jax.vmap` makes it."""
+    size = next(v.shape[a] for v, a in zip(values, axes) if a is not None)
+    values = [
+        value if axis is None else jnp.moveaxis(value, axis, 0)
+        for value, axis in zip(values, axes)
+    ]
+    axes = [None if axis is None else 0 for axis in axes]
+    # Of the argument all: what comes back to one that is shared is summed by this.
+    argument = [
+        jnp.broadcast_to(value, (size, *value.shape)) if axis is None else value
+        for value, axis in zip(values[count:], axes[count:])
+    ]
+    given, known = values[:count], axes[:count]
+    found = _apply.bind(
+        *given,
+        *argument,
+        forward=jax.vmap(forward, (*known, *(0 for _ in argument))),
+        transpose=jax.vmap(transpose, (*known, *(0 for _ in shapes))),
+        count=count,
+        shapes=tuple(
+            jax.ShapeDtypeStruct((size, *one.shape), one.dtype) for one in shapes
+        ),
+    )
     return found, [0] * len(found)
 
 
