@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from gsjax import window
 from gsjax.devices import spread
 from gsjax.metrics import (
-    SSIM_RADIUS,
     ratio,
     seen_only,
     ssim_map,
@@ -69,7 +69,7 @@ def photometric_spread(
     """
     height = images.shape[1]
     rows = -(-height // devices)
-    margin = SSIM_RADIUS if ssim_weight > 0 else 0
+    margin = window.RADIUS if ssim_weight > 0 else 0
     if weights is None:
         weights = jnp.ones(images.shape[:-1], images.dtype)
 

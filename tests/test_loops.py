@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import on_cpu
 
-from gsjax.raster import loops
+from gsjax import loops
 
 ROOM = 40
 SIZE = 3 * loops.STRETCH + 5

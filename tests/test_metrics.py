@@ -8,8 +8,8 @@ import pytest
 from gsjax.errors import InputError
 from gsjax.metrics import psnr, ssim, ssim_map, weighted_mean
 
-# Smaller than the window, one pixel, and on either side of the blocks of 128 rows.
-SIZES = [(1, 1), (3, 20), (24, 32), (130, 257)]
+# One pixel, smaller than the window, and larger than what is taken at a time.
+SIZES = [(1, 1), (3, 20), (24, 32), (130, 257), (7, 700)]
 
 maps = jax.jit(ssim_map)
 scores = jax.jit(lambda x, y, w: (psnr(x, y, w), ssim(x, y, w)))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.raster.transposed import with_transpose
+from gsjax.transposed import with_transpose
 
 RNG = np.random.default_rng(0)
 A, B, X, Y = (jnp.asarray(RNG.normal(size=5)) for _ in range(4))

@@ -24,10 +24,10 @@ import numpy as np
 from jax import lax
 
 from gsjax.devices import KERNEL_BYTES
+from gsjax.loops import part_at, with_part
 from gsjax.raster import single
 from gsjax.raster.bins import Grid, Lists
 from gsjax.raster.blend import pass_through
-from gsjax.raster.loops import part_at, with_part
 from gsjax.raster.single import LOOK, Kept, number_at, reading_of
 from gsjax.raster.types import Array, Projected, RasterConfig
 

@@ -20,8 +20,8 @@ from gsjax.raster.bins import Grid, Lists
 from gsjax.raster.chunks import by_chunks, by_steps
 from gsjax.raster.schedules import Schedule
 from gsjax.raster.single import Kept, composite_singly
-from gsjax.raster.transposed import moving_jvp, with_transpose
 from gsjax.raster.types import Array, Projected, RasterConfig
+from gsjax.transposed import moving_jvp, with_transpose
 
 # Under `jax.vmap`: side by side each would wait for the longest, and every turn of a
 # loop copy the images of all.

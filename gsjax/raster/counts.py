@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gsjax.raster import loops
+from gsjax import loops
 from gsjax.raster.types import Array
 
 # A total above this is reported as 2^31 - 1: int32 sums must not wrap.

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
-from gsjax.raster import loops
+from gsjax import loops
 from gsjax.raster.blocks import block_size, over_blocks
 from gsjax.raster.counts import owners, running_total
 from gsjax.raster.ladder import on_ladder

@@ -3,7 +3,7 @@
 As plain code would have it: for each tile, for each Gaussian of its list, until no
 pixel of the tile is open. It needs no schedule, looks up each Gaussian when it is due,
 and keeps the sums of a tile in the nearest cache. It is fast where XLA makes one kernel
-of the loops (`gsjax.raster.loops`), which it does of larger turns than by default only
+of the loops (`gsjax.loops`), which it does of larger turns than by default only
 if the process was started so, as `gsjax.use_all_cores` does; `suits` tells. The way
 back, for gradients, is `gsjax.raster.adjoint`.
 
@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from gsjax import loops
 from gsjax.devices import KERNEL_BYTES
-from gsjax.raster import loops
+from gsjax.loops import part_at, with_part
 from gsjax.raster.alpha import alphas, pixel_centres
 from gsjax.raster.bins import Grid, Lists, corners
 from gsjax.raster.blend import columns_of, pass_through, table_of
 from gsjax.raster.counts import running_total
-from gsjax.raster.loops import part_at, with_part
 from gsjax.raster.types import Array, Projected, RasterConfig
 
 TURN = 2  # Gaussians: the sums are fetched and stored once for so many

@@ -1,4 +1,4 @@
-"""Loops over single numbers, for CPUs: each is one compiled kernel.
+"""Loops over single numbers, or a few, for CPUs: each is one compiled kernel.
 
 XLA's CPU backend makes one kernel of a `while` whose turn touches less than 1 kB, if it
 is not told otherwise (its `SmallWhileLoopHoistingPass`), arrays of any size among what
@@ -20,7 +20,8 @@ from jax import lax
 from jax.custom_batching import sequential_vmap
 
 from gsjax.devices import KERNEL_BYTES
-from gsjax.raster.types import Array
+
+Array = jax.Array
 
 STRETCH = 256  # slots that `places` looks at or leaves out together
 _ADDED = 4  # counts that `running_total` adds in a turn; of 16 it is above 1 kB
@@ -33,7 +34,7 @@ def large_are_kernels() -> bool:
     numbers = jax.ShapeDtypeStruct((KERNEL_BYTES // 9,), jnp.float32)  # 8 bytes each
 
     def loop(x):
-        return _each(0, 9, lambda _, x: 2 * x + 1, x)
+        return each(0, 9, lambda _, x: 2 * x + 1, x)
 
     with jax.disable_jit(False):
         program = jax.jit(loop).lower(numbers).compile().as_text() or ""
@@ -67,7 +68,7 @@ def _put(values: Array, number: Array, index: Array) -> Array:
     return with_part(values, number, (index[0],))
 
 
-def _each(start, end, turn, state):
+def each(start, end, turn, state):
     """A `lax.fori_loop` that counts in 32 bits."""
     return lax.fori_loop(jnp.int32(start), jnp.int32(end), turn, state)
 
@@ -89,7 +90,7 @@ def running_total(counts: Array) -> Array:
         return total, out
 
     init = (jnp.zeros(1, jnp.int32), jnp.zeros_like(counts))
-    return _each(0, counts.shape[0] // _ADDED, turn, init)[1][:size]
+    return each(0, counts.shape[0] // _ADDED, turn, init)[1][:size]
 
 
 @sequential_vmap
@@ -116,7 +117,7 @@ def append(
         return count + _at(numbers, i[None]), kept
 
     numbers = chosen.astype(jnp.int32)
-    return _each(0, numbers.shape[0], turn, (count, kept))
+    return each(0, numbers.shape[0], turn, (count, kept))
 
 
 @sequential_vmap
@@ -143,10 +144,10 @@ def places(chosen: Array, some: Array, index: Array) -> tuple[Array, Array]:
     def of_stretch(i, state):
         start = i * STRETCH
         end = jnp.minimum(start + _at(lengths, i[None])[0], numbers.shape[0])
-        return _each(start, end, turn, state)
+        return each(start, end, turn, state)
 
     init = (jnp.zeros(1, jnp.int32), index)
-    count, found = _each(0, lengths.shape[0], of_stretch, init)
+    count, found = each(0, lengths.shape[0], of_stretch, init)
     return _put(found, index[-1:], count), count[0]
 
 
@@ -180,4 +181,4 @@ def deal(kept: Array, items: Array, place: Array, out: Array) -> Array:
         *_, place, out = lax.while_loop(lambda s: s[0][0] < s[1][0], one, state)
         return place, out
 
-    return _each(0, items, of_item, (place, out))[1]
+    return each(0, items, of_item, (place, out))[1]

@@ -16,8 +16,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from gsjax.raster.types import Array
-
+Array = jax.Array
 T = TypeVar("T")
 Arrays = Sequence[Array]
 _apply = Primitive("linear_with_transpose")
