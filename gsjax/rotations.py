@@ -56,3 +56,18 @@ def covariance(quats: Array, scales: Array) -> Array:
     """Covariances R S Sᵀ Rᵀ [..., 3, 3] from wxyz [..., 4] and scales [..., 3]."""
     half = quaternion_to_matrix(quats) * jnp.asarray(scales)[..., None, :]
     return jnp.einsum("...ij,...kj->...ik", half, half, precision="highest")
+
+
+def times_covariance(quats: Array, scales: Array, vectors: Array) -> Array:
+    """R S Sᵀ Rᵀ v of vectors v [..., 3]: along each axis, and back."""
+    quat, scale, vector = (
+        tuple(jnp.moveaxis(a, -1, 0)) for a in (quats, scales, vectors)
+    )
+    quat, _ = near_one(quat, (1.0, 0.0, 0.0, 0.0))
+    rows, square = rotation_rows(*quat), sum(q * q for q in quat)
+    along = [
+        sum(r * v for r, v in zip(column, vector)) * jnp.square(s / square)
+        for column, s in zip(zip(*rows), scale)
+    ]
+    back = [sum(r * a for r, a in zip(row, along)) for row in rows]
+    return jnp.stack(back, -1)

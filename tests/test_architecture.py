@@ -19,10 +19,10 @@ PACKAGE = Path(gsjax.__file__).parent
 FLOORS = {
     0: (
         *("errors", "files", "numerics", "rotations", "settings", "sh"),
-        *("devices", "programs", "machine", "memory"),
+        *("devices", "programs", "machine", "memory", "loops", "transposed"),
     ),
     1: ("gaussians", "cameras", "distortion"),
-    2: ("raster", "densify", "losses", "metrics", "optim"),
+    2: ("raster", "densify", "losses", "metrics", "optim", "window"),
     3: ("io", "scene", "images", "movies", "sheets", "curves"),
 }  # what is not named here is a program, floor 4
 

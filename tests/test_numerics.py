@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsjax.numerics import exp_negative, held, near_one, once, safe_normalize
-from gsjax.rotations import quaternion_to_matrix
+from gsjax.rotations import covariance, quaternion_to_matrix, times_covariance
 
 pytestmark = pytest.mark.as_users
 
@@ -94,6 +94,18 @@ def test_a_rotation_does_not_depend_on_the_norm(norm):
         quaternion_to_matrix, (jnp.float32(quats),), (jnp.float32(quats),)
     )
     assert np.abs(along).max() < 2e-6
+
+
+@pytest.mark.parametrize("norm", [1e-25, 1.0, 1e25])
+def test_times_a_covariance_is_so_without_its_matrix(norm):
+    rng = np.random.default_rng(4)
+    quats = jnp.float32(norm * rng.normal(size=(2, 50, 4)))
+    scales = jnp.exp(jnp.float32(rng.normal(size=(2, 50, 3))))
+    vectors = jnp.float32(rng.normal(size=(2, 50, 3)))
+    found = times_covariance(quats, scales, vectors)
+    wanted = jnp.einsum("...ij,...j", covariance(quats, scales), vectors)
+    near = 2e-6 * jnp.max(scales, -1, keepdims=True) ** 2
+    assert jnp.all(jnp.abs(found - wanted) < near)
 
 
 def test_slopes_of_a_rotation_by_what_is_zero():

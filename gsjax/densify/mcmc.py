@@ -22,7 +22,7 @@ from gsjax.densify.slots import copy_into
 from gsjax.densify.types import Densifier, SlotEdit
 from gsjax.gaussians import Gaussians
 from gsjax.numerics import exp_log_scale, logit
-from gsjax.rotations import covariance
+from gsjax.rotations import times_covariance
 from gsjax.settings import require_ranges, settle
 
 Array = jax.Array
@@ -120,8 +120,7 @@ def mcmc(settings: McmcSettings, extent: float = USUAL_EXTENT) -> Densifier:
         opacity = jax.nn.sigmoid(params.logit_opacities)
         gate = jax.nn.sigmoid(-100 * (opacity - 0.005))
         noise = jax.random.normal(key, params.means.shape, params.means.dtype)
-        spread = covariance(params.quats, exp_log_scale(params.log_scales))
-        shift = jnp.einsum("nij,nj->ni", spread, noise, precision="highest")
+        shift = times_covariance(params.quats, exp_log_scale(params.log_scales), noise)
         # The rate may be wider than the parameters, and must not widen them.
         strength = settings.noise / unit**2 * rate.astype(gate.dtype)
         shift = shift * (gate * strength)[:, None]

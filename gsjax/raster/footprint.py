@@ -66,8 +66,7 @@ def render_estimate(
     numbers = 11 + 3 * bases
     by_turns = jax.default_backend() == "cpu"
     count = _by_turns if by_turns else _side_by_side
-    singly = by_turns and adjoint.suits(3, width, grid, config)
-    if singly and gradients:
+    if gradients and by_turns and adjoint.suits(3, width, grid, config):
         blended = kept = single.look_capacity(share, grid) * config.tile_size**2
     else:
         blended, kept = count(share, grid, config, channels, gradients)

@@ -28,9 +28,9 @@ from gsjax.raster.types import Array, Projected, RasterConfig
 TURN = 2  # Gaussians: the sums are fetched and stored once for so many
 LOOK = 8  # Gaussians from one look at who is open to the next; a multiple of TURN
 _FEWEST = 64  # pixels: of fewer XLA hardly makes vector instructions
-# What a turn touches at most: arrays [P] of each Gaussian, without channels and for
-# each. XLA counts what every kernel reads and writes, in the loops around it as well.
-_ARRAYS, _OF_CHANNEL = 32, 4
+# What a turn touches at most: arrays [P] without channels, and for each. XLA counts
+# what every kernel reads and writes, in the loops around it as well.
+_ARRAYS, _OF_CHANNEL = 64, 8
 
 
 class Reading(NamedTuple):
@@ -94,7 +94,7 @@ def suits(colors: int, width: int, grid: Grid) -> bool:
     ``width`` is the bytes of a number, beside ``colors`` of which depth may be asked
     for, and the median."""
     channels = colors + 3  # depth, ones, the median
-    touched = width * grid.tile**2 * TURN * (_ARRAYS + _OF_CHANNEL * channels)
+    touched = width * grid.tile**2 * (_ARRAYS + _OF_CHANNEL * channels)
     fits = grid.tile**2 >= _FEWEST and touched <= KERNEL_BYTES
     return fits and loops.large_are_kernels()
 
