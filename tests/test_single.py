@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from conftest import on_cpu
 
-from gsjax import RasterConfig, devices
-from gsjax.raster import adjoint, chunks, loops, schedules, single
+from gsjax import RasterConfig, devices, loops
+from gsjax.raster import adjoint, chunks, schedules, single
 from gsjax.raster.bins import Lists, corners, make_grid
 from gsjax.raster.types import Projected
 

@@ -31,7 +31,7 @@ _IN_STEP = 3  # of a Gaussian at a pixel, while a chunk is blended
 _PROJECTED, _PROJECTED_LEARNT, _KEPT = 42, 60, 32
 # Bytes of a pixel: images and their tiles; with gradients; and what SSIM blurs, which
 # the devices share.
-_OF_PIXEL, _OF_PIXEL_LEARNT, _BLURRED = 26, 35, 190
+_OF_PIXEL, _OF_PIXEL_LEARNT, _BLURRED = 26, 35, 240
 
 
 def render_estimate(
