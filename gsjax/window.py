@@ -51,7 +51,8 @@ def _weights() -> list[float]:
 def _by_loops(planes: Sequence[Array]) -> Array:
     """[N, H, W, C], for CPUs: rows under the window, then columns of those.
 
-    In one expression XLA would evaluate the rows anew for every column.
+    In one expression XLA would evaluate the rows anew for every column. Where XLA makes
+    no kernels of the loops (`gsjax.loops`), they take as long as the products.
     """
     height, width, channels = planes[0].shape
     margin = RADIUS * channels
@@ -72,6 +73,7 @@ def _with_rows(rows: Array, place: int, plane: Array, margin: int) -> Array:
         left = jnp.minimum(i % parts * size, width - size)
         total = jnp.zeros((1, size), plane.dtype)
         for offset, weight in enumerate(_weights(), -RADIUS):
+            # A row beyond the border is 0 times that at it, which is in reach as well.
             at = jnp.clip(row + offset, 0, height - 1)
             weight = jnp.where(at == row + offset, weight, 0).astype(plane.dtype)
             total += weight * part_at(plane, (at, left), (1, size))
