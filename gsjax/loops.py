@@ -1,4 +1,4 @@
-"""Loops over single numbers, or a few, for CPUs: each is one compiled kernel.
+"""Loops over single numbers, for CPUs: each is one compiled kernel.
 
 XLA's CPU backend makes one kernel of a `while` whose turn touches less than 1 kB, if it
 is not told otherwise (its `SmallWhileLoopHoistingPass`), arrays of any size among what
@@ -6,7 +6,8 @@ it carries: a turn then takes a nanosecond or two, and some hundred times as lon
 it does not. So a turn holds arithmetic on numbers, slices and updates of a few, and no
 gather, scatter or sort; and what it reads of an array that it also writes, it carries
 over from the turn before: else XLA copies that array in every turn. No derivative is
-taken here, and a batch goes one after another.
+taken here, and a batch goes one after another. Loops whose turns hold more, as those of
+`gsjax.window`, are kernels where XLA is told `gsjax.devices.KERNEL_BYTES`.
 
 Axis legend: I items, T tiles.
 """

@@ -97,10 +97,12 @@ def ssim(image: Array, target: Array, weight: Array | None = None) -> Array:
 
 def ssim_map(image: Array, target: Array) -> Array:
     """SSIM of every pixel and channel, [H, W, C]; see `ssim`."""
+    dtype = jnp.result_type(image, target)
+    x, y = jnp.broadcast_arrays(*(jnp.asarray(a, dtype) for a in (image, target)))
     # By the difference d = x − y: of equal pictures, numerator and denominator are the
     # same numbers, whatever the rounding. As var x + var y = 2 covar + var d, nothing
     # else changes, and the derivative goes through three means only.
-    x, y, difference = image, target, image - target
+    difference = x - y
     mean_x, product, square = window_means((x, x * y, difference * difference))
     (mean_y,) = window_means((y,))
     mean = mean_x - mean_y

@@ -28,7 +28,8 @@ _STRETCH = 1024
 
 
 def window_means(planes: Sequence[Array]) -> list[Array]:
-    """Means of planes [H, W, C] under the window at each pixel and channel, alike."""
+    """Means of planes [H, W, C], all of one shape and type, under the window at each
+    pixel and channel, alike."""
     by = _by_loops if jax.default_backend() == "cpu" else _by_products
     return with_transpose(
         lambda *planes: list(by(planes)),
@@ -49,26 +50,27 @@ def _weights() -> list[float]:
 @jax.jit  # by itself: where it is called outside of one, it is compiled once
 @sequential_vmap
 def _by_loops(planes: Sequence[Array]) -> Array:
-    """[N, H, W, C], for CPUs: rows under the window, then columns of those.
+    """[N, H, W, C], for CPUs: sums down the picture, then sums of those across.
 
-    In one expression XLA would evaluate the rows anew for every column. Where XLA makes
-    no kernels of the loops (`gsjax.loops`), they take as long as the products.
+    In one expression XLA would make the sums down anew for every one across. Where it
+    makes no kernels of the loops (`gsjax.loops`), they take as long as the products.
     """
     height, width, channels = planes[0].shape
     margin = RADIUS * channels
     shape = len(planes), height, width * channels + 2 * margin
-    rows = jnp.zeros(shape, planes[0].dtype)
+    down = jnp.zeros(shape, planes[0].dtype)
     for place, plane in enumerate(planes):
-        rows = _with_rows(rows, place, plane.reshape(height, -1), margin)
-    return _columns(rows, channels).reshape(-1, height, width, channels)
+        down = _with_sums_down(down, place, plane.reshape(height, -1), margin)
+    return _sums_across(down, channels).reshape(-1, height, width, channels)
 
 
-def _with_rows(rows: Array, place: int, plane: Array, margin: int) -> Array:
-    """``rows`` [N, H, margin + W + margin] with sums of a plane's [H, W] at a place."""
+def _with_sums_down(down: Array, place: int, plane: Array, margin: int) -> Array:
+    """``down`` [N, H, margin + W · C + margin] with those of a plane [H, W · C], at
+    ``place`` and between the margins."""
     height, width = plane.shape
     size, parts = _stretches(width)
 
-    def turn(i, rows):
+    def turn(i, down):
         row = i // parts
         left = jnp.minimum(i % parts * size, width - size)
         total = jnp.zeros((1, size), plane.dtype)
@@ -77,27 +79,27 @@ def _with_rows(rows: Array, place: int, plane: Array, margin: int) -> Array:
             at = jnp.clip(row + offset, 0, height - 1)
             weight = jnp.where(at == row + offset, weight, 0).astype(plane.dtype)
             total += weight * part_at(plane, (at, left), (1, size))
-        return with_part(rows, total[None], (jnp.int32(place), row, margin + left))
+        return with_part(down, total[None], (jnp.int32(place), row, margin + left))
 
-    return each(0, height * parts, turn, rows)
+    return each(0, height * parts, turn, down)
 
 
-def _columns(rows: Array, step: int) -> Array:
-    """[N, H, W] sums of neighbours ``step`` apart; ``rows`` has those at the ends."""
-    count, height, width = rows.shape
+def _sums_across(down: Array, step: int) -> Array:
+    """[N, H, W · C] of neighbours ``step`` = C apart; ``down`` has margins for them."""
+    count, height, width = down.shape
     width -= 2 * RADIUS * step
     size, parts = _stretches(width)
 
     def turn(i, out):
         row, left = i // parts, jnp.minimum(i % parts * size, width - size)
         start = row // height, row % height, left
-        some = part_at(rows, start, (1, 1, size + 2 * RADIUS * step))
-        total = jnp.zeros((1, 1, size), rows.dtype)
+        some = part_at(down, start, (1, 1, size + 2 * RADIUS * step))
+        total = jnp.zeros((1, 1, size), down.dtype)
         for place, weight in enumerate(_weights()):
             total += weight * some[..., place * step : place * step + size]
         return with_part(out, total, start)
 
-    out = jnp.zeros((count, height, width), rows.dtype)
+    out = jnp.zeros((count, height, width), down.dtype)
     return each(0, count * height * parts, turn, out)
 
 

@@ -68,6 +68,19 @@ def test_ssim_is_the_sum_over_windows(size, report):
         np.testing.assert_allclose(scores(x, y, None)[1], wanted.mean(), rtol=1e-11)
 
 
+@pytest.mark.parametrize("types", [("float32", "float64"), ("float64", "float32")])
+def test_types_may_differ(types):
+    """As in any sum, the wider one counts."""
+    x, y = (jnp.asarray(a, t) for a, t in zip(pair(12, 20), types))
+    found = maps(x, y)
+    assert found.dtype == jnp.float64
+    np.testing.assert_allclose(found, maps(*map(jnp.float64, (x, y))), atol=1e-14)
+    slope = jax.grad(lambda x: ssim(x, y))(x)
+    assert slope.dtype == x.dtype
+    wanted = jax.grad(lambda x: ssim(x, jnp.float64(y)))(jnp.float64(x))
+    np.testing.assert_allclose(slope, wanted, atol=1e-8)
+
+
 @pytest.mark.parametrize("channels", [1, 3])
 def test_symmetry_bounds_and_identity(channels):
     for seed in range(3):

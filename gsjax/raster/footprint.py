@@ -30,7 +30,7 @@ _IN_STEP = 3  # of a Gaussian at a pixel, while a chunk is blended
 # is kept of it for another camera.
 _PROJECTED, _PROJECTED_LEARNT, _KEPT = 42, 60, 32
 # Bytes of a pixel: images and their tiles; with gradients; and what SSIM blurs, which
-# the devices share.
+# the devices share (on accelerators the pairs are always more).
 _OF_PIXEL, _OF_PIXEL_LEARNT, _BLURRED = 26, 35, 240
 
 

@@ -28,8 +28,8 @@ from gsjax.raster.types import Array, Projected, RasterConfig
 TURN = 2  # Gaussians: the sums are fetched and stored once for so many
 LOOK = 8  # Gaussians from one look at who is open to the next; a multiple of TURN
 _FEWEST = 64  # pixels: of fewer XLA hardly makes vector instructions
-# What a turn touches at most: arrays [P] without channels, and for each. XLA counts
-# what every kernel reads and writes, in the loops around it as well.
+# What a turn (of two) touches at most: arrays [P] that have no channels, and for each
+# channel. XLA counts what every kernel reads and writes, in the loops around as well.
 _ARRAYS, _OF_CHANNEL = 64, 8
 
 
