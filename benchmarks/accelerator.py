@@ -28,7 +28,7 @@ import scenes
 from jax import lax
 
 import gsjax
-from gsjax.console import note
+from gsjax.runtime.console import note
 
 COUNTS = (100_000, 1_000_000, 3_000_000)
 _TURNS = 32

@@ -3,7 +3,7 @@
 ``python benchmarks/before.py COMMIT DATASET [IMAGE …]`` trains on the photographs of
 the demo as `gsjax demo` does, and on DATASET with `--preset fast`, the named images
 held out (else every 8th), both with the code of COMMIT and with that which is here, in
-processes that have nothing compiled. Kept is after how many seconds a PSNR of the
+processes that have nothing compiled. Residuals is after how many seconds a PSNR of the
 held-out views was passed: compiling counts, measuring and loading do not.
 """
 
@@ -16,8 +16,8 @@ from pathlib import Path
 
 import measure
 
-from gsjax.train.folder import run_files
-from gsjax.train.history import read_metrics
+from gsjax.runs.folder import run_files
+from gsjax.runs.history import read_metrics
 
 ROOT = Path(__file__).parents[1]
 # As `gsjax demo`, but for measuring on the way.
@@ -25,7 +25,7 @@ DEMO = """
 import sys
 from pathlib import Path
 from gsjax import demo
-from gsjax.commands.common import start_jax
+from gsjax.cli.common import start_jax
 start_jax()
 usual = demo.demo_config
 demo.demo_config = lambda *given: usual(*given).replace(every_eval=20)
@@ -67,7 +67,7 @@ def compared(scene: str, before: list[dict], now: list[dict]) -> list[dict]:
 
 def main(commit: str, dataset: Path, held_out: list[str]) -> None:
     """Measure and save."""
-    options = ["-m", "gsjax.cli", "train", str(dataset.resolve())]
+    options = ["-m", "gsjax.cli.main", "train", str(dataset.resolve())]
     options += ["--preset", "fast", "--eval-every", "25"]
     if held_out:
         options += ["--test-images", *held_out]

@@ -29,17 +29,22 @@ from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import gsjax
-from gsjax.raster import bins, schedules, single
-from gsjax.raster.alpha import alphas, pixel_centres
-from gsjax.raster.blend import (
+from gsjax.raster.compositing import fused, schedules
+from gsjax.raster.compositing.alpha import alphas, pixel_centres
+from gsjax.raster.compositing.blending import (
     running_product,
     splats_of,
     tables_of,
 )
-from gsjax.raster.chunks import by_chunks, by_steps, take_rows
-from gsjax.raster.composite import composite
-from gsjax.raster.order import depth_order
-from gsjax.raster.project import conics_of, project
+from gsjax.raster.compositing.chunked import (
+    composite_chunks,
+    composite_steps,
+    take_rows,
+)
+from gsjax.raster.compositing.compositor import composite
+from gsjax.raster.lists import binning
+from gsjax.raster.lists.depth_order import depth_order
+from gsjax.raster.primitives.ellipsoid import conics_of, project
 
 
 class Prepared(NamedTuple):
@@ -54,7 +59,7 @@ class Prepared(NamedTuple):
     """
 
     spread: Callable[..., Callable[..., Any]]
-    grid: bins.Grid
+    grid: binning.Grid
     room: int
     project: Callable[..., Any]
     bin: Callable[..., Any]
@@ -67,7 +72,7 @@ def prepare(case: scenes.Case, config: gsjax.RasterConfig) -> Prepared:
     """What comes before the compositor, jitted and done."""
     gaussians, camera = case.gaussians, case.camera
     devices = jax.local_device_count()
-    grid = bins.make_grid(camera.width, camera.height, config.tile_size, devices)
+    grid = binning.make_grid(camera.width, camera.height, config.tile_size, devices)
     group = schedules.tiles_per_step(config, grid)
     pairs, chunk = -(-config.pair_capacity // devices), config.chunk_size
     steps = schedules.step_capacity(pairs, grid, group, chunk)
@@ -75,7 +80,7 @@ def prepare(case: scenes.Case, config: gsjax.RasterConfig) -> Prepared:
     index = jnp.arange(devices, dtype=jnp.int32)
 
     def spread(function, *sharded):
-        """``function(device, *arguments)`` on every device; see `bins.Grid`."""
+        """``function(device, *arguments)`` on every device; see `binning.Grid`."""
 
         def local(device, *arguments):
             arguments = [
@@ -98,24 +103,24 @@ def prepare(case: scenes.Case, config: gsjax.RasterConfig) -> Prepared:
         return project(gaussians, camera, config, order, count)
 
     def bin_local(device, projected):
-        spans = bins.row_spans(projected, grid, device)
-        lists = bins.make_lists(projected, spans, grid, device, pairs)
+        spans = binning.row_spans(projected, grid, device)
+        lists = binning.make_lists(projected, spans, grid, device, pairs)
         return lists, schedules.make_schedule(lists, grid, group, chunk, steps)
 
-    binning = jax.jit(spread(bin_local, False))
+    bin_all = jax.jit(spread(bin_local, False))
     # On every device beforehand, as within one program.
     projected = projected_of(gaussians, camera)
     projected = jax.device_put(projected, NamedSharding(mesh, PartitionSpec()))
-    lists, schedule = binning(projected)
+    lists, schedule = bin_all(projected)
     return Prepared(
-        spread, grid, steps, projected_of, binning, projected, lists, schedule
+        spread, grid, steps, projected_of, bin_all, projected, lists, schedule
     )
 
 
 def stages(case: scenes.Case, config: gsjax.RasterConfig):
     """Jitted stages of one view, each with its inputs ready: a dict of functions."""
     gaussians, camera = case.gaussians, case.camera
-    spread, grid, steps, projected_of, binning, *given = prepare(case, config)
+    spread, grid, steps, projected_of, bin_all, *given = prepare(case, config)
     projected, lists, schedule = given
     group = schedule.tiles.shape[-1]
     share = -(-config.pair_capacity // jax.local_device_count())
@@ -124,12 +129,12 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
         return composite(projected, lists, schedule, device, grid, steps, config)
 
     def chunks_local(device, projected, lists, schedule):
-        return by_chunks(projected, lists, schedule, device, grid, config)
+        return composite_chunks(projected, lists, schedule, device, grid, config)
 
     # From one look at who is open to the next it takes so many Gaussians of each tile,
     # or of a block of tiles, a whole number of turns.
-    singly = single.suits(3, projected.u.dtype.itemsize, grid)
-    look, turn = (single.LOOK, single.TURN) if singly else (config.chunk_size,) * 2
+    singly = fused.suits(3, projected.u.dtype.itemsize, grid)
+    look, turn = (fused.LOOK, fused.TURN) if singly else (config.chunk_size,) * 2
     looks = 2 * schedules.step_capacity(share, grid, group, look)
 
     def count_local(device, projected, lists):
@@ -144,7 +149,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
 
         def step(carried, inputs):
             first, live, block, ranks = inputs
-            corner = bins.corners(by_look.tiles[block], grid, device, pixels.dtype)
+            corner = binning.corners(by_look.tiles[block], grid, device, pixels.dtype)
             splats = take_rows(tables.splats, ranks)
             carried = jnp.where(first, 1, carried)
             go = live & jnp.any(carried > config.stop, 1, keepdims=True)
@@ -172,7 +177,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     cotangent = jax.random.normal(jax.random.key(0), image["sums"].shape)
 
     def steps_local(device, projected, lists, schedule):
-        return by_steps(projected, lists, schedule, device, grid, steps, config)
+        return composite_steps(projected, lists, schedule, device, grid, steps, config)
 
     def loss(projected, lists, schedule, cotangent, way=spread_composite):
         return jnp.sum(way(projected, lists, schedule)["sums"] * cotangent)
@@ -196,7 +201,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     )
     functions = {
         "project": lambda: projected_of(gaussians, camera),
-        "bin": lambda: binning(projected),
+        "bin": lambda: bin_all(projected),
         "composite": lambda: compositing(projected, lists, schedule),
         "composite by chunks": lambda: by_chunk(projected, lists, schedule),
         "composite v+g": lambda: gradient(projected, lists, schedule, cotangent),
@@ -217,7 +222,7 @@ def reference(case: scenes.Case, projected, config: gsjax.RasterConfig):
     colors = np.asarray(projected.colors.T)[seen]
     depth = np.asarray(projected.depth)[seen]
     ranges, ids = yardstick.exact_lists(
-        means2d, conics, opacity, depth, width, height, 16, config.alpha_cut
+        means2d, conics, opacity, depth, width, height, 16, config.alpha_min
     )
     scene = (means2d, conics, opacity, colors, ranges, ids, width, height, np.zeros(3))
     rng = np.random.default_rng(0)

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import measure
 
-from gsjax.demo import demo_files
-from gsjax.train.folder import run_files
-from gsjax.train.history import read_metrics
+from gsjax.runs.demo import demo_files
+from gsjax.runs.folder import run_files
+from gsjax.runs.history import read_metrics
 
 
 def main() -> None:
@@ -23,7 +23,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         files = demo_files(Path(folder) / "demo")
         begun = time.perf_counter()
-        measure.run_cold(["-m", "gsjax.cli", "demo", "-o", f"{folder}/demo"])
+        measure.run_cold(["-m", "gsjax.cli.main", "demo", "-o", f"{folder}/demo"])
         seconds = time.perf_counter() - begun
         found = json.loads(run_files(files.run).eval.read_text())
         logged = read_metrics(run_files(files.run).metrics)[-1]

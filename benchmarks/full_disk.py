@@ -18,7 +18,7 @@ from pathlib import Path
 import kills
 import measure
 
-from gsjax.train.checkpoint import load_checkpoint
+from gsjax.runs.checkpoint import load_checkpoint
 
 
 def mount(folder: Path, size: int, *, again: bool = False) -> None:

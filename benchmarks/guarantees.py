@@ -20,7 +20,7 @@ import scenes
 from as_cli import QUEUED
 
 import gsjax
-from gsjax.numerics import in_float64
+from gsjax.math.numerics import in_float64
 
 
 def functions(gaussians, camera, config=gsjax.RasterConfig()) -> dict:  # noqa: B008

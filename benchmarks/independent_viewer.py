@@ -28,8 +28,8 @@ import measure
 import numpy as np
 
 import gsjax
-from gsjax.flights import path_entries
-from gsjax.train.folder import load_data, load_settings, run_files
+from gsjax.runs.folder import load_data, load_settings, run_files
+from gsjax.runs.trajectories import path_entries
 
 PACKAGES = ("@mkkellogg/gaussian-splats-3d@0.4.7", "three@0.167.1")
 PATIENCE = 300.0  # s: the browser draws without a GPU
@@ -64,7 +64,7 @@ const viewer = new Splats.DropInViewer({
   sharedMemoryForWorkers: false, gpuAcceleratedSort: false, integerBasedSort: false,
   sphericalHarmonicsDegree: degree, antialiased: false, dynamicScene: false,
   sceneRevealMode: Splats.SceneRevealMode.Instant, logLevel: 0});
-const scene = new THREE.Scene();
+const scene = new THREE.Dataset();
 scene.add(viewer);
 await viewer.addSplatScene("splat.ply", {showLoadingUI: false,
   splatAlphaRemovalThreshold: 1, progressiveLoad: false});

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import measure
 import numpy as np
 
-from gsjax.scene.caster import DemoDatasetSettings, write_demo_dataset
+from gsjax.synthetic.raycaster import DemoDatasetSettings, write_demo_dataset
 
 STEPS, CHECKPOINT_EVERY = 120, 9
 VARYING = {"seconds", "compile_seconds", "compilations"}
@@ -35,7 +35,15 @@ VARYING = {"seconds", "compile_seconds", "compilations"}
 
 def command(dataset: Path, run: Path, strategy: str, *more: str) -> list[str]:
     """`gsjax train` of a run with a checkpoint every few steps."""
-    program = [sys.executable, "-m", "gsjax.cli", "train", str(dataset), "-o", str(run)]
+    program = [
+        sys.executable,
+        "-m",
+        "gsjax.cli.main",
+        "train",
+        str(dataset),
+        "-o",
+        str(run),
+    ]
     settings = [
         "--preset", "fast", "--strategy", strategy, "--steps", str(STEPS),
         "--checkpoint-every", str(CHECKPOINT_EVERY), "--eval-every", "50",

@@ -1,4 +1,4 @@
-"""Where results go, and cold processes; timing is `gsjax.timing`."""
+"""Where results go, and cold processes; timing is `gsjax.runtime.timing`."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 
 import jax
 
-from gsjax import files
-from gsjax.timing import interleaved as interleaved
-from gsjax.timing import machine as machine
-from gsjax.timing import time_ms as time_ms
+from gsjax.runtime import files
+from gsjax.runtime.timing import interleaved as interleaved
+from gsjax.runtime.timing import machine as machine
+from gsjax.runtime.timing import time_ms as time_ms
 
 RESULTS = Path(__file__).with_name("results")
 

@@ -22,23 +22,24 @@ import measure
 import scenes
 
 import gsjax
-from gsjax import files, images
 from gsjax.bench.pareto import front, pareto, points, stages
-from gsjax.bench.scenes import open_trial
-from gsjax.bench.sheet import front_picture, table
-from gsjax.scene.trials import TRIALS, Trial
+from gsjax.bench.report import front_picture, table
+from gsjax.bench.scenes import open_stress_scene
+from gsjax.io import images
+from gsjax.runtime import files
+from gsjax.synthetic.stress_scenes import STRESS_SCENES, StressScene
 
 REAL = {"guitar": scenes.guitar, "garden": scenes.garden}
 
 
-def trial_of(name: str) -> Trial:
+def trial_of(name: str) -> StressScene:
     """A scene of the benchmarks, or as `gsjax bench` opens it."""
     if name in REAL and not Path(name).exists():
-        return Trial(*REAL[name](), background=(0.0, 0.0, 0.0))
-    return open_trial(name)
+        return StressScene(*REAL[name](), background=(0.0, 0.0, 0.0))
+    return open_stress_scene(name)
 
 
-def measured(trial: Trial, planned: bool) -> bool:
+def measured(trial: StressScene, planned: bool) -> bool:
     """Measure and save; whether all are inside. ``planned``: with a plan's point."""
     made = None
     if planned:
@@ -76,7 +77,7 @@ def main() -> int:
     options = parser.parse_args()
     real = [name for name in REAL if (scenes.DATA / name).is_dir()]
     inside = True
-    for name in options.names or [*TRIALS, *real]:
+    for name in options.names or [*STRESS_SCENES, *real]:
         if not options.draw:
             trial = trial_of(name)
             inside &= measured(trial, not options.without_plan)

@@ -70,7 +70,7 @@ def row(name: str, gaussians, seen, unseen) -> dict:
     print(f"{name}: planned in {seconds:.0f} s")
     for line in made.lines():
         print(f"  {line}")
-    finer = gsjax.RasterConfig.accurate(alpha_cut=1e-6, stop=1e-7, outputs=("rgb",))
+    finer = gsjax.RasterConfig.accurate(alpha_min=1e-6, stop=1e-7, outputs=("rgb",))
     finer = gsjax.exact_config(gaussians, unseen[0], finer)
     errors = []
     for camera in unseen:
@@ -85,7 +85,7 @@ def row(name: str, gaussians, seen, unseen) -> dict:
         ("compat", gsjax.RasterConfig(outputs=("rgb",))),
         (
             "coarse",
-            gsjax.RasterConfig.fast(alpha_cut=0.02, stop=0.01, outputs=("rgb",)),
+            gsjax.RasterConfig.fast(alpha_min=0.02, stop=0.01, outputs=("rgb",)),
         ),
     ):
         settings[key] = gaussians, gsjax.exact_config(gaussians, timed, config)
@@ -103,7 +103,7 @@ def row(name: str, gaussians, seen, unseen) -> dict:
     return {
         "scene": name,
         "Gaussians": int(gsjax.num_active(gaussians)),
-        "alpha cut": made.config.alpha_cut,
+        "alpha cut": made.config.alpha_min,
         "stop": made.config.stop,
         "promised /255": 255 * made.error,
         "worst of unseen /255": max(errors),

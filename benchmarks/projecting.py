@@ -4,7 +4,7 @@ shows.
 ``python benchmarks/projecting.py [RUN...]`` renders the real scenes, and those of runs'
 folders, and takes gradients, in turn: as it is; with masks and derivatives worked out
 anew wherever they are used (without `numerics.held` and `once`); and, where colours
-turn with the view, with every device projecting all ranks (without `devices.in_parts`);
+turn with the view, with every device projecting all ranks (without `devices.shard_rows`);
 and with parts always. Where a scene has no bands beyond the first, so that nothing is
 in parts, it is taken a second time with random ones up to degree 3. Beside the times,
 the seconds of compiling, and how far the pictures and the gradients are from one
@@ -27,9 +27,10 @@ import numpy as np
 import scenes
 
 import gsjax
-from gsjax.devices import in_parts, on_all_devices
-from gsjax.raster import picture, project
-from gsjax.raster.order import depth_order
+from gsjax.raster import render_camera
+from gsjax.raster.lists.depth_order import depth_order
+from gsjax.raster.primitives import ellipsoid
+from gsjax.runtime.devices import replicate, shard_rows
 
 
 def unchanged(values, *_, **__):
@@ -41,15 +42,15 @@ def order_in_parts(gaussians, *given):
     """`depth_order`, in parts whatever the colours are."""
     order, count = depth_order(gaussians, *given)
     devices = jax.local_device_count()
-    return in_parts(order, devices, fill=gaussians.capacity), count
+    return shard_rows(order, devices, fill=gaussians.capacity), count
 
 
 # What is put in the place of what.
 WAYS = {
     "as it is": [],
-    "not once": [(project, "held", unchanged), (project, "once", unchanged)],
-    "not in parts": [(picture, "in_parts", unchanged)],
-    "always in parts": [(picture, "depth_order", order_in_parts)],
+    "not once": [(ellipsoid, "held", unchanged), (ellipsoid, "once", unchanged)],
+    "not in parts": [(render_camera, "shard_rows", unchanged)],
+    "always in parts": [(render_camera, "depth_order", order_in_parts)],
 }
 
 
@@ -66,7 +67,7 @@ def with_bands(case: scenes.Case, degree: int) -> scenes.Case:
 
 def row(case: scenes.Case) -> dict:
     """Times of one scene, as ratios to how it is."""
-    scene, camera = on_all_devices(case.gaussians), case.camera
+    scene, camera = replicate(case.gaussians), case.camera
     config = gsjax.exact_config(scene, camera)
     cotangent = jax.random.normal(jax.random.key(1), (camera.height, camera.width, 3))
 

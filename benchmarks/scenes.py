@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 import gsjax
 from gsjax.bench.scenes import facing
-from gsjax.sh import rgb_to_dc
+from gsjax.math.sh import rgb_to_dc
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -122,8 +122,8 @@ class Run(NamedTuple):
 
 def of_run(folder: Path) -> Run:
     """The scene and the cameras of a run that ``gsjax train`` made."""
-    from gsjax.flights import path_entries
-    from gsjax.train.folder import load_data, load_scene, load_settings, run_files
+    from gsjax.runs.folder import load_data, load_scene, load_settings, run_files
+    from gsjax.runs.trajectories import path_entries
 
     settings = load_settings(folder)
     data = load_data(settings)

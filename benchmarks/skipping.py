@@ -16,7 +16,7 @@ import numpy as np
 import scenes
 
 import gsjax
-from gsjax.cameras import camera_centre
+from gsjax.cameras.camera import camera_centre
 
 
 def behind_camera(case: scenes.Case, share: float) -> gsjax.Gaussians:

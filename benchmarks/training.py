@@ -3,7 +3,7 @@
 ``python benchmarks/training.py DATASET [IMAGE …]`` trains with `gsjax train --preset
 fast`, once for each strategy (or the one of ``--strategy``), with the named images held
 out (else every 8th), in a process that has nothing compiled; with ``--steps N`` so many
-steps, ``--max-gaussians N`` no more Gaussians, ``--preset NAME`` another preset. Kept
+steps, ``--max-gaussians N`` no more Gaussians, ``--preset NAME`` another preset. Residuals
 are PSNR and SSIM of the held-out views over seconds; compiling counts, measuring does
 not. What was kept of other runs of that dataset stays. Drawn are PSNR over seconds,
 with the runs that are kept of another kind of device, and that of the ends over
@@ -20,10 +20,11 @@ from pathlib import Path
 
 import measure
 
-from gsjax import files, images
-from gsjax.curves import Series, curves
-from gsjax.train.folder import run_files
-from gsjax.train.history import read_metrics
+from gsjax.io import images
+from gsjax.plots.curves import Series, curves
+from gsjax.runs.folder import run_files
+from gsjax.runs.history import read_metrics
+from gsjax.runtime import files
 
 # This process asks JAX what there is, and leaves the memory to those it starts.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -38,7 +39,7 @@ def train(
     dataset: Path, held_out: list[str], strategy: str, other: list[str], run: Path
 ) -> None:
     """One run, from a cold start."""
-    program = ["-m", "gsjax.cli", "train", str(dataset), "-o", str(run)]
+    program = ["-m", "gsjax.cli.main", "train", str(dataset), "-o", str(run)]
     options = ["--strategy", strategy, "--eval-every", str(EVERY), *other]
     if held_out:
         options += ["--test-images", *held_out]

@@ -5,7 +5,7 @@ every 8th view held out: as it is, and with pictures of half the size for the fi
 quarter (``levels``). On the scene of the first run it measures the other skips, each
 with its switch on and off:
 
-- ``drop_unseen``: Gaussians that no photograph shows, what the file weighs without
+- ``prune_invisible``: Gaussians that no photograph shows, what the file weighs without
   them, and whether a view that was trained on changes in a bit;
 - ``skip_masked``: a step with a disc of each photograph left over by a mask, and by how
   much the gradients differ, relative to the largest.
@@ -32,16 +32,16 @@ import measure
 import numpy as np
 
 import gsjax
+from gsjax.data.extent import extent_of
+from gsjax.data.photos import load_photos
 from gsjax.raster.render import count_demand
-from gsjax.scene.photos import load_photos
+from gsjax.runs.held_out import results_of
+from gsjax.train.capacity_policy import pairs_for
 from gsjax.train.config import Level, TrainConfig, preset
-from gsjax.train.fit import FitResult, fit, subset
 from gsjax.train.frames import draw, make_frames
-from gsjax.train.held_out import results_of
-from gsjax.train.room import pairs_for
-from gsjax.train.start import extent_of
+from gsjax.train.loop import FitResult, fit, subset
 from gsjax.train.step import make_stages, make_train_step
-from gsjax.train.unseen import without_unseen
+from gsjax.train.visibility_pruning import prune_invisible
 
 SHARES = (0.75, 0.5, 0.25)  # of the pixels that the mask leaves
 
@@ -89,7 +89,7 @@ def of_levels(name: str, trained: Trained, result: FitResult, seconds: float) ->
 def of_unseen(name: str, trained: Trained, result: FitResult) -> dict:
     """Without the Gaussians that no photograph shows."""
     config, frames = trained.config, trained.frames
-    after, dropped = without_unseen(result.state, frames, config, trained.extent)
+    after, dropped = prune_invisible(result.state, frames, config, trained.extent)
     raster = config.raster.replace(outputs=("rgb",))
     differ = 0
     for index in range(frames.count):
@@ -108,7 +108,7 @@ def of_unseen(name: str, trained: Trained, result: FitResult) -> dict:
     quality = [trained.psnr(s) for s in (after.gaussians, result.gaussians)]
     total = int(gsjax.num_active(result.gaussians))
     return {
-        "dataset": name, "skip": "drop_unseen", "unit": "MB of splat.ply",
+        "dataset": name, "skip": "prune_invisible", "unit": "MB of splat.ply",
         "with": sizes[0], "without": sizes[1], "ratio": sizes[0] / sizes[1],
         "changes": f"{dropped} of {total} Gaussians; {differ} numbers of the trained "
         f"views; held out {quality[0]:.3f} dB with, {quality[1]:.3f} dB without",
@@ -197,7 +197,7 @@ def main() -> None:
     parser.add_argument("datasets", nargs="+", type=Path, metavar="DATASET")
     rows = []
     for folder in parser.parse_args().datasets:
-        config = preset("fast").replace(drop_unseen=False)
+        config = preset("fast").replace(prune_invisible=False)
         trained = Trained(folder, config)
         result, seconds = trained.fit(config)
         rows.append(of_unseen(folder.name, trained, result))

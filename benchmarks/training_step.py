@@ -18,16 +18,17 @@ import jax.numpy as jnp
 import measure
 
 import gsjax
+from gsjax.data.extent import extent_of
+from gsjax.data.photos import load_photos
 from gsjax.densify.types import apply_edit
-from gsjax.losses import photometric_spread
 from gsjax.raster.render import device_count
-from gsjax.scene.photos import load_photos
-from gsjax.train.checkpoint import load_latest, restore
-from gsjax.train.fit import subset
-from gsjax.train.folder import load_data, load_settings, run_files
+from gsjax.runs.checkpoint import load_latest, restore
+from gsjax.runs.folder import load_data, load_settings, run_files
+from gsjax.train.capacity_policy import pairs_for
 from gsjax.train.frames import draw, make_frames, views_of_step
-from gsjax.train.room import pairs_for
-from gsjax.train.start import empty_state, extent_of
+from gsjax.train.initialisation import empty_state
+from gsjax.train.loop import subset
+from gsjax.train.losses import photometric_spread
 from gsjax.train.state import gradients_like
 from gsjax.train.step import _optimise, make_stages, targets
 

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import gsjax
-from gsjax.raster import bins
-from gsjax.raster.order import depth_order
-from gsjax.raster.project import project
-from gsjax.scene.synthetic import torus_knot_scene
-from gsjax.sh import rgb_to_dc
-from gsjax.sheets import depth_colors, put_text, text_width, wrapped
+from gsjax.math.sh import rgb_to_dc
+from gsjax.plots.contact_sheets import depth_colors, put_text, text_width, wrapped
+from gsjax.raster.lists import binning
+from gsjax.raster.lists.depth_order import depth_order
+from gsjax.raster.primitives.ellipsoid import project
+from gsjax.synthetic.torus_knot import torus_knot_scene
 
 ASSETS = Path(__file__).parent / "assets"
 
@@ -72,7 +72,7 @@ def pipeline() -> None:
         np.asarray(gsjax.render_exact(one, camera, background=white).rgb)
         for one in (small, gaussians)
     )
-    config = gsjax.RasterConfig(tile_size=_TILE, devices=1, rungs=1)
+    config = gsjax.RasterConfig(tile_size=_TILE, devices=1, num_size_buckets=1)
     slots, count = depth_order(gaussians, camera, config)
     seen = project(gaussians, camera, config, slots, count)
     panels = [dots, _ellipses(seen, dots.shape), _lengths(seen, picture), picture]
@@ -137,10 +137,10 @@ def _ellipses(seen, shape: tuple[int, ...]) -> np.ndarray:
 def _lengths(seen, picture: np.ndarray) -> np.ndarray:
     """How many Gaussians each tile's list has, in colours over the picture."""
     height, width = picture.shape[:2]
-    grid = bins.make_grid(width, height, _TILE, 1)
+    grid = binning.make_grid(width, height, _TILE, 1)
     device = jnp.int32(0)
-    spans = bins.row_spans(seen, grid, device)
-    lists = bins.make_lists(seen, spans, grid, device, 2**17)
+    spans = binning.row_spans(seen, grid, device)
+    lists = binning.make_lists(seen, spans, grid, device, 2**17)
     assert lists.fit
     length = np.asarray(lists.length, np.float64).reshape(grid.rows, grid.cols)
     levels = np.rint(255 * length / length.max()).astype(np.uint8)

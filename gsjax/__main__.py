@@ -2,6 +2,6 @@
 
 import sys
 
-from gsjax.cli import program
+from gsjax.cli.main import program
 
 sys.exit(program())

@@ -15,7 +15,7 @@ class InputError(GsjaxError, ValueError):
 
 class CapacityError(GsjaxError, RuntimeError):
     """A fixed-size stage, or the memory, does not hold what is wanted; says how much
-    that is. See `gsjax.memory`."""
+    that is. See `gsjax.runtime.memory`."""
 
     exit_code = 3
 

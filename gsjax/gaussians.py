@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from gsjax import sh as sh_lib
 from gsjax.errors import InputError
-from gsjax.numerics import exp_log_scale, real_floats, to_device
-from gsjax.settings import whole
+from gsjax.math import sh as sh_lib
+from gsjax.math.numerics import exp_log_scale, real_floats, to_device
+from gsjax.runtime.settings import whole
 
 Array = jax.Array
 

@@ -1,19 +1,18 @@
 """The public names, which are those of `gsjax` itself."""
 
-from gsjax import notebook as notebook
-from gsjax.cameras import Camera as Camera
-from gsjax.cameras import CameraModel as CameraModel
-from gsjax.cameras import look_at as look_at
-from gsjax.cameras import make_camera as make_camera
-from gsjax.cameras import resize_camera as resize_camera
-from gsjax.cameras import stack_cameras as stack_cameras
-from gsjax.devices import use_all_cores as use_all_cores
+from gsjax.cameras.camera import Camera as Camera
+from gsjax.cameras.camera import Lens as Lens
+from gsjax.cameras.camera import look_at as look_at
+from gsjax.cameras.camera import make_camera as make_camera
+from gsjax.cameras.camera import resize_camera as resize_camera
+from gsjax.cameras.camera import stack_cameras as stack_cameras
+from gsjax.data.dataset import load_dataset as load_dataset
+from gsjax.data.photos import load_photos as load_photos
+from gsjax.data.splits import split_views as split_views
 from gsjax.errors import CapacityError as CapacityError
 from gsjax.errors import DivergedError as DivergedError
 from gsjax.errors import GsjaxError as GsjaxError
 from gsjax.errors import InputError as InputError
-from gsjax.evaluation import evaluate as evaluate
-from gsjax.evaluation import summarise as summarise
 from gsjax.gaussians import GaussianParams as GaussianParams
 from gsjax.gaussians import Gaussians as Gaussians
 from gsjax.gaussians import capacity_bucket as capacity_bucket
@@ -24,6 +23,7 @@ from gsjax.gaussians import make_gaussians as make_gaussians
 from gsjax.gaussians import num_active as num_active
 from gsjax.gaussians import select as select
 from gsjax.gaussians import with_sh_degree as with_sh_degree
+from gsjax.init.gaussians import init_gaussians as init_gaussians
 from gsjax.io import load as load
 from gsjax.io import save as save
 from gsjax.planning.plan import plan as plan
@@ -34,13 +34,13 @@ from gsjax.raster.render import render as render
 from gsjax.raster.render import render_exact as render_exact
 from gsjax.raster.types import RasterConfig as RasterConfig
 from gsjax.raster.types import Render as Render
-from gsjax.scene.dataset import load_dataset as load_dataset
-from gsjax.scene.initialise import init_gaussians as init_gaussians
-from gsjax.scene.photos import load_photos as load_photos
-from gsjax.scene.splits import split_views as split_views
+from gsjax.runtime.devices import use_all_cores as use_all_cores
 from gsjax.train.config import TrainConfig as TrainConfig
-from gsjax.train.fit import Hooks as Hooks
-from gsjax.train.fit import fit as fit
-from gsjax.train.fit import subset as subset
+from gsjax.train.evaluation import evaluate as evaluate
+from gsjax.train.evaluation import summarise as summarise
+from gsjax.train.loop import Hooks as Hooks
+from gsjax.train.loop import fit as fit
+from gsjax.train.loop import subset as subset
 from gsjax.train.state import init_state as init_state
 from gsjax.train.step import make_train_step as make_train_step
+from gsjax.viewer import notebook as notebook

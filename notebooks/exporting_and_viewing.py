@@ -29,12 +29,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import gsjax
-from gsjax.histograms import histograms
-from gsjax.notebook import Picture, movie, show
-from gsjax.scene.synthetic import torus_knot_scene
+from gsjax.plots.histograms import histograms
+from gsjax.synthetic.torus_knot import torus_knot_scene
+from gsjax.viewer.notebook import Picture, movie, show
 
 WIDTH, HEIGHT, FRAMES = 160, 120, 30
-CONFIG = gsjax.RasterConfig(outputs=("rgb",), occlusion=False, rungs=1, devices=1)
+CONFIG = gsjax.RasterConfig(
+    outputs=("rgb",), occlusion=False, num_size_buckets=1, devices=1
+)
 kept = tempfile.TemporaryDirectory(prefix="gsjax-")
 folder = Path(kept.name)
 
@@ -211,7 +213,7 @@ assert psnr > 45
 #
 # The orbit as a movie within the notebook, in the colours of the settings above, and
 # the same for a file: `gsjax render SCENE.ply --cameras DATASET --path orbit -o
-# orbit.webm`, or from Python `gsjax.movies.write_movie`.
+# orbit.webm`, or from Python `gsjax.io.movies.write_movie`.
 
 # %%
 light = smaller["opacity > 0.05"]

@@ -41,13 +41,13 @@ import numpy as np
 import optax
 
 import gsjax
-from gsjax.notebook import show
-from gsjax.rotations import quaternion_to_matrix
-from gsjax.scene.caster import cast, demo_cameras, surface_points
-from gsjax.scene.synthetic import torus_knot_scene
-from gsjax.scene.types import Scene, View
+from gsjax.data.types import Dataset, View
+from gsjax.math.rotations import quaternion_to_matrix
+from gsjax.synthetic.raycaster import cast, demo_cameras, surface_points
+from gsjax.synthetic.torus_knot import torus_knot_scene
+from gsjax.viewer.notebook import show
 
-SMALL = {"outputs": ("rgb",), "occlusion": False, "rungs": 1, "devices": 1}
+SMALL = {"outputs": ("rgb",), "occlusion": False, "num_size_buckets": 1, "devices": 1}
 compiler = ThreadPoolExecutor(2)
 
 
@@ -120,7 +120,7 @@ DECAY = optax.exponential_decay(1.0, STEPS, 0.1)
 def start(seed):
     """Gaussians at points on the surfaces, drawn by the seed."""
     views = [View("", Path(), v, K, WIDTH, HEIGHT) for v in viewmats]
-    scene = Scene(Path(), "", tuple(views), *surface_points(N, seed))
+    scene = Dataset(Path(), "", tuple(views), *surface_points(N, seed))
     return gsjax.init_gaussians(scene, sh_degree=0, opacity=0.5, scale=0.7)
 
 

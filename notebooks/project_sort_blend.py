@@ -33,14 +33,18 @@ from matplotlib.collections import PatchCollection
 from matplotlib.patches import Ellipse, Rectangle
 
 import gsjax
-from gsjax.rotations import covariance
-from gsjax.scene.synthetic import torus_knot_scene
-from gsjax.sh import sh_basis
+from gsjax.math.rotations import covariance
+from gsjax.math.sh import sh_basis
+from gsjax.synthetic.torus_knot import torus_knot_scene
 
 WIDTH, HEIGHT, TILE = 128, 96, 16
 COLS, ROWS = WIDTH // TILE, HEIGHT // TILE
 CONFIG = gsjax.RasterConfig.compat(
-    tile_size=TILE, outputs=("rgb", "alpha"), occlusion=False, rungs=1, devices=1
+    tile_size=TILE,
+    outputs=("rgb", "alpha"),
+    occlusion=False,
+    num_size_buckets=1,
+    devices=1,
 )
 
 # %% [markdown]

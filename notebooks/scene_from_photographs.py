@@ -35,13 +35,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import gsjax
-from gsjax.curves import Series, curves
-from gsjax.notebook import Picture, live, movie, show
-from gsjax.scene.caster import DemoDatasetSettings, cast, write_demo_dataset
-from gsjax.scene.paths import median_intrinsics, orbit
-from gsjax.sheets import SheetRow, comparison
+from gsjax.data.camera_paths import median_intrinsics, orbit
+from gsjax.plots.contact_sheets import SheetRow, comparison
+from gsjax.plots.curves import Series, curves
+from gsjax.synthetic.raycaster import DemoDatasetSettings, cast, write_demo_dataset
 from gsjax.train.config import preset, scaled
-from gsjax.train.fit import Hooks
+from gsjax.train.loop import Hooks
+from gsjax.viewer.notebook import Picture, live, movie, show
 
 PHOTOS, WIDTH, HEIGHT, STEPS = 28, 128, 96, 360
 
@@ -104,7 +104,7 @@ config = config.replace(
     strategy="adaptive",
     initial="points",
     max_size=None,
-    raster=gsjax.RasterConfig(rungs=1, devices=1, occlusion=False),
+    raster=gsjax.RasterConfig(num_size_buckets=1, devices=1, occlusion=False),
     adaptive=replace(config.adaptive, max_gaussians=4000),
 )
 

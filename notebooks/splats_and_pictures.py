@@ -44,8 +44,8 @@ import gsjax
 from gsjax.densify.adaptive import AdaptiveSettings, adaptive
 from gsjax.densify.types import Observation, apply_edit
 from gsjax.gaussians import grow, num_active
-from gsjax.rotations import covariance
-from gsjax.sh import dc_to_rgb, rgb_to_dc
+from gsjax.math.rotations import covariance
+from gsjax.math.sh import dc_to_rgb, rgb_to_dc
 
 
 def flat_camera(width, height, zoom=1.0):
@@ -108,7 +108,7 @@ def by_hand(x, depths):
     return value
 
 
-PLAIN = {"dilation": 0.0, "outputs": ("rgb",), "rungs": 1, "devices": 1}
+PLAIN = {"dilation": 0.0, "outputs": ("rgb",), "num_size_buckets": 1, "devices": 1}
 rows = {}
 for preset in ("compat", "accurate"):
     config = getattr(gsjax.RasterConfig, preset)(**PLAIN)
@@ -225,7 +225,7 @@ print(f"{np.sum(smooth > 1)} pixels clipped at 1, {np.sum(smooth < 0)} at 0")
 # the 1/255 of `compat` ends each with a small step. With `compat` the fits of 60 come
 # out 0.5 dB lower and those of 400 1.7 dB lower (medians of the same seeds). Tiles
 # of 8 pixels and 16 Gaussians at a time, for a small picture; one device and a single
-# compiled size (`rungs=1`), because here the fixed costs are what one waits for; and
+# compiled size (`num_size_buckets=1`), because here the fixed costs are what one waits for; and
 # only `rgb`.
 
 # %%
@@ -233,7 +233,7 @@ RATES = gsjax.GaussianParams(
     means=0.6, quats=0.05, log_scales=0.1, logit_opacities=0.1, sh=0.14
 )
 CONFIG = gsjax.RasterConfig.accurate(
-    outputs=("rgb",), tile_size=8, chunk_size=16, rungs=1, devices=1
+    outputs=("rgb",), tile_size=8, chunk_size=16, num_size_buckets=1, devices=1
 )
 ADAM = optax.scale_by_adam()
 DECAY = optax.cosine_decay_schedule(1.0, STEPS, alpha=0.01)

@@ -33,14 +33,14 @@ import numpy as np
 
 import gsjax
 from gsjax.bench.pareto import front
-from gsjax.notebook import show
-from gsjax.numerics import in_float64
+from gsjax.math.numerics import in_float64
 from gsjax.planning import bounds
-from gsjax.scene.trials import fog, knot
-from gsjax.timing import interleaved, machine
+from gsjax.runtime.timing import interleaved, machine
+from gsjax.synthetic.stress_scenes import fog, knot
+from gsjax.viewer.notebook import show
 
 WIDTH, HEIGHT = 160, 120
-SMALL = {"outputs": ("rgb",), "occlusion": False, "rungs": 1, "devices": 1}
+SMALL = {"outputs": ("rgb",), "occlusion": False, "num_size_buckets": 1, "devices": 1}
 print("\n".join(f"{name}: {value}" for name, value in machine().items()))
 
 # %% [markdown]
@@ -67,10 +67,10 @@ scene
 # %% [markdown]
 # ## The knobs
 #
-# - `alpha_cut`: a Gaussian is left out of a pixel where its α is below. A low cut means
+# - `alpha_min`: a Gaussian is left out of a pixel where its α is below. A low cut means
 #   wide ellipses, and so more pairs of tile and Gaussian to sort and to blend.
 # - `stop`: a pixel ends at this transmittance. Only what is opaque gains.
-# - `stop_rule`, `alpha_cap`: the constants of the field, in the preset `compat`, end a
+# - `stop_rule`, `alpha_max`: the constants of the field, in the preset `compat`, end a
 #   pixel *before* the Gaussian that would bring it to the stop, and let no α above
 #   0.99.
 # - the SH degree: fewer numbers to read and to add up, once a Gaussian.
@@ -116,7 +116,7 @@ def compiled(gaussians, config):
 # %%
 def exact_picture():
     config = gsjax.RasterConfig.accurate(
-        alpha_cut=1e-9, alpha_cap=1 - 1e-12, stop=1e-9, pair_capacity=2 * MANY, **SMALL
+        alpha_min=1e-9, alpha_max=1 - 1e-12, stop=1e-9, pair_capacity=2 * MANY, **SMALL
     )
     with jax.enable_x64(True):
         wide = in_float64((scene, camera, background))

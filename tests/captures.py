@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from gsjax.cameras import look_at
-from gsjax.scene.types import Scene, View
+from gsjax.cameras.camera import look_at
+from gsjax.data.types import Dataset, View
 
 SIZE = (32, 24)
 
@@ -39,7 +39,7 @@ def scene_of_views(count: int = 5, points: int = 40, seed: int = 0, at=(0, 0, 0)
         views.append(View(name, Path(name), look_at(eye, target), K, *SIZE))
     xyz = rng.normal(size=(points, 3)) + at
     colors = rng.integers(0, 256, (points, 3)).astype(np.uint8)
-    return Scene(Path("made"), "made", tuple(views), xyz, colors)
+    return Dataset(Path("made"), "made", tuple(views), xyz, colors)
 
 
 def to_opengl(viewmat: np.ndarray) -> np.ndarray:

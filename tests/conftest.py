@@ -34,23 +34,23 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 import jax.numpy as jnp
 
 import gsjax
-import gsjax.devices
+import gsjax.runtime.devices
 from gsjax import Gaussians, RasterConfig
-from gsjax.cameras import Camera
+from gsjax.cameras.camera import Camera
 from gsjax.stress.scenes import fields_at
 
 # What is traced are objects by the million, and few of them in cycles.
 gc.set_threshold(200_000, 20, 50)
 # Thousands of programs of all sizes in one process: memory kept would only pile up.
-gsjax.devices.keep_memory = lambda: False
-gsjax.devices.make_kernels_of_loops()  # as the command line does
+gsjax.runtime.devices.keep_memory = lambda: False
+gsjax.runtime.devices.make_kernels_of_loops()  # as the command line does
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 # One size of the ladder and one device: anything more is compiled again. Nor is what is
 # hidden looked for, which compiles longer (see benchmarks/training_skips.py): tests of
 # the oracle, of equal bits, of batches and of bad numbers do, by `WHOLE` and `PRESETS`.
-LIGHT = {"rungs": 1, "devices": 1, "pair_capacity": 8192, "occlusion": False}
+LIGHT = {"num_size_buckets": 1, "devices": 1, "pair_capacity": 8192, "occlusion": False}
 ALL = ("rgb", "alpha", "depth", "median_depth")
 COMPAT = RasterConfig.compat(**LIGHT, outputs=ALL)
 WHOLE = COMPAT.replace(occlusion=True)
@@ -167,7 +167,7 @@ def float32():
 
 def as_compiled(config):
     """A `TrainConfig` without what no program of a step depends on."""
-    host = ("seed", "max_size", "levels", "drop_unseen", "every_eval")
+    host = ("seed", "max_size", "levels", "prune_invisible", "every_eval")
     begun = ("initial", "initial_count", "dense_count", "max_initial")
     names = (*host, *begun, "every_checkpoint")
     same = type(config)()
@@ -180,7 +180,7 @@ def shared_programs():
 
     So `compilations` and `compile_seconds` are of all runs. The programs, to clear.
     """
-    import gsjax.train.fit as fit_module
+    import gsjax.train.loop as fit_module
 
     compiled, compile_one = {}, fit_module._Run.program
 
@@ -205,7 +205,7 @@ def in_a_process():
     def printed(code: str, option: bool = True) -> str:
         folder = Path(__file__).parent
         path = os.pathsep.join(map(str, (folder, folder.parent)))
-        bare = "import gsjax.devices as d; d.make_kernels_of_loops = lambda: None; "
+        bare = "import gsjax.runtime.devices as d; d.make_kernels_of_loops = lambda: None; "
         done = subprocess.run(
             [sys.executable, "-c", code if option else bare + code],
             env={**os.environ, "XLA_FLAGS": "", "PYTHONPATH": path},
@@ -245,7 +245,7 @@ def reference(
 ) -> dict[str, jax.Array]:
     """`gsjax.reference_render`, jitted, of scenes without inactive slots."""
     if config is not None:  # only these matter; the rest would compile it again
-        names = ("alpha_cut", "alpha_cap", "stop", "stop_rule", "dilation", "antialias")
+        names = ("alpha_min", "alpha_max", "stop", "stop_rule", "dilation", "antialias")
         config = RasterConfig(**{name: getattr(config, name) for name in names})
     return _reference(gaussians, camera, config, background, features)
 

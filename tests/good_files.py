@@ -11,21 +11,21 @@ import numpy as np
 from captures import save_photo, scene_of_views, to_opengl
 
 import gsjax
+from gsjax.data import colmap_binary
+from gsjax.data.colmap import read_colmap
+from gsjax.data.colmap_writer import write_colmap
+from gsjax.data.llff import load_llff
+from gsjax.data.nerf import load_nerf
+from gsjax.data.photos import load_photo
+from gsjax.data.transforms import load_transforms
+from gsjax.data.types import View
+from gsjax.init.gaussians import init_gaussians
 from gsjax.io.point_cloud import read_point_cloud
-from gsjax.runinfo import describe_run
-from gsjax.scene import colmap_binary
-from gsjax.scene.colmap import read_colmap
-from gsjax.scene.colmap_writer import write_colmap
-from gsjax.scene.initialise import init_gaussians
-from gsjax.scene.llff import load_llff
-from gsjax.scene.nerf import load_nerf
-from gsjax.scene.photos import load_photo
-from gsjax.scene.transforms import load_transforms
-from gsjax.scene.types import View
-from gsjax.train.checkpoint import load_checkpoint, save_checkpoint
+from gsjax.runs.checkpoint import load_checkpoint, save_checkpoint
+from gsjax.runs.folder import RunSettings, load_settings, save_settings
+from gsjax.runs.refined_cameras import save_cameras, with_cameras
+from gsjax.runs.run_info import describe_run
 from gsjax.train.config import TrainConfig
-from gsjax.train.folder import RunSettings, load_settings, save_settings
-from gsjax.train.refined import save_cameras, with_cameras
 from gsjax.train.state import init_state
 
 SCENE = scene_of_views(count=2, points=4)

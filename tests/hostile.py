@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from captures import save_photo
 
-from gsjax.cameras import look_at
-from gsjax.scene.colmap_writer import write_colmap
-from gsjax.scene.types import Scene, View
+from gsjax.cameras.camera import look_at
+from gsjax.data.colmap_writer import write_colmap
+from gsjax.data.types import Dataset, View
 
 SIZE, PHOTOS, POINTS = 32, 3, 40
 # The extent of the last two is then 1, as it is of cameras in one place.
@@ -27,7 +27,7 @@ class Hostile:
     last one a corner is anyway.
     """
 
-    scene: Scene
+    scene: Dataset
     photos: tuple[np.ndarray, ...]
     masked: tuple[int, ...] = ()
 
@@ -44,7 +44,7 @@ def harmless() -> Hostile:
         photos.append(rng.integers(0, 256, (SIZE, SIZE, 3)).astype(np.uint8))
     points = rng.uniform(-0.8, 0.8, (POINTS, 3))
     colors = rng.integers(0, 256, (POINTS, 3)).astype(np.uint8)
-    scene = Scene(Path("made"), "made", tuple(views), points, colors)
+    scene = Dataset(Path("made"), "made", tuple(views), points, colors)
     return Hostile(scene, tuple(photos))
 
 

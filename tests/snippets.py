@@ -121,7 +121,7 @@ def _compile_little() -> None:
     from gsjax.raster.render import DEFAULT_CONFIG
     from gsjax.raster.types import RasterConfig
 
-    little = {"rungs": 1, "chunk_size": 4}
+    little = {"num_size_buckets": 1, "chunk_size": 4}
     names = list(RasterConfig.__dataclass_fields__)
     defaults = dict(zip(names, RasterConfig.__init__.__defaults__ or ())) | little
     RasterConfig.__init__.__defaults__ = tuple(defaults.values())

@@ -129,7 +129,7 @@ def test_public_names_come_when_asked_for():
     for name in names:
         assert starred[name] is getattr(gsjax, name) is getattr(gsjax.public, name)
     assert gsjax.__all__ == names
-    assert gsjax.scene.splits.split_views is gsjax.split_views
+    assert gsjax.data.splits.split_views is gsjax.split_views
     with pytest.raises(AttributeError, match="module 'gsjax' has no attribute 'rend'"):
         _ = gsjax.rend
 

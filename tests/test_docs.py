@@ -30,7 +30,7 @@ from snippets import (
 from viewing import CHROMIUM, opened
 
 import gsjax.public
-from gsjax import cli
+from gsjax.cli.main import main
 
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
@@ -66,7 +66,7 @@ def helps() -> dict[str, str]:
     def help_of(*words: str) -> str:
         out = io.StringIO()
         with redirect_stdout(out), pytest.raises(SystemExit):
-            cli._parse([*words, "--help"])
+            main._parse([*words, "--help"])
         return out.getvalue()
 
     return {name: help_of(name) for name in re.findall(r"• (\w+)", help_of())}
@@ -82,7 +82,7 @@ def test_commands_are_those_of_the_program(path, helps):
         if words[-1] in ("--help", "--version"):
             assert set(words[:-1]) <= set(helps), words
         else:
-            cli._parse(words)
+            main._parse(words)
     for words in mentions(TEXTS[path]):
         if words[0] not in ("--help", "--version", "…"):
             assert words[0] in helps, words
@@ -148,7 +148,7 @@ def test_every_public_name_is_in_the_reference():
             continue
         public += own_names(value) if ismodule(value) else [f"gsjax.{name}"]
     assert len(public) > 35
-    assert "gsjax.notebook.show" in public
+    assert "gsjax.viewer.notebook.show" in public
     assert [name for name in public if name not in names] == []
     assert len(set(names)) == len(names), "each once"
 

@@ -59,7 +59,7 @@ def test_benchmarks_and_their_results_are_linked():
 def test_presets_are_as_in_the_table():
     presets = [gsjax.RasterConfig.compat(), gsjax.RasterConfig.accurate()]
     presets.append(gsjax.RasterConfig.fast())
-    for name in ("alpha_cut", "alpha_cap", "stop", "stop_rule"):
+    for name in ("alpha_min", "alpha_max", "stop", "stop_rule"):
         row = re.search(rf"^\| `{name}`.*$", README, re.M)
         assert row is not None
         cells = [cell.strip() for cell in row[0].strip("|").split("|")[1:]]

@@ -11,20 +11,20 @@ from conftest import LIGHT
 
 import gsjax
 from gsjax import RasterConfig
-from gsjax.images import to_8_bit
-from gsjax.scene.initialise import init_gaussians
-from gsjax.scene.types import Photo, Scene, View
-from gsjax.train.start import extent_of
+from gsjax.data.extent import extent_of
+from gsjax.data.types import Dataset, Photo, View
+from gsjax.init.gaussians import init_gaussians
+from gsjax.io.images import to_8_bit
 
 VIEWS, POINTS, WIDTH, HEIGHT = 4, 60, 32, 24
 # Small programs: they take longest in these tests.
 RASTER = RasterConfig(**{**LIGHT, "pair_capacity": 4096})
 # No threshold within reach, so that finite differences are those of the gradient.
-SMOOTH = RASTER.replace(alpha_cut=1e-14, alpha_cap=1 - 1e-9, stop=0, stop_rule="after")
+SMOOTH = RASTER.replace(alpha_min=1e-14, alpha_max=1 - 1e-9, stop=0, stop_rule="after")
 
 
 @cache
-def scene() -> Scene:
+def scene() -> Dataset:
     """Cameras around coloured points; no files."""
     rng = np.random.default_rng(0)
     views = []
@@ -37,7 +37,7 @@ def scene() -> Scene:
         views.append(View(name, Path(name), viewmat, K, WIDTH, HEIGHT))
     points = rng.uniform(-0.8, 0.8, (POINTS, 3))
     colors = rng.integers(40, 256, (POINTS, 3)).astype(np.uint8)
-    return Scene(Path("made"), "made", tuple(views), points, colors)
+    return Dataset(Path("made"), "made", tuple(views), points, colors)
 
 
 EXTENT = extent_of(scene())

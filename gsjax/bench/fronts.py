@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsjax import images
-from gsjax.curves import BOTTOM, COLORS, LEFT, PAPER, RIGHT, TOP, axes
-from gsjax.sheets import put_text, text_width
+from gsjax.io import images
+from gsjax.plots.contact_sheets import put_text, text_width
+from gsjax.plots.curves import BOTTOM, COLORS, LEFT, PAPER, RIGHT, TOP, axes
 
 _FRONT, _SMALL = (120, 124, 132), 0.36
 _LINE, _DOT = 12, 5  # px: height of a label, half a dot and its margin

@@ -16,23 +16,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.bench import pixelwise
-from gsjax.cameras import Camera
-from gsjax.console import progress
+from gsjax.cameras.camera import Camera
 from gsjax.gaussians import Gaussians, with_sh_degree
-from gsjax.machine import all_of, usable_cores
-from gsjax.numerics import in_float64
+from gsjax.math.numerics import in_float64
 from gsjax.planning.types import Plan
 from gsjax.raster.render import exact_config, render
 from gsjax.raster.types import RasterConfig
-from gsjax.scene.trials import Trial
-from gsjax.timing import interleaved
+from gsjax.runtime.console import progress
+from gsjax.runtime.machine import all_of, usable_cores
+from gsjax.runtime.timing import interleaved
+from gsjax.synthetic.stress_scenes import StressScene
 
 _EXACT = RasterConfig.accurate(
-    alpha_cut=1e-9,
-    alpha_cap=1 - 1e-12,
+    alpha_min=1e-9,
+    alpha_max=1 - 1e-12,
     stop=1e-9,
     outputs=("rgb",),
-    rungs=1,
+    num_size_buckets=1,
     devices=1,
 )
 _PIXELS = 48
@@ -73,18 +73,18 @@ class _Runs(NamedTuple):
 
 def points(gaussians: Gaussians, made: Plan | None = None) -> list[Point]:
     """Knobs turned one at a time from `RasterConfig.accurate`, the presets, a plan."""
-    base = RasterConfig.accurate(outputs=("rgb",), rungs=1)
+    base = RasterConfig.accurate(outputs=("rgb",), num_size_buckets=1)
     found = [
-        Point("compat", "", RasterConfig.compat(outputs=("rgb",), rungs=1)),
+        Point("compat", "", RasterConfig.compat(outputs=("rgb",), num_size_buckets=1)),
         Point("accurate", "", base),
-        Point("fast", "", RasterConfig.fast(outputs=("rgb",), rungs=1)),
+        Point("fast", "", RasterConfig.fast(outputs=("rgb",), num_size_buckets=1)),
     ]
     for cut, text in ((1 / 255, "1/255"), (1 / 1024, "1/1024"), (1e-4, "1e-4")):
-        found.append(Point("cut", text, base.replace(alpha_cut=cut)))
+        found.append(Point("cut", text, base.replace(alpha_min=cut)))
     for stop in ("1e-2", "1e-3"):
         found.append(Point("stop after", stop, base.replace(stop=float(stop))))
     # The rule's bound is ε / (1 − cap): it wants the field's cap.
-    before = base.replace(stop=1e-4, stop_rule="before", alpha_cap=0.99)
+    before = base.replace(stop=1e-4, stop_rule="before", alpha_max=0.99)
     found.append(Point("stop before", "1e-4", before))
     for degree in range(gaussians.sh_degree):
         found.append(Point("SH degree", str(degree), base, degree))
@@ -94,13 +94,18 @@ def points(gaussians: Gaussians, made: Plan | None = None) -> list[Point]:
     found.append(Point("dtype", "float64", base, double=True))
     if made is not None:
         config = made.config.replace(
-            rungs=1, outputs=("rgb",), pair_capacity=None, visible_capacity=None
+            num_size_buckets=1,
+            outputs=("rgb",),
+            pair_capacity=None,
+            visible_capacity=None,
         )
         found.append(Point("plan", "", config, made.gaussians.sh_degree))
     return found
 
 
-def pareto(trial: Trial, settings: Sequence[Point], repeats: int = 5) -> list[dict]:
+def pareto(
+    trial: StressScene, settings: Sequence[Point], repeats: int = 5
+) -> list[dict]:
     """A row for each point: milliseconds, errors, and what theory allows.
 
     Its keys: knob, value; "forward ms", "gradient ms" (value and gradient); "max",
@@ -142,7 +147,7 @@ def pareto(trial: Trial, settings: Sequence[Point], repeats: int = 5) -> list[di
 
 
 def _ready_runs(
-    trial: Trial, settings: Sequence[Point], weights: np.ndarray
+    trial: StressScene, settings: Sequence[Point], weights: np.ndarray
 ) -> list[_Runs]:
     """Of the exact picture, and of each point; all that will be timed is compiled."""
     exact = Point("exact", "", _EXACT, double=True)
@@ -176,7 +181,7 @@ class _Fits:
         config = point.config
         if config.pair_capacity is not None:
             return config
-        sizes = config.alpha_cut, config.tile_size, config.chunk_size, point.double
+        sizes = config.alpha_min, config.tile_size, config.chunk_size, point.double
         with self.locks.setdefault(sizes, Lock()):
             if sizes not in self.found:
                 self.found[sizes] = exact_config(scene, camera, config)
@@ -186,7 +191,7 @@ class _Fits:
         )
 
 
-def _run(trial: Trial, point: Point, weights: np.ndarray, fits: _Fits) -> _Runs:
+def _run(trial: StressScene, point: Point, weights: np.ndarray, fits: _Fits) -> _Runs:
     """Compile, run once, and hand out what to time; ``fits`` keeps the capacities."""
     with jax.enable_x64(point.double):
         scene, camera = trial.gaussians, trial.camera
@@ -236,7 +241,7 @@ def _times(
 
 
 def _bounds(
-    trial: Trial, settings: Sequence[Point], pixels: np.ndarray, exact: np.ndarray
+    trial: StressScene, settings: Sequence[Point], pixels: np.ndarray, exact: np.ndarray
 ) -> tuple[list[np.ndarray], float]:
     """What theory allows each point at the pixels; how far dense and exact differ."""
     with jax.enable_x64(True):
@@ -263,7 +268,7 @@ def _relative(found: Sequence[np.ndarray], wanted: Sequence[np.ndarray]) -> floa
     return float(np.sqrt(off / max(sum(np.sum(b**2) for b in wanted), 1e-300)))
 
 
-def stages(trial: Trial, repeats: int = 5) -> dict[str, float]:
+def stages(trial: StressScene, repeats: int = 5) -> dict[str, float]:
     """Milliseconds of a render's parts with the default settings.
 
     "lists" is projecting, binning and sorting; composite and backward are what the

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from gsjax.cameras import Camera
+from gsjax.cameras.camera import Camera
 from gsjax.gaussians import Gaussians, with_sh_degree
 from gsjax.raster.reference import reference_colors, reference_project
 from gsjax.raster.types import RasterConfig
@@ -95,10 +95,10 @@ def allowed(
     Cap, cut, stop and SH degree as in `gsjax.planning.bounds`; rounding by `ROUNDING`.
     """
     alpha, spread = found.alpha, found.spread
-    capped = np.minimum(alpha, config.alpha_cap)
-    over = (alpha > config.alpha_cap).any(axis=0)
-    cap = over * (1 - config.alpha_cap) / config.alpha_cap
-    low = capped < config.alpha_cut * (1 + 1e-3)
+    capped = np.minimum(alpha, config.alpha_max)
+    over = (alpha > config.alpha_max).any(axis=0)
+    cap = over * (1 - config.alpha_max) / config.alpha_max
+    low = capped < config.alpha_min * (1 + 1e-3)
     cut = -np.expm1(np.log1p(-np.where(low, capped, 0)).sum(axis=0))
     kept = np.where(low, 0, capped)
     _, left = _weights(kept)

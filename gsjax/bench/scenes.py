@@ -4,29 +4,29 @@ from pathlib import Path
 
 import numpy as np
 
-from gsjax.cameras import Camera, look_at, make_camera, resize_camera
-from gsjax.errors import InputError
-from gsjax.flights import path_entries
-from gsjax.gaussians import Gaussians
-from gsjax.scene.transforms import (
+from gsjax.cameras.camera import Camera, look_at, make_camera, resize_camera
+from gsjax.data.transforms import (
     CameraEntry,
     load_near_transforms,
     load_transforms,
 )
-from gsjax.scene.trials import TRIALS, Trial
-from gsjax.subjects import is_run, open_subject
-from gsjax.train.folder import load_data, load_settings, refined_data, run_files
+from gsjax.errors import InputError
+from gsjax.gaussians import Gaussians
+from gsjax.runs.folder import load_data, load_settings, refined_data, run_files
+from gsjax.runs.scene_source import is_run, open_scene_source
+from gsjax.runs.trajectories import path_entries
+from gsjax.synthetic.stress_scenes import STRESS_SCENES, StressScene
 
 _SIZE = (400, 300)
 
 
-def open_trial(
+def open_stress_scene(
     name: str, *, cameras: Path | None = None, size: tuple[int, int] | None = None
-) -> Trial:
+) -> StressScene:
     """A scene that is built in, a file or a run, with one camera.
 
     Args:
-      name: of `TRIALS`, unless there is a file or a folder of that name.
+      name: of `STRESS_SCENES`, unless there is a file or a folder of that name.
       cameras: a transforms.json, whose first camera is taken.
       size: (width, height) in px.
 
@@ -34,15 +34,15 @@ def open_trial(
       InputError: if it cannot be read, or holds no Gaussian or no camera.
     """
     path = Path(name)
-    if name in TRIALS and not path.exists():
-        trial = TRIALS[name]()
+    if name in STRESS_SCENES and not path.exists():
+        trial = STRESS_SCENES[name]()
         if cameras is None:
             return trial._replace(camera=_sized(trial.camera, size))
         entries = load_transforms(cameras, size=size)
         return trial._replace(camera=_first(cameras, entries))
     if not path.exists():
         raise InputError(
-            f"{name}: neither a run nor a .ply or .spz, nor one of {', '.join(TRIALS)}"
+            f"{name}: neither a run nor a .ply or .spz, nor one of {', '.join(STRESS_SCENES)}"
         )
     origin = camera = None
     if cameras is not None:
@@ -54,12 +54,12 @@ def open_trial(
         origin = data.scene.origin
         entries = path_entries(data, "train", max_size=settings.config.max_size)
         camera = _sized(entries[0].camera, size)
-    subject = open_subject(path, origin=origin)
+    subject = open_scene_source(path, origin=origin)
     gaussians = subject.load()
     if camera is None:
         camera = facing(gaussians, *(size or _SIZE))
     red, green, blue = subject.background
-    return Trial(path.stem, gaussians, camera, (red, green, blue))
+    return StressScene(path.stem, gaussians, camera, (red, green, blue))
 
 
 def facing(gaussians: Gaussians, width: int, height: int) -> Camera:

@@ -20,9 +20,9 @@ from gsjax.densify.schedule import edits_between, grown, is_due
 from gsjax.densify.slots import assign, copy_into, where_slots
 from gsjax.densify.types import Densifier, Observation, SlotEdit
 from gsjax.gaussians import Gaussians
-from gsjax.numerics import exp_log_scale, logit
-from gsjax.rotations import quaternion_to_matrix
-from gsjax.settings import require_ranges, settle
+from gsjax.math.numerics import exp_log_scale, logit
+from gsjax.math.rotations import quaternion_to_matrix
+from gsjax.runtime.settings import require_ranges, settle
 
 Array = jax.Array
 
@@ -121,7 +121,7 @@ def adaptive(settings: AdaptiveSettings, extent: float) -> Densifier:
 
     Args:
       settings: see there.
-      extent: of the scene, in its units; see `gsjax.scene.initialise.scene_extent`.
+      extent: of the scene, in its units; see `gsjax.init.gaussians.scene_extent`.
     """
 
     def init(gaussians: Gaussians) -> AdaptiveStats:

@@ -15,15 +15,15 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gsjax.cameras import USUAL_EXTENT
+from gsjax.cameras.camera import USUAL_EXTENT
 from gsjax.densify.penalties import mean_penalty
 from gsjax.densify.schedule import edits_between, grown, is_due
 from gsjax.densify.slots import copy_into
 from gsjax.densify.types import Densifier, SlotEdit
 from gsjax.gaussians import Gaussians
-from gsjax.numerics import exp_log_scale, logit
-from gsjax.rotations import times_covariance
-from gsjax.settings import require_ranges, settle
+from gsjax.math.numerics import exp_log_scale, logit
+from gsjax.math.rotations import times_covariance
+from gsjax.runtime.settings import require_ranges, settle
 
 Array = jax.Array
 
@@ -88,7 +88,7 @@ def mcmc(settings: McmcSettings, extent: float = USUAL_EXTENT) -> Densifier:
 
     Args:
       settings: see there.
-      extent: of the scene, in its units; see `gsjax.scene.initialise.scene_extent`.
+      extent: of the scene, in its units; see `gsjax.init.gaussians.scene_extent`.
     """
     unit = extent / USUAL_EXTENT
 

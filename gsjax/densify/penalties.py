@@ -3,9 +3,9 @@
 import jax
 import jax.numpy as jnp
 
-from gsjax.cameras import USUAL_EXTENT
+from gsjax.cameras.camera import USUAL_EXTENT
 from gsjax.gaussians import Gaussians
-from gsjax.numerics import exp_log_scale
+from gsjax.math.numerics import exp_log_scale
 
 
 def mean_penalty(

@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.files import opened, replacing
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.io.common import MAX_SHIFT, require_new, warn
 from gsjax.io.ply_header import Header, check_properties, check_size, read_header
 from gsjax.io.ply_rows import CHUNK_ROWS, read_rows
-from gsjax.memory import Estimate, require
+from gsjax.runtime.files import opened, replacing
+from gsjax.runtime.memory import Estimate, require
 
 _NORMALS = ("nx", "ny", "nz")
 _FILTER = "filter_3D"  # of Mip-Splatting: σ by which a Gaussian is to be smoothed

@@ -11,7 +11,7 @@ from typing import BinaryIO, NamedTuple
 
 from gsjax.errors import InputError
 from gsjax.io.common import warn
-from gsjax.sh import MAX_DEGREE, num_bases
+from gsjax.math.sh import MAX_DEGREE, num_bases
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2"},

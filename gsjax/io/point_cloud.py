@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.files import opened
 from gsjax.io.ply_header import check_size, read_header
 from gsjax.io.ply_rows import read_rows
-from gsjax.memory import Estimate, require
+from gsjax.runtime.files import opened
+from gsjax.runtime.memory import Estimate, require
 
 _GREY = 128
 _COLORS = (  # names of red, green and blue

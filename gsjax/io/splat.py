@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.files import replacing
 from gsjax.gaussians import Gaussians
 from gsjax.io.common import (
     MAX_SHIFT,
@@ -23,7 +22,8 @@ from gsjax.io.common import (
     to_bytes,
     warn,
 )
-from gsjax.sh import C0
+from gsjax.math.sh import C0
+from gsjax.runtime.files import replacing
 
 _ROW = np.dtype(
     [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]

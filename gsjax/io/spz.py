@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.files import opened, replacing
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.io.common import (
     MAX_SHIFT,
@@ -29,8 +28,9 @@ from gsjax.io.common import (
     warn,
 )
 from gsjax.io.ply_rows import CHUNK_ROWS
-from gsjax.memory import Estimate, require
-from gsjax.sh import num_bases, sh_basis
+from gsjax.math.sh import num_bases, sh_basis
+from gsjax.runtime.files import opened, replacing
+from gsjax.runtime.memory import Estimate, require
 
 _MAGIC = b"NGSP"
 _HEADER = Struct("<4sIIBBBB")

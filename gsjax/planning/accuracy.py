@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.cameras import Camera
+from gsjax.cameras.camera import Camera
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.planning import bounds
@@ -54,7 +54,7 @@ def within_budget(
     share = _STOP_SHARE * budget
     stop = float(np.clip(share / max(spread, 1e-9), _LEAST_STOP, 1e-2))
     stop = _rounded(stop)
-    config = config.replace(alpha_cap=_CAP, stop=stop, stop_rule="after")
+    config = config.replace(alpha_max=_CAP, stop=stop, stop_rule="after")
     stopping = bounds.stop_error(stop, "after", _CAP, spread)
     capping = bounds.cap_error(_CAP, spread)
     told = [
@@ -65,7 +65,7 @@ def within_budget(
             stopping,
             "bound",
         ),
-        Reason("alpha_cap", f"1 − {1 - _CAP:.0e}", capping, "bound"),
+        Reason("alpha_max", f"1 − {1 - _CAP:.0e}", capping, "bound"),
     ]
     single = gaussians.params.means.dtype == jnp.float32
     if single:
@@ -82,8 +82,8 @@ def within_budget(
     if cut is not None:
         error = bounds.cut_error(gaussians, cut, spread)
         why = f"{cut:g}: even all the splats over one another hide no more"
-        told.append(Reason("alpha_cut", why, error, "bound"))
-        return config.replace(alpha_cut=cut), told, None
+        told.append(Reason("alpha_min", why, error, "bound"))
+        return config.replace(alpha_min=cut), told, None
     # A heuristic: of 20 random cameras of a trained scene the worst was 1.7 times as
     # far off as the worst of 12 others.
     margin = 1.5 + 2 / np.sqrt(len(views))
@@ -95,8 +95,8 @@ def within_budget(
         f"{cut:.3g}: {255 * measured.error:.3g}/255 off at most on {len(views)} "
         f"camera{'s' * (len(views) != 1)}, times {margin:.2g} for those not seen"
     )
-    told.append(Reason("alpha_cut", why, margin * measured.error, "estimate"))
-    return config.replace(alpha_cut=cut), told, measured
+    told.append(Reason("alpha_min", why, margin * measured.error, "estimate"))
+    return config.replace(alpha_min=cut), told, measured
 
 
 def _rounded(value: float) -> float:
@@ -179,7 +179,7 @@ def _pictures(
     """rgb [H, W, 3] of each camera with an α cut, by one program for any, and what it
     wants; with ``room`` for pairs, or more."""
     behind = jnp.asarray(background, gaussians.params.means.dtype)
-    config = config.replace(rungs=1, outputs=("rgb",), visible_capacity=None)
+    config = config.replace(num_size_buckets=1, outputs=("rgb",), visible_capacity=None)
     for view in views:
         config = config.replace(pair_capacity=room)
         result = render_at_cut(gaussians, view, config, behind, cut)

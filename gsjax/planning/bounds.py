@@ -14,7 +14,7 @@ in float64. Axis legend: N Gaussians, L bands of spherical harmonics.
 import numpy as np
 
 from gsjax.gaussians import Gaussians
-from gsjax.sh import C0
+from gsjax.math.sh import C0
 
 
 def opacities(gaussians: Gaussians) -> np.ndarray:

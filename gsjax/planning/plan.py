@@ -13,21 +13,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.cameras import Camera
+from gsjax.cameras.camera import Camera
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, select, with_sh_degree
 from gsjax.planning import bounds
 from gsjax.planning.accuracy import ROUNDING, within_budget
 from gsjax.planning.sizes import shown, tuned, with_capacities
 from gsjax.planning.types import Plan, Reason
-from gsjax.raster.render import DEFAULT_CONFIG, on_the_host
+from gsjax.raster.render import DEFAULT_CONFIG, requires_concrete_values
 from gsjax.raster.types import COLOR_LIMIT, RasterConfig
 
 _CAMERAS = 12  # to measure on, at most
 _SH_SHARE = 0.25
 
 
-@on_the_host()
+@requires_concrete_values()
 def plan(
     gaussians: Gaussians,
     cameras: Camera | Sequence[Camera],

@@ -5,9 +5,8 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.cameras import Camera
+from gsjax.cameras.camera import Camera
 from gsjax.gaussians import Gaussians, compact, select
-from gsjax.memory import size_text
 from gsjax.planning import bounds
 from gsjax.planning.types import Reason
 from gsjax.raster.render import (
@@ -17,7 +16,8 @@ from gsjax.raster.render import (
     render_exact,
 )
 from gsjax.raster.types import Demand, RasterConfig
-from gsjax.timing import time_ms
+from gsjax.runtime.memory import size_text
+from gsjax.runtime.timing import time_ms
 
 _ROOM = 1.125  # of capacities, for views that show more than those measured
 _TRIALS = ((8, 32), (16, 32), (16, 64))
@@ -30,7 +30,7 @@ def shown(
     active = np.asarray(gaussians.active)
     visible = np.zeros(active.shape, bool)
     # Antialiasing only lowers opacities.
-    visible[active] = bounds.opacities(gaussians) > config.alpha_cut * (1 - 1e-6)
+    visible[active] = bounds.opacities(gaussians) > config.alpha_min * (1 - 1e-6)
     faint = int(active.sum() - visible.sum())
     count = max(int(visible.sum()), 1)
     gaussians = compact(select(gaussians, jnp.asarray(visible)), count)

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax import sh as sh_lib
-from gsjax.cameras import Camera, camera_centre
+from gsjax.cameras.camera import Camera, camera_centre
 from gsjax.gaussians import Gaussians
+from gsjax.math import sh as sh_lib
+from gsjax.math.rotations import covariance
 from gsjax.raster.types import Array, RasterConfig
-from gsjax.rotations import covariance
 
 
 def reference_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.3):
@@ -31,13 +31,11 @@ def reference_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.
     world = covariance(p.quats, jnp.exp(p.log_scales))
 
     def lens(point):
-        return jnp.stack(camera.model.project_point(camera.K, tuple(point)))
+        return jnp.stack(camera.model.project(camera.K, tuple(point)))
 
     def limited(point):
         return jnp.stack(
-            camera.model.linearisation_point(
-                camera.K, camera.width, camera.height, tuple(point)
-            )
+            camera.model.linearise(camera.K, camera.width, camera.height, tuple(point))
         )
 
     jacobian = jax.vmap(lambda point: jax.jacfwd(lens)(limited(point)))(points)
@@ -108,10 +106,10 @@ def reference_render(
     alpha = opacity[:, None] * jnp.exp(-0.5 * power)  # [N, pixels]
     margin = jnp.full(alpha.shape[1], jnp.inf)
     if config is not None:
-        from_cut = jnp.abs(alpha / config.alpha_cut - 1)
+        from_cut = jnp.abs(alpha / config.alpha_min - 1)
         margin = jnp.min(from_cut, axis=0, initial=jnp.inf)
-        alpha = jnp.where(alpha < config.alpha_cap, alpha, config.alpha_cap)
-        alpha = jnp.where(alpha >= config.alpha_cut, alpha, 0)
+        alpha = jnp.where(alpha < config.alpha_max, alpha, config.alpha_max)
+        alpha = jnp.where(alpha >= config.alpha_min, alpha, 0)
     after = jnp.cumprod(1 - alpha, axis=0)
     before = jnp.concatenate([jnp.ones_like(after[:1]), after[:-1]])
     if config is not None:

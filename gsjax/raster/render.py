@@ -12,13 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from gsjax.cameras import Camera
+from gsjax.cameras.camera import Camera
 from gsjax.errors import CapacityError, InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
-from gsjax.memory import require
-from gsjax.raster.counts import total_count
-from gsjax.raster.footprint import render_estimate as render_estimate
-from gsjax.raster.inputs import (
+from gsjax.raster.argument_checks import (
     check_camera,
     check_config,
     check_features,
@@ -27,10 +24,15 @@ from gsjax.raster.inputs import (
     checked_size,
     with_batch,
 )
-from gsjax.raster.inputs import on_the_host as on_the_host
-from gsjax.raster.picture import draw, finish
-from gsjax.raster.rasterise import device_count as device_count
+from gsjax.raster.argument_checks import (
+    requires_concrete_values as requires_concrete_values,
+)
+from gsjax.raster.lists.counting import total_count
+from gsjax.raster.memory_estimate import render_estimate as render_estimate
+from gsjax.raster.render_camera import draw, finish
+from gsjax.raster.tile_render import device_count as device_count
 from gsjax.raster.types import Array, Demand, RasterConfig, Render
+from gsjax.runtime.memory import require
 
 DEFAULT_CONFIG = RasterConfig()
 _LEAST_ROOM = 1024  # slots
@@ -141,7 +143,7 @@ def _demand_jit(gaussians: Gaussians, camera: Camera, config: RasterConfig):
     return view.demand, view.overflowed
 
 
-@on_the_host()
+@requires_concrete_values()
 def render_exact(
     gaussians: Gaussians,
     camera: Camera,
@@ -163,7 +165,7 @@ def render_exact(
 
     Raises:
       CapacityError: if more than ``max_capacity`` is wanted, or more memory than there
-        is (see `gsjax.memory`).
+        is (see `gsjax.runtime.memory`).
       InputError: as `render`, and under `jax.jit`, `vmap` or `scan`.
     """
     draw = partial(_render_jit, background=background, **kwargs)
@@ -175,12 +177,12 @@ def render_at_cut(
     camera: Camera,
     config: RasterConfig,
     background: Array,
-    alpha_cut: float,
+    alpha_min: float,
 ) -> Render:
-    """`render_exact` with ``alpha_cut`` in place of that of ``config``, as a number of
+    """`render_exact` with ``alpha_min`` in place of that of ``config``, as a number of
     the program's input: one program draws with any. Pictures alone: no derivative goes
     through it."""
-    cut = jnp.asarray(alpha_cut, gaussians.params.means.dtype)
+    cut = jnp.asarray(alpha_min, gaussians.params.means.dtype)
     draw = partial(_at_cut_jit, background=background, cut=cut)
     return _regrown(draw, gaussians, camera, config, 2**30 - 1)
 
@@ -206,7 +208,7 @@ def _regrown(
         config = _regrow(config, result.demand, max_capacity)
 
 
-@on_the_host()
+@requires_concrete_values()
 def exact_config(
     gaussians: Gaussians,
     camera: Camera,
@@ -246,7 +248,7 @@ def count_demand(
     Raises:
       CapacityError: as `render_exact`.
     """
-    light = config.replace(outputs=("alpha",), absgrad=False, rungs=1)
+    light = config.replace(outputs=("alpha",), absgrad=False, num_size_buckets=1)
     light = _for_active(gaussians, light)
     while True:
         _check_memory(gaussians, camera, light)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import jax
 
-from gsjax.settings import require_ranges, settle
+from gsjax.runtime.settings import require_ranges, settle
 
 Array = jax.Array
 COLOR_LIMIT = 1e32  # a coefficient or feature from there on counts as infinite
@@ -27,9 +27,9 @@ class RasterConfig:
     Gaussians left out, D being the colour range including the background.
 
     Attributes:
-      alpha_cut: a Gaussian is left out of a pixel where its α is below this; it
-        also sets the extent, sqrt(2 ln(opacity / alpha_cut)) standard deviations.
-      alpha_cap: α is at most this; at most 1.
+      alpha_min: a Gaussian is left out of a pixel where its α is below this; it
+        also sets the extent, sqrt(2 ln(opacity / alpha_min)) standard deviations.
+      alpha_max: α is at most this; at most 1.
       stop: a pixel stops once its transmittance T has fallen to this.
       stop_rule: "before": a Gaussian that would bring T to ``stop`` is not blended
         (the field's rule); "after": it is blended, then the pixel stops.
@@ -54,7 +54,7 @@ class RasterConfig:
         slots. Reported and regrown like ``pair_capacity``.
       occlusion: leave out, before sorting, what lies behind pixels that have all
         stopped. Bit-equal on a CPU; pays where something opaque fills part of the view.
-      rungs: how many sizes, each a quarter of the one before, sorting by depth is
+      num_size_buckets: how many sizes, each a quarter of the one before, sorting by depth is
         compiled for; the smallest that fits is run. Sorting pairs, on accelerators,
         has sizes between them; from 2 on there is a small size of projecting, from 4 on
         the gradient of compositing by chunks has sizes too, two fewer, and on
@@ -69,8 +69,8 @@ class RasterConfig:
       InputError: if a setting is out of its range.
     """
 
-    alpha_cut: float = 1 / 255
-    alpha_cap: float = 0.99
+    alpha_min: float = 1 / 255
+    alpha_max: float = 0.99
     stop: float = 1e-4
     stop_rule: str = "before"
     dilation: float = 0.3
@@ -83,14 +83,14 @@ class RasterConfig:
     pair_capacity: int | None = None
     visible_capacity: int | None = None
     occlusion: bool = True
-    rungs: int = 3
+    num_size_buckets: int = 3
     devices: int | None = None
 
     def __post_init__(self):
         settle(self)
         checks = {
-            "alpha_cut": 0 < self.alpha_cut < 1,
-            "alpha_cap": self.alpha_cut < self.alpha_cap <= 1,
+            "alpha_min": 0 < self.alpha_min < 1,
+            "alpha_max": self.alpha_min < self.alpha_max <= 1,
             "stop": 0 <= self.stop < 1,
             "stop_rule": self.stop_rule in STOP_RULES,
             "dilation": 0 <= self.dilation <= 1e9,  # its square is one of float32
@@ -104,7 +104,7 @@ class RasterConfig:
             or 1 <= self.pair_capacity < 2**30,
             "visible_capacity": self.visible_capacity is None
             or self.visible_capacity >= 1,
-            "rungs": self.rungs >= 1,
+            "num_size_buckets": self.num_size_buckets >= 1,
             "devices": self.devices is None or self.devices >= 1,
         }
         require_ranges(self, checks)
@@ -118,8 +118,8 @@ class RasterConfig:
     def accurate(cls, **changes) -> "RasterConfig":
         """Within 0.5/255 of the exact image: cut 1e-5, blend then stop at 1e-5."""
         settings = {
-            "alpha_cut": 1e-5,
-            "alpha_cap": 1 - 1e-6,
+            "alpha_min": 1e-5,
+            "alpha_max": 1 - 1e-6,
             "stop": 1e-5,
             "stop_rule": "after",
         }
@@ -128,18 +128,18 @@ class RasterConfig:
     @classmethod
     def fast(cls, **changes) -> "RasterConfig":
         """Cut 1/255, blend then stop at 1e-3: stops earlier, and yet errs less."""
-        settings = {"alpha_cap": 0.999, "stop": 1e-3, "stop_rule": "after"}
+        settings = {"alpha_max": 0.999, "stop": 1e-3, "stop_rule": "after"}
         return cls(**{**settings, **changes})
 
     def replace(self, **changes) -> "RasterConfig":
         """A copy with some settings changed."""
         return replace(self, **changes)
 
-    def at_cut(self, alpha_cut: Array) -> "RasterConfig":
+    def at_cut(self, alpha_min: Array) -> "RasterConfig":
         """A copy with an α cut that is traced, for use within what traces it alone: see
         `gsjax.raster.render.render_at_cut`."""
         config = copy(self)
-        object.__setattr__(config, "alpha_cut", alpha_cut)
+        object.__setattr__(config, "alpha_min", alpha_min)
         return config
 
 

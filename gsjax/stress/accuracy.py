@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.numerics import in_float64
+from gsjax.math.numerics import in_float64
 from gsjax.raster.reference import reference_render
 from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig
@@ -28,11 +28,11 @@ from gsjax.stress.scenes import (
 from gsjax.stress.types import Case, Measured
 
 _EXACT = RasterConfig(
-    alpha_cut=1e-7,
-    alpha_cap=1 - 1e-6,
+    alpha_min=1e-7,
+    alpha_max=1 - 1e-6,
     stop=0.0,
     outputs=("rgb",),
-    rungs=1,
+    num_size_buckets=1,
     devices=1,
     pair_capacity=4096,
 )
@@ -79,15 +79,15 @@ def _share(config: RasterConfig, bound: np.ndarray) -> float:
     return float(np.max(error / (bound + _ROUNDING)))
 
 
-def cut(alpha_cut: float):
+def cut(alpha_min: float):
     """α below the cut are left out."""
 
     def measure(full: bool) -> Measured:
         del full
         _, alpha, spread = _exact()
-        left_out = np.where(alpha < alpha_cut, alpha, 0)
+        left_out = np.where(alpha < alpha_min, alpha, 0)
         bound = spread * (1 - np.prod(1 - left_out, axis=0))
-        share = _share(_EXACT.replace(alpha_cut=alpha_cut), bound)
+        share = _share(_EXACT.replace(alpha_min=alpha_min), bound)
         return Measured(share, f"bound {bound.max():.1e} at most")
 
     return measure
@@ -114,19 +114,19 @@ def cap(full: bool) -> Measured:
     _, alpha, spread = _exact()
     excess = np.maximum(alpha - 0.99, 0).sum(0)
     return Measured(
-        _share(_EXACT.replace(alpha_cap=0.99), spread * excess),
+        _share(_EXACT.replace(alpha_max=0.99), spread * excess),
         f"{int((alpha > 0.99).any(0).sum())} pixels",
     )
 
 
 def sizes_of_work(full: bool) -> Measured:
-    """Numbers that change with what must not matter: capacities, rungs, slots."""
+    """Numbers that change with what must not matter: capacities, num_size_buckets, slots."""
     del full
     wanted = _render(usual(), camera_of(), _EXACT, jnp.asarray(BACKGROUND)).rgb
     count = 0
     for changes in (
         {"pair_capacity": 8191},
-        {"rungs": 4, "pair_capacity": 2**18},
+        {"num_size_buckets": 4, "pair_capacity": 2**18},
         {"visible_capacity": SLOTS},
     ):
         config = _EXACT.replace(**changes)

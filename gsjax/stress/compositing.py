@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.gaussians import make_gaussians
-from gsjax.numerics import in_float64
-from gsjax.raster.alpha import alphas
-from gsjax.raster.blend import running_product, transmittance
-from gsjax.raster.counts import total_count
+from gsjax.math.numerics import in_float64
+from gsjax.math.sh import dc_to_rgb
+from gsjax.raster.compositing.alpha import alphas
+from gsjax.raster.compositing.blending import running_product, transmittance
+from gsjax.raster.lists.counting import total_count
 from gsjax.raster.reference import reference_render
 from gsjax.raster.render import render, render_exact
 from gsjax.raster.types import RasterConfig
-from gsjax.sh import dc_to_rgb
 from gsjax.stress.scenes import (
     BACKGROUND,
     BAND,
@@ -104,7 +104,7 @@ def cap_tie(full: bool) -> Measured:
         splats = (half, zero, half, opacity.reshape(1, 1), half, half)
         return alphas(splats, pixel, COMPAT)[0, 0, 0]
 
-    cap = np.float32(COMPAT.alpha_cap)
+    cap = np.float32(COMPAT.alpha_max)
     below = np.nextafter(cap, np.float32(0))
     tie, inside = (float(jax.grad(alpha)(jnp.asarray(o))) for o in (cap, below))
     return Measured(abs(tie) if inside == 1 else np.nan, f"{inside:g} just below")
@@ -265,7 +265,7 @@ CASES = (
         "alpha/at the cap",
         "error of slopes of T, relative",
         1e-6,
-        opaque(transmittance, RasterConfig.accurate().alpha_cap),
+        opaque(transmittance, RasterConfig.accurate().alpha_max),
     ),
     Case("alpha/tie at the cap", "slope", 0, cap_tie),
     Case("capacity/overflow", "silent or wrong", 0, capacities),

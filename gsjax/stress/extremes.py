@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.cameras import NEAREST
+from gsjax.cameras.camera import NEAREST
 from gsjax.gaussians import Gaussians, num_active
-from gsjax.numerics import logit
-from gsjax.raster.bins import make_grid, row_spans
-from gsjax.raster.project import project
-from gsjax.rotations import quaternion_to_matrix
+from gsjax.math.numerics import logit
+from gsjax.math.rotations import quaternion_to_matrix
+from gsjax.raster.lists.binning import make_grid, row_spans
+from gsjax.raster.primitives.ellipsoid import project
 from gsjax.stress.scenes import (
     BACKGROUND,
     COMPAT,

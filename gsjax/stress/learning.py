@@ -6,15 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.cameras import look_at
+from gsjax.cameras.camera import look_at
+from gsjax.data.types import Dataset, View
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.types import SlotEdit, apply_edit
 from gsjax.gaussians import Gaussians
-from gsjax.metrics import ssim
-from gsjax.numerics import logit
-from gsjax.optim import Rates, adam_step, init_moments
-from gsjax.scene.initialise import init_gaussians
-from gsjax.scene.types import Scene, View
+from gsjax.init.gaussians import init_gaussians
+from gsjax.math.numerics import logit
 from gsjax.stress.scenes import (
     SLOTS,
     camera_of,
@@ -27,6 +25,8 @@ from gsjax.stress.scenes import (
     usual_gradients,
 )
 from gsjax.stress.types import Case, Measured, worse
+from gsjax.train.metrics import ssim
+from gsjax.train.optimiser import Rates, adam_step, init_moments
 
 
 def similarity(full: bool) -> Measured:
@@ -130,7 +130,7 @@ def initial_scales(full: bool) -> Measured:
     for points in clouds.values():
         for seen in (views, views[:1]):
             colors = np.zeros((len(points), 3), np.uint8)
-            scene = Scene(Path("none"), "none", seen, points, colors)
+            scene = Dataset(Path("none"), "none", seen, points, colors)
             count += not_finite(init_gaussians(scene, sh_degree=0).params)
     return Measured(count, ", ".join(clouds))
 

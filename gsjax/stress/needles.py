@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.cameras import Camera
+from gsjax.cameras.camera import Camera
 from gsjax.gaussians import Gaussians, num_active
-from gsjax.numerics import in_float64
-from gsjax.raster.project import project
+from gsjax.math.numerics import in_float64
+from gsjax.raster.primitives.ellipsoid import project
 from gsjax.raster.reference import reference_project
 from gsjax.stress.scenes import (
     COMPAT,
@@ -115,7 +115,7 @@ def gradient_error(full: bool) -> Measured:
 def projected(gaussians: Gaussians, camera: Camera):
     """Of every slot: mean px [N, 2], compensation [N], opacity [N] (0 if culled)."""
     order, count = jnp.arange(SLOTS), num_active(gaussians)
-    sharp = COMPAT.replace(alpha_cut=1e-30, antialias=True)
+    sharp = COMPAT.replace(alpha_min=1e-30, antialias=True)
     out = project(gaussians, camera, sharp, order, count)
     return jnp.stack([out.u, out.v], -1), out.compensation, out.opacity
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.cameras import ORTHOGRAPHIC, Camera
+from gsjax.cameras.camera import ORTHOGRAPHIC, Camera
 from gsjax.gaussians import Gaussians
 from gsjax.raster.types import RasterConfig
 from gsjax.stress.scenes import (
@@ -122,7 +122,10 @@ def settings() -> dict[str, dict[str, Any]]:
     """Ways to render, as arguments of `usual_gradients`."""
     outputs = (*COMPAT.outputs, "median_depth")
     accurate = RasterConfig.accurate().replace(
-        rungs=1, devices=1, pair_capacity=COMPAT.pair_capacity, outputs=outputs
+        num_size_buckets=1,
+        devices=1,
+        pair_capacity=COMPAT.pair_capacity,
+        outputs=outputs,
     )
     level = {"focal": 6.0, "model": ORTHOGRAPHIC}
     return {

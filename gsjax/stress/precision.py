@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.cameras import Camera, look_at
+from gsjax.cameras.camera import Camera, look_at
+from gsjax.data.rebase import rebase
+from gsjax.data.types import Dataset, View
 from gsjax.gaussians import Gaussians, num_active
-from gsjax.numerics import in_float64
-from gsjax.raster.project import project
-from gsjax.rotations import quaternion_to_matrix
-from gsjax.scene.rebase import rebase
-from gsjax.scene.types import Scene, View
+from gsjax.math.numerics import in_float64
+from gsjax.math.rotations import quaternion_to_matrix
+from gsjax.raster.primitives.ellipsoid import project
 from gsjax.stress.needles import projected
 from gsjax.stress.scenes import (
     COMPAT,
@@ -102,7 +102,7 @@ def of_scenes(column: int):
     return measure
 
 
-def far_scene(offset: float) -> tuple[Scene, np.ndarray]:
+def far_scene(offset: float) -> tuple[Dataset, np.ndarray]:
     """Eight cameras around points, ``offset`` metres from the origin on each axis."""
     rng = np.random.default_rng(0)
     middle = offset * np.array([1, -0.7, 0.3])
@@ -115,13 +115,13 @@ def far_scene(offset: float) -> tuple[Scene, np.ndarray]:
         views.append(View(f"{turn:.2f}", Path("none"), viewmat, K, SIZE, SIZE))
     points = middle + rng.uniform(-1, 1, (SLOTS, 3))
     colors = np.zeros((SLOTS, 3), np.uint8)
-    return Scene(Path("none"), "none", tuple(views), points, colors), points
+    return Dataset(Path("none"), "none", tuple(views), points, colors), points
 
 
 def far_world(offset: float):
     """px between float32 after rebasing, and float64 in the original coordinates."""
 
-    def shown(scene: Scene, view: View) -> np.ndarray:
+    def shown(scene: Dataset, view: View) -> np.ndarray:
         fields = fields_at(np.zeros((SLOTS, 3)), 0.05, 0.5)
         fields["means"] = scene.points.astype(np.float32)
         camera = camera_of(view.viewmat, centre=(view.K[0, 2], view.K[1, 2]))

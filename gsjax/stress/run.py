@@ -7,7 +7,8 @@ from typing import Any
 import jax
 
 from gsjax.errors import InputError
-from gsjax.files import finite_or_none, write_file
+from gsjax.runtime.files import finite_or_none, write_file
+from gsjax.runtime.timing import machine
 from gsjax.stress import (
     accuracy,
     compositing,
@@ -18,7 +19,6 @@ from gsjax.stress import (
     precision,
 )
 from gsjax.stress.types import Case, Result, run_case
-from gsjax.timing import machine
 
 CASES: tuple[Case, ...] = (
     *needles.CASES,

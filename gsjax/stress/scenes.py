@@ -13,22 +13,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.cameras import Camera, look_at, make_camera
+from gsjax.cameras.camera import Camera, look_at, make_camera
 from gsjax.gaussians import GaussianParams, Gaussians, make_gaussians, select
-from gsjax.numerics import in_float64
+from gsjax.math.numerics import in_float64
+from gsjax.math.sh import num_bases
 from gsjax.raster.reference import reference_render
 from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig, Render
-from gsjax.sh import num_bases
 
 Array = jax.Array
 SLOTS, SIZE, FOCAL, BASES = 128, 32, 40.0, 16
 # Room for 125 splats over all 16 tiles: enough for usual scenes, and not for any.
 WIDE = 125
-COMPAT = RasterConfig(rungs=1, devices=1, pair_capacity=WIDE * 16)
+COMPAT = RasterConfig(num_size_buckets=1, devices=1, pair_capacity=WIDE * 16)
 # No threshold that an error of rounding could carry a whole Gaussian across.
 SMOOTH = COMPAT.replace(
-    alpha_cut=1e-6, alpha_cap=1 - 1e-6, stop=0.0, outputs=("alpha",)
+    alpha_min=1e-6, alpha_max=1 - 1e-6, stop=0.0, outputs=("alpha",)
 )
 BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
 # A pixel this near a threshold, relatively, may rightly differ by a whole Gaussian.

@@ -8,9 +8,9 @@ from gsjax.densify.adaptive import AdaptiveSettings, adaptive
 from gsjax.densify.mcmc import McmcSettings, mcmc
 from gsjax.densify.types import Densifier
 from gsjax.errors import InputError
-from gsjax.optim import Rates
 from gsjax.raster.types import RasterConfig
-from gsjax.settings import number, require_ranges, settle
+from gsjax.runtime.settings import number, require_ranges, settle
+from gsjax.train.optimiser import Rates
 
 STRATEGIES = ("adaptive", "mcmc")
 BACKGROUNDS = ("auto", "black", "white", "random")
@@ -54,7 +54,7 @@ class TrainConfig:
         transparent, which tells what is nothing, else black. But for "white", views
         and files have it black.
       initial: "points" of the dataset; "dense": those, and more on which the
-        photographs agree (`gsjax.train.start.with_dense`); or "random" ones in view.
+        photographs agree (`gsjax.train.initialisation.add_dense_points`); or "random" ones in view.
         "auto" is points where there are any, else random; so is "dense" where next to
         nothing is found.
       initial_count: how many random ones.
@@ -66,7 +66,7 @@ class TrainConfig:
       pose_rate, intrinsics_rate, exposure_rate: of Adam, for those.
       skip_masked: leave out the tiles of a view whose pixels are all masked;
         changes nothing beyond rounding.
-      drop_unseen: at the end, remove the Gaussians that are in none of the views that
+      prune_invisible: at the end, remove the Gaussians that are in none of the views that
         were trained on; changes no bit of those. (The count of the last step is the
         one before.)
       every_eval: in steps, measure the held-out views; 0 only at the end.
@@ -101,13 +101,13 @@ class TrainConfig:
     intrinsics_rate: float = 1e-5
     exposure_rate: float = 1e-3
     skip_masked: bool = True
-    drop_unseen: bool = True
+    prune_invisible: bool = True
     every_eval: int = 0
     every_checkpoint: int = 1000
     # What compiles faster: one size of the work, as a run grows its capacities itself;
     # no search for what is hidden, of which views of photographs hold next to nothing.
     raster: RasterConfig = field(
-        default_factory=lambda: RasterConfig(rungs=1, occlusion=False)
+        default_factory=lambda: RasterConfig(num_size_buckets=1, occlusion=False)
     )
 
     def __post_init__(self):
@@ -217,7 +217,7 @@ def scaled(config: TrainConfig, steps: int) -> TrainConfig:
     )
 
 
-def going_on(config: TrainConfig) -> TrainConfig:
+def continuation_config(config: TrainConfig) -> TrainConfig:
     """The same run for a scene that was trained before: what such a scene has of
     harmonics and of detail is used from the first steps on."""
     finest = Level(0.0, config.levels[-1].divisor)

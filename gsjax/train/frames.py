@@ -11,10 +11,10 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from gsjax.cameras import Camera, make_camera
-from gsjax.images import opencv
-from gsjax.numerics import to_device
-from gsjax.scene.types import Photo, View
+from gsjax.cameras.camera import Camera, make_camera
+from gsjax.data.types import Photo, View
+from gsjax.io.images import opencv
+from gsjax.math.numerics import to_device
 
 Array = jax.Array
 

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsjax.data.extent import require_points
+from gsjax.data.types import Dataset, Photo
 from gsjax.errors import DivergedError, InputError
-from gsjax.scene.initialise import require_points
-from gsjax.scene.types import Photo, Scene
 from gsjax.train.state import Metrics
 
 _MAX_BAD_STEPS = 50
@@ -27,7 +27,7 @@ def is_seen(photo: Photo) -> bool:
     return photo.valid is None or bool(photo.valid.any())
 
 
-def check_photos(scene: Scene, photos: Sequence[Photo]) -> None:
+def check_photos(scene: Dataset, photos: Sequence[Photo]) -> None:
     """Warn of photographs that are masked altogether.
 
     Raises:
@@ -56,7 +56,7 @@ def check_photos(scene: Scene, photos: Sequence[Photo]) -> None:
         )
 
 
-def check_points(scene: Scene) -> None:
+def check_points(scene: Dataset) -> None:
     """See that points lie before cameras, and not too near to be drawn.
 
     Warns where half of those that lie before a camera are too near to it.
@@ -95,7 +95,7 @@ def check_points(scene: Scene) -> None:
         )
 
 
-def check_in_view(scene: Scene, means: np.ndarray, source: str) -> None:
+def check_in_view(scene: Dataset, means: np.ndarray, source: str) -> None:
     """See that some of the Gaussians that a run is to start from are in a picture.
 
     Args:
@@ -129,7 +129,7 @@ class _Depths(NamedTuple):
     farthest: float
 
 
-def _depths(scene: Scene, points: np.ndarray) -> _Depths:
+def _depths(scene: Dataset, points: np.ndarray) -> _Depths:
     before, drawn, farthest = 0, 0, 0.0
     for view in scene.views:
         depth = points @ view.viewmat[2, :3] + view.viewmat[2, 3]

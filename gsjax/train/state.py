@@ -11,9 +11,13 @@ import jax.numpy as jnp
 import optax
 
 from gsjax.gaussians import GaussianParams, Gaussians
-from gsjax.optim import init_moments
+from gsjax.train.camera_refinement import (
+    CameraRefinement,
+    init_refinement,
+    init_refinement_moments,
+)
 from gsjax.train.config import TrainConfig
-from gsjax.train.tuning import Tuning, init_tuning, init_tuning_moments
+from gsjax.train.optimiser import init_moments
 
 Array = jax.Array
 
@@ -31,7 +35,7 @@ class TrainState:
       gaussians: the scene.
       moments: Adam's, slot by slot.
       stats: what the strategy has gathered.
-      tuning, tuning_moments: corrections of cameras and exposures.
+      refinement, refinement_moments: corrections of cameras and exposures.
     """
 
     step: Array
@@ -39,8 +43,8 @@ class TrainState:
     gaussians: Gaussians
     moments: optax.ScaleByAdamState
     stats: Any
-    tuning: Tuning
-    tuning_moments: optax.ScaleByAdamState
+    refinement: CameraRefinement
+    refinement_moments: optax.ScaleByAdamState
 
     def replace(self, **changes) -> "TrainState":
         """A copy with some fields changed."""
@@ -55,18 +59,18 @@ def init_state(
     Args:
       gaussians: as initialised; capacity as wanted.
       config: the settings.
-      extent: of the scene, see `gsjax.scene.initialise.scene_extent`.
+      extent: of the scene, see `gsjax.init.gaussians.scene_extent`.
       views: V.
     """
-    tuning = init_tuning(config, views)
+    refinement = init_refinement(config, views)
     return TrainState(
         step=jnp.int32(0),
         key=jax.random.key(config.seed),
         gaussians=gaussians,
         moments=init_moments(gaussians.params),
         stats=config.densifier(extent).init(gaussians),
-        tuning=tuning,
-        tuning_moments=init_tuning_moments(tuning),
+        refinement=refinement,
+        refinement_moments=init_refinement_moments(refinement),
     )
 
 
@@ -104,7 +108,7 @@ class Gradients(NamedTuple):
     Attributes:
       loss, psnr: [] as in `Metrics`.
       by_params: of the loss, by the parameters.
-      by_tuning: by the corrections.
+      by_refinement: by the corrections.
       by_probe: [B, N, 2] by the projected means, px; see `Observation`.
       radii: [B, N] px.
       size: [B, 2] int32, width and height of the photographs.
@@ -114,7 +118,7 @@ class Gradients(NamedTuple):
     loss: Array
     psnr: Array
     by_params: GaussianParams
-    by_tuning: Tuning
+    by_refinement: CameraRefinement
     by_probe: Array
     radii: Array
     size: Array
@@ -130,14 +134,15 @@ def gradients_like(state: TrainState, batch: int) -> Gradients:
     def shape(*sizes: int, dtype=dtype) -> Any:
         return jax.ShapeDtypeStruct(sizes, dtype)
 
-    params, tuning = jax.tree.map(
-        lambda a: shape(*a.shape, dtype=a.dtype), (state.gaussians.params, state.tuning)
+    params, refinement = jax.tree.map(
+        lambda a: shape(*a.shape, dtype=a.dtype),
+        (state.gaussians.params, state.refinement),
     )
     return Gradients(
         loss=shape(),
         psnr=shape(),
         by_params=params,
-        by_tuning=tuning,
+        by_refinement=refinement,
         by_probe=shape(batch, slots, 2),
         radii=shape(batch, slots),
         size=shape(batch, 2, dtype=jnp.int32),

@@ -1,6 +1,6 @@
 """One step of training: a pure function (state, batch) → (state, metrics).
 
-Its stages, which a run compiles one by one (`gsjax.train.compiled`): differentiate what
+Its stages, which a run compiles one by one (`gsjax.train.step_compiler`): differentiate what
 the views show, advance by it, and edit the slots where that is due.
 
 Axis legend: N Gaussians (capacity), V views, B views of a step, H W image.
@@ -15,16 +15,16 @@ from jax import lax
 
 from gsjax.densify.types import Densifier, Observation, apply_edit
 from gsjax.gaussians import Gaussians, num_active
-from gsjax.losses import photometric_spread
-from gsjax.metrics import psnr
-from gsjax.numerics import all_within
-from gsjax.optim import adam_step, means_rate
+from gsjax.math.numerics import all_within
 from gsjax.raster.render import device_count, render
 from gsjax.raster.types import RasterConfig
+from gsjax.train.camera_refinement import exposed, refine_camera, refinement_step
 from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Batch
+from gsjax.train.losses import photometric_spread
+from gsjax.train.metrics import psnr
+from gsjax.train.optimiser import adam_step, means_rate
 from gsjax.train.state import Gradients, Metrics, TrainState, gradients_like
-from gsjax.train.tuning import exposed, tuned_camera, tuning_step
 
 Array = jax.Array
 
@@ -90,9 +90,9 @@ def make_stages(
         outputs=("rgb",), absgrad=densifier.absgrad, visible_capacity=None
     )
 
-    def objective(params, tuning, probe, state, batch: Batch, background):
+    def objective(params, refinement, probe, state, batch: Batch, background):
         gaussians = state.gaussians.replace(params=params)
-        camera = tuned_camera(batch.camera, tuning, batch.view, extent)
+        camera = refine_camera(batch.camera, refinement, batch.view, extent)
         name = "abs_probe" if densifier.absgrad else "probe"
         mask = batch.valid if config.skip_masked else None
         given = {"mask": mask, "size": batch.size, name: probe}
@@ -102,12 +102,12 @@ def make_stages(
             view = render(gaussians, camera, outputs, **given)
             assert view.rgb is not None
             assert view.alpha is not None
-            image = exposed(view.rgb, tuning, batch.view, view.alpha)
+            image = exposed(view.rgb, refinement, batch.view, view.alpha)
             image += (1 - view.alpha[..., None]) * background
         else:
             view = render(gaussians, camera, raster, background, **given)
             assert view.rgb is not None
-            image = exposed(view.rgb, tuning, batch.view)
+            image = exposed(view.rgb, refinement, batch.view)
         target, weight = targets(batch, background, image.dtype)
         with jax.named_scope("loss"):
             loss = photometric_spread(
@@ -132,19 +132,19 @@ def make_stages(
         background = background_of(config, _transparent(batch), by_background, dtype)
         probe = jnp.zeros((count, state.gaussians.capacity, 2), dtype)
         (loss, (quality, view)), by = slopes(
-            params, state.tuning, probe, state, batch, background
+            params, state.refinement, probe, state, batch, background
         )
         size = batch.size
         if size is None:
             whole = jnp.asarray([batch.camera.width, batch.camera.height], jnp.int32)
             size = jnp.broadcast_to(whole, (count, 2))
         demand = view.demand
-        by_params, by_tuning, by_probe = by
+        by_params, by_refinement, by_probe = by
         found = Gradients(
             loss=loss,
             psnr=quality,
             by_params=by_params,
-            by_tuning=by_tuning,
+            by_refinement=by_refinement,
             by_probe=by_probe,
             radii=view.radii,
             size=size,
@@ -157,7 +157,7 @@ def make_stages(
         return jax.tree.map(lambda a, b: a.astype(b.dtype), found, like)
 
     def advance(state: TrainState, found: Gradients):
-        by = found.by_params, found.by_tuning, found.by_probe
+        by = found.by_params, found.by_refinement, found.by_probe
         finite = jnp.isfinite(found.loss) & all_within(by, _STEEPEST)
 
         def keep():
@@ -232,7 +232,7 @@ def _optimise(
     state: TrainState, found: Gradients, config: TrainConfig, extent: float
 ) -> tuple[TrainState, Array]:
     """Parameters and corrections after one step of Adam; whether all made it."""
-    by_params, by_tuning = found.by_params, found.by_tuning
+    by_params, by_refinement = found.by_params, found.by_refinement
     bases = by_params.sh.shape[-2]
     degree = jnp.floor(jnp.sqrt(jnp.arange(bases, dtype=jnp.float32))).astype(jnp.int32)
     learnt = degree <= state.step // config.sh_every
@@ -246,17 +246,17 @@ def _optimise(
         extent,
     )
     good, params = _still_numbers(state.gaussians, params)
-    tuning, tuning_moments = tuning_step(
-        state.tuning, by_tuning, state.tuning_moments, config
+    refinement, refinement_moments = refinement_step(
+        state.refinement, by_refinement, state.refinement_moments, config
     )
     moved = state.replace(
         step=state.step + 1,
         gaussians=state.gaussians.replace(params=params),  # pyright: ignore
         moments=moments,
-        tuning=tuning,
-        tuning_moments=tuning_moments,
+        refinement=refinement,
+        refinement_moments=refinement_moments,
     )
-    return moved, good & all_within(tuning)
+    return moved, good & all_within(refinement)
 
 
 def _still_numbers(before: Gaussians, params) -> tuple[Array, Any]:

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsjax import images
-from gsjax.cameras import NEAR, Camera, make_camera
+from gsjax.cameras.camera import NEAR, Camera, make_camera
 from gsjax.gaussians import Gaussians, capacity_bucket
+from gsjax.io import images
+from gsjax.plots.contact_sheets import depth_colors
 from gsjax.raster.render import render_exact
 from gsjax.raster.types import RasterConfig, Render
-from gsjax.sheets import depth_colors
 
 KINDS = ("rgb", "depth", "alpha")
 _PAIRS, _MARGIN = 2**20, 1.5  # room at first, and for the views to come
@@ -49,7 +49,7 @@ class ExactRenderer:
     def __init__(self, config: RasterConfig, background: Sequence[float]):
         # One rung, and no capacity measured first: less to compile.
         self.config = config.replace(
-            outputs=("rgb", "alpha", "depth"), rungs=1, pair_capacity=_PAIRS
+            outputs=("rgb", "alpha", "depth"), num_size_buckets=1, pair_capacity=_PAIRS
         )
         self.background = tuple(background)
         self._lock = threading.Lock()

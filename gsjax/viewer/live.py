@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 
-from gsjax.console import note
+from gsjax.data.types import Dataset, Photo
 from gsjax.gaussians import Gaussians
-from gsjax.scene.types import Photo, Scene
+from gsjax.runtime.console import note
 from gsjax.train.config import TrainConfig
-from gsjax.train.fit import Progress
+from gsjax.train.loop import Progress
 from gsjax.train.state import TrainState
 from gsjax.viewer.opening import exhibit_of_training
 from gsjax.viewer.stage import require_viser
@@ -41,7 +41,7 @@ class LiveViewer:
         self.due = 0.0
 
     def begin(
-        self, scene: Scene, photos: Sequence[Photo], config: TrainConfig
+        self, scene: Dataset, photos: Sequence[Photo], config: TrainConfig
     ) -> Callable[[TrainState, Progress], None]:
         """The hook for `gsjax.Hooks.state`; serving begins at its first."""
 

@@ -4,21 +4,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from gsjax.console import note, one_line
+from gsjax.data.photos import load_photos
+from gsjax.data.types import Dataset, Photo, View
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
-from gsjax.runinfo import describe_run
-from gsjax.scene.photos import load_photos
-from gsjax.scene.types import Photo, Scene, View
-from gsjax.subjects import from_anywhere, is_run, open_subject
-from gsjax.train.config import TrainConfig
-from gsjax.train.folder import (
+from gsjax.runs.folder import (
     background_of,
     load_data,
     load_settings,
     refined_data,
     run_files,
 )
+from gsjax.runs.run_info import describe_run
+from gsjax.runs.scene_source import from_anywhere, is_run, open_scene_source
+from gsjax.runtime.console import note, one_line
+from gsjax.train.config import TrainConfig
 from gsjax.viewer.exact import ExactRenderer
 from gsjax.viewer.session import Exhibit
 from gsjax.viewer.stage import (
@@ -54,11 +54,11 @@ def open_exhibit(
       path: a .ply or .spz file, or the folder of a run.
       up: of the world, of `UPS`; None takes it from the cameras, or else −y, which is
         up in most scenes from COLMAP.
-      preset: as `open_subject`.
+      preset: as `open_scene_source`.
       min_opacity, max_gaussians: see `Exhibit`.
 
     Raises:
-      InputError: as `open_subject`, or if the file cannot be read.
+      InputError: as `open_scene_source`, or if the file cannot be read.
     """
     scene, status = None, ""
     if is_run(path):
@@ -70,7 +70,7 @@ def open_exhibit(
         except InputError as error:
             note(f"warning: without cameras: {one_line(error)}")
     origin = None if scene is None else scene.origin
-    subject = open_subject(path, origin=origin, preset=preset)
+    subject = open_scene_source(path, origin=origin, preset=preset)
     gaussians = subject.load()
     frusta = [] if scene is None else frusta_of(scene.views)
     renderer = ExactRenderer(subject.config, subject.background)
@@ -92,7 +92,7 @@ def photographed(views: Sequence[View], size: int = THUMBNAIL) -> list[Frustum]:
 
 
 def exhibit_of_training(
-    gaussians: Gaussians, scene: Scene, photos: Sequence[Photo], config: TrainConfig
+    gaussians: Gaussians, scene: Dataset, photos: Sequence[Photo], config: TrainConfig
 ) -> Exhibit:
     """What a training begins with.
 

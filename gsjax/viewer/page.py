@@ -4,9 +4,9 @@ import html
 from pathlib import Path
 from typing import NamedTuple
 
-from gsjax import files
 from gsjax.errors import InputError
 from gsjax.gaussians import num_active
+from gsjax.runtime import files
 from gsjax.viewer.session import Exhibit
 from gsjax.viewer.splats import Cut, most_important, pack, within
 from gsjax.viewer.stage import (

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from gsjax.cameras import NEAR
-from gsjax.console import note, one_line
+from gsjax.cameras.camera import NEAR
 from gsjax.gaussians import Gaussians, select
+from gsjax.runtime.console import note, one_line
 from gsjax.viewer.exact import KINDS, ExactRenderer, camera_of, picture
 from gsjax.viewer.splats import (
     LEAST_OPACITY,

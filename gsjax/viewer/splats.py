@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsjax.gaussians import Gaussians
-from gsjax.sh import dc_to_rgb
+from gsjax.math.sh import dc_to_rgb
 
 LEAST_OPACITY = 0.01
 # Half precision has 11 bits from 6e-5 to 65504: of scales, from 0.008 to 255.

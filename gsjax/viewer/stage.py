@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gsjax import images
+from gsjax.data import camera_paths
+from gsjax.data.types import Photo, View
 from gsjax.errors import InputError, MissingExtraError
 from gsjax.gaussians import Gaussians
-from gsjax.scene import paths
-from gsjax.scene.types import Photo, View
+from gsjax.io import images
 from gsjax.viewer.splats import Cut, within
 
 THUMBNAIL = 320  # px, longest side
@@ -200,11 +200,11 @@ def small(pixels: np.ndarray, most: int = THUMBNAIL) -> np.ndarray:
 def eye_of_cameras(frusta: Sequence[Frustum]) -> Eye:
     """Behind and above the first camera, turning about what all of them look at."""
     viewmats = np.stack([frustum.viewmat for frustum in frusta])
-    focus = paths.focus_point(viewmats)
+    focus = camera_paths.focus_point(viewmats)
     position, ahead = frusta[0].centre, frusta[0].viewmat[2, :3]
     away = np.linalg.norm(focus - position)
     distance = max((focus - position) @ ahead, 0.3 * away, 1e-6)
-    up, target = paths.up_direction(viewmats), position + distance * ahead
+    up, target = camera_paths.up_direction(viewmats), position + distance * ahead
     behind = _BEHIND * distance * _leant(-ahead, up)
     return Eye(target + behind, target, up, frusta[0].fov)
 

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-from gsjax.console import note, one_line
 from gsjax.gaussians import Gaussians
+from gsjax.runtime.console import note, one_line
 from gsjax.viewer.session import Exhibit, Session
 from gsjax.viewer.stage import (
     Frustum,

@@ -20,30 +20,31 @@ from captures import save_photo, scene_of_views
 from hostile import HOSTILE, harmless, write_hostile
 
 import gsjax
-import gsjax.train.fit as fit_module
-import gsjax.train.run as run_module
-import gsjax.train.sitting as sitting_module
-from gsjax import cli, memory
-from gsjax.commands.train import TrainCommand
+import gsjax.runs.run as run_module
+import gsjax.runs.session as sitting_module
+import gsjax.train.loop as fit_module
+from gsjax.cli.main import main
+from gsjax.cli.train import TrainCommand
+from gsjax.data.colmap_writer import write_colmap
+from gsjax.data.dataset import load_dataset
+from gsjax.data.photos import load_photos
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import CapacityError, DivergedError, InputError
-from gsjax.evaluation import evaluate
-from gsjax.flights import path_entries
+from gsjax.init.gaussians import init_gaussians
 from gsjax.raster.types import RasterConfig
-from gsjax.scene.colmap_writer import write_colmap
-from gsjax.scene.dataset import load_dataset
-from gsjax.scene.initialise import init_gaussians
-from gsjax.scene.photos import load_photos
-from gsjax.subjects import splat_file
-from gsjax.train.checkpoint import load_checkpoint
+from gsjax.runs.checkpoint import load_checkpoint
+from gsjax.runs.folder import Data, RunSettings
+from gsjax.runs.held_out import evaluate_run
+from gsjax.runs.history import read_metrics
+from gsjax.runs.run import resume_run, start_run
+from gsjax.runs.scene_source import splat_file
+from gsjax.runs.trajectories import path_entries
+from gsjax.runtime import memory
 from gsjax.train.config import TrainConfig
-from gsjax.train.folder import Data, RunSettings
+from gsjax.train.evaluation import evaluate
 from gsjax.train.frames import make_frames
 from gsjax.train.health import Health, check_points
-from gsjax.train.held_out import evaluate_run
-from gsjax.train.history import read_metrics
-from gsjax.train.run import resume_run, start_run
 from gsjax.train.state import Metrics
 
 pytestmark = pytest.mark.usefixtures("float32", "shared_programs")
@@ -58,7 +59,7 @@ CONFIG = TrainConfig(
         start=0, stop=20, every=5, threshold=1e-6, reset_every=10, max_gaussians=MOST
     ),
     mcmc=McmcSettings(start=0, stop=20, every=5, growth=1.3, max_gaussians=MOST),
-    raster=RasterConfig(rungs=1, devices=1, chunk_size=4, occlusion=False),
+    raster=RasterConfig(num_size_buckets=1, devices=1, chunk_size=4, occlusion=False),
 )
 # Of another shape: with one strategy, to compile less.
 ONE_PROGRAM_MORE = "one photograph"
@@ -338,7 +339,7 @@ def train(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(TrainCommand, "_settings", lambda *_: settings)
 
     def run(folder, *more):
-        code = cli.main(["train", str(settings.dataset), "-o", str(folder), *more])
+        code = main.main(["train", str(settings.dataset), "-o", str(folder), *more])
         return code, capsys.readouterr().err.splitlines()
 
     yield run

@@ -15,14 +15,14 @@ from bad_files import BAD, CAMERAS, IMAGES, LEAVING, POINTS, swap
 from captures import scene_of_views
 from good_files import READ, STEP, TEXT, write_good_files
 
-from gsjax import cli
+from gsjax.cli.main import main
+from gsjax.data import colmap_binary, colmap_text
+from gsjax.data.colmap import load_colmap
+from gsjax.data.colmap_writer import write_colmap
+from gsjax.data.dataset import load_dataset
 from gsjax.errors import InputError
 from gsjax.io.point_cloud import read_point_cloud
-from gsjax.scene import colmap_binary, colmap_text
-from gsjax.scene.colmap import load_colmap
-from gsjax.scene.colmap_writer import write_colmap
-from gsjax.scene.dataset import load_dataset
-from gsjax.train.history import read_metrics
+from gsjax.runs.history import read_metrics
 
 REMEDY = re.compile(
     "wanted|pass|export|copy|remove|convert|check|put|train|supported|undistort|choose|"
@@ -248,7 +248,7 @@ def test_the_command_line_tells_in_one_line(datasets, name, capfd, monkeypatch):
     monkeypatch.chdir(datasets)
     file, change, wanted = BAD[name]
     with replaced(datasets / file, change((datasets / file).read_bytes())):
-        code = cli.main(COMMANDS[file])
+        code = main.main(COMMANDS[file])
     said = capfd.readouterr()
     assert code == 3, said
     assert said.out == ""

@@ -11,7 +11,7 @@ from conftest import on_cpu
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsjax import cli
+from gsjax.cli.main import main
 from gsjax.stress import poison, precision, run
 from gsjax.stress.scenes import (
     changed,
@@ -136,7 +136,7 @@ def test_a_nan_is_the_worst():
 def stress(monkeypatch, names: str, *args: str) -> int:
     cases = tuple(FAKE[name] for name in names.split())
     monkeypatch.setattr(run, "CASES", cases)
-    return cli.main(["stress", *args])
+    return main.main(["stress", *args])
 
 
 def test_exit_codes(monkeypatch, capsys):

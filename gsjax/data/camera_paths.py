@@ -1,0 +1,319 @@
+"""Paths of a camera through a captured scene: an orbit, a spiral, a flight along.
+
+Axis legend: B cameras that are given, F frames of the path, S dense samples of it.
+
+World → camera matrices [·, 4, 4] in and out, float64, OpenCV axes. No input is
+degenerate to the point of NaN: one camera, equal cameras and parallel ones fall back
+to what each docstring says.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from gsjax.cameras.camera import look_at
+from gsjax.data.types import View
+from gsjax.errors import InputError
+
+# Least eigenvalue, the mean squared sine between the optical axes and the direction
+# that they agree on most, at which they say how far the scene is: spread over 2°.
+_PARALLEL = np.sin(np.radians(2.0)) ** 2
+_STEEPEST = np.radians(85.0)
+_ALIKE = np.cos(np.radians(45.0))  # of directions that face one side of a scene
+_SAMPLES = 512  # of a path between two keyframes, to measure its length
+
+
+class Intrinsics(NamedTuple):
+    """Intrinsics K [3, 3] in px, for an image of width × height."""
+
+    K: np.ndarray
+    width: int
+    height: int
+
+
+def median_intrinsics(views: Sequence[View]) -> Intrinsics:
+    """What the views have in common: the commonest size, and the median K for it.
+
+    Raises:
+      InputError: if there is no view.
+    """
+    if not views:
+        raise InputError("no views; a path needs the intrinsics of at least one")
+    sizes = Counter((view.width, view.height) for view in views)
+    width, height = max(sizes, key=lambda size: (sizes[size], size))
+    scaled = [
+        view.K * ([width / view.width], [height / view.height], [1]) for view in views
+    ]
+    return Intrinsics(np.median(scaled, axis=0), width, height)
+
+
+def focus_point(viewmats, depth: float | None = None) -> np.ndarray:
+    """[3] the point that the cameras look at: nearest to all their optical axes.
+
+    Where they do not look at one (a single camera, axes within about 2°, or apart, as
+    from inside out), it is straight ahead of the middle of them.
+
+    Args:
+      viewmats: [B, 4, 4].
+      depth: how far ahead then; None takes the spread of the cameras, or 1.
+
+    Raises:
+      InputError: on a wrong shape, no camera, or values that are not finite.
+    """
+    centres, axes = _centres_and_axes(viewmats)
+    ahead = axes[:, 2]
+    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+    if np.linalg.eigvalsh(across.mean(axis=0))[0] > _PARALLEL:
+        moment = np.einsum("bij,bj->i", across, centres)
+        focus = np.linalg.solve(across.sum(axis=0), moment)
+        if np.median(((focus - centres) * ahead).sum(axis=1)) > 0:
+            return focus
+    if depth is None:
+        spread = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
+        depth = 2 * spread if spread > 1e-9 else 1.0
+    return centres.mean(axis=0) + depth * _mean_direction(ahead)
+
+
+def up_direction(viewmats) -> np.ndarray:
+    """[3] unit: the up of the scene, at right angles to the cameras' horizontals.
+
+    Cameras are held level more often than they look level. Where all horizontals are
+    parallel, or cameras were turned about their axes, it is the mean of their ups.
+
+    Raises:
+      InputError: as `focus_point`.
+    """
+    _, axes = _centres_and_axes(viewmats)
+    mean = _mean_direction(-axes[:, 1])
+    right = axes[:, 0]
+    values, vectors = np.linalg.eigh(right.T @ right / len(right))
+    level = vectors[:, 0] * np.sign(vectors[:, 0] @ mean)
+    return level if values[1] > _PARALLEL and level @ mean > 0.5 else mean
+
+
+def orbit(viewmats, frames: int, *, depth: float | None = None) -> np.ndarray:
+    """[F, 4, 4]: once around `focus_point` about `up_direction`, and closed.
+
+    At the median distance and the mean elevation of the cameras (at most 85°), from
+    where the first of them stands on. A camera that stands on the focus or below the
+    zenith of it has no azimuth: the orbit then starts anywhere.
+
+    Args:
+      viewmats: [B, 4, 4].
+      frames: F; frame F would be frame 0.
+      depth: as `focus_point`.
+
+    Raises:
+      InputError: as `focus_point`, or if ``frames`` is below 1.
+    """
+    _check_frames(frames)
+    centres, _ = _centres_and_axes(viewmats)
+    focus, up = focus_point(viewmats, depth), up_direction(viewmats)
+    offsets = centres - focus
+    distances = np.linalg.norm(offsets, axis=1)
+    distance = float(np.median(distances)) or depth or 1.0
+    sines = (offsets @ up) / np.where(distances > 0, distances, 1)
+    elevation = np.arcsin(np.clip(sines, -1, 1)).mean()
+    elevation = np.clip(elevation, -_STEEPEST, _STEEPEST)
+    start = offsets[0] - (offsets[0] @ up) * up
+    if np.linalg.norm(start) < 1e-6 * distance:
+        start = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    start = start / np.linalg.norm(start)
+    turns = 2 * np.pi * np.arange(frames) / frames
+    around = np.outer(np.cos(turns), start) + np.outer(
+        np.sin(turns), np.cross(up, start)
+    )
+    eyes = np.cos(elevation) * around + np.sin(elevation) * up
+    return np.stack([look_at(focus + distance * eye, focus, up) for eye in eyes])
+
+
+def unseen_angle(viewmats, *, depth: float | None = None) -> float:
+    """Degrees of an `orbit` between those cameras that stand farthest apart on it.
+
+    360 where all stand in one direction, as a single camera does.
+
+    Raises:
+      InputError: as `focus_point`.
+    """
+    centres, _ = _centres_and_axes(viewmats)
+    offsets = centres - focus_point(viewmats, depth)
+    up = up_direction(viewmats)
+    across = np.cross(np.eye(3)[np.abs(up).argmin()], up)
+    angles = np.arctan2(offsets @ np.cross(up, across), offsets @ across)
+    angles = np.sort(angles)
+    return float(np.degrees(np.diff(angles, append=angles[0] + 2 * np.pi).max()))
+
+
+def spiral(
+    viewmats, frames: int, *, turns: int = 2, depth: float | None = None
+) -> np.ndarray:
+    """[F, 4, 4]: a closed spiral before a scene that all cameras face (LLFF, 2019).
+
+    About the mean pose, as wide as 90 % of the cameras are off it (at least 3 % of
+    the distance of the focus, which is what one camera or equal ones get), looking at
+    the focus. Cameras all around a scene have no mean pose: of those the ones count
+    that look as the first does, within 45°.
+
+    Args:
+      viewmats: [B, 4, 4].
+      frames: F; frame F would be frame 0.
+      turns: how often around, while once to and fro.
+      depth: as `focus_point`.
+
+    Raises:
+      InputError: as `focus_point`, or if ``frames`` is below 1.
+    """
+    _check_frames(frames)
+    viewmats = np.asarray(viewmats, np.float64)
+    centres, axes = _centres_and_axes(viewmats)
+    # Of a ring that looks down the mean is straight down, and so is that of the ups.
+    upward = _mean_direction(-axes[:, 1]) @ _mean_direction(axes[:, 2])
+    if np.linalg.norm(axes[:, 2].mean(axis=0)) < _ALIKE or abs(upward) > _ALIKE:
+        alike = axes[:, 2] @ axes[0, 2] >= _ALIKE
+        viewmats, centres, axes = viewmats[alike], centres[alike], axes[alike]
+    middle = centres.mean(axis=0)
+    ahead = _mean_direction(axes[:, 2])
+    focus = focus_point(viewmats, depth)
+    distance = max((focus - middle) @ ahead, 1e-9)
+    pose = look_at(middle, middle + ahead, _mean_direction(-axes[:, 1]))[:3, :3]
+    reach = np.percentile(np.abs((centres - middle) @ pose.T), 90, axis=0)
+    reach = np.maximum(reach, distance * np.asarray([0.03, 0.03, 0]))
+    # Not through what is looked at.
+    reach[2] = min(reach[2], 0.5 * distance)
+    phase = 2 * np.pi * np.arange(frames) / frames
+    steps = [np.cos(turns * phase), np.sin(turns * phase), np.sin(phase)]
+    eyes = middle + (np.stack(steps, -1) * reach) @ pose
+    target = middle + distance * ahead
+    return np.stack([look_at(eye, target, -pose[1]) for eye in eyes])
+
+
+def interpolate(
+    viewmats, frames: int, *, closed: bool = False, depth: float | None = None
+) -> np.ndarray:
+    """[F, 4, 4]: a smooth flight through all the cameras, in their order.
+
+    Centripetal Catmull–Rom (Yuksel et al. 2011) of positions and of quaternions,
+    these normalised; so the path and its first derivative are continuous. Frames are
+    at equal steps of sqrt(movement² + (distance of the focus · turn)²), about how far
+    the picture moves. Equal cameras in a row count once; one camera stands still.
+
+    Args:
+      viewmats: [B, 4, 4].
+      frames: F; the first and the last are the first and the last camera, unless
+        ``closed``: then frame F would be frame 0.
+      closed: whether to fly back to the first camera.
+      depth: as `focus_point`.
+
+    Raises:
+      InputError: as `focus_point`, or if ``frames`` is below 1.
+    """
+    from scipy.interpolate import CubicHermiteSpline
+    from scipy.spatial.transform import Rotation
+
+    _check_frames(frames)
+    centres, axes = _centres_and_axes(viewmats)
+    away = focus_point(viewmats, depth) - centres
+    scale = np.median(np.linalg.norm(away, axis=1)) or 1.0
+    keys = np.concatenate([centres, Rotation.from_matrix(axes).as_quat()], axis=1)
+    keys = _aligned(keys[[*range(len(keys)), 0]] if closed else keys)
+    steps = _steps(keys, scale)
+    apart = steps > 1e-9 * max(steps.sum(), scale)
+    keys = np.concatenate([keys[:1], keys[1:][apart]])
+    if len(keys) == 1:
+        return np.tile(_matrices(keys), (frames, 1, 1))
+    knots = np.concatenate([[0], np.cumsum(np.sqrt(steps[apart]))])
+    path = CubicHermiteSpline(knots, keys, _tangents(keys, knots, closed))
+    pieces = len(keys) - 1
+    places = np.linspace(0, pieces, pieces * _SAMPLES + 1)
+    dense = np.interp(places, np.arange(pieces + 1), knots)
+    lengths = _steps(path(dense), scale)
+    lengths = np.concatenate([[0], np.cumsum(lengths)])
+    wanted = np.linspace(0, lengths[-1], frames, endpoint=not closed)
+    return _matrices(path(np.interp(wanted, lengths, dense)))
+
+
+def _check_frames(frames: int) -> None:
+    if frames < 1:
+        raise InputError(f"frames is {frames}; a path has at least 1")
+
+
+def _centres_and_axes(viewmats) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [B, 3], and rotations [B, 3, 3]: rows right, down, ahead."""
+    viewmats = np.asarray(viewmats, np.float64)
+    if viewmats.ndim != 3 or viewmats.shape[1:] != (4, 4) or len(viewmats) == 0:
+        raise InputError(
+            f"viewmats have shape {viewmats.shape}; [B, 4, 4] of at least one camera "
+            "is wanted"
+        )
+    if not np.isfinite(viewmats).all():
+        raise InputError("viewmats have a value that is not finite")
+    axes = viewmats[:, :3, :3]
+    return -np.einsum("bij,bi->bj", axes, viewmats[:, :3, 3]), axes
+
+
+def _mean_direction(directions: np.ndarray) -> np.ndarray:
+    """[3] unit; the first of them where they cancel."""
+    mean = directions.mean(axis=0)
+    length = np.linalg.norm(mean)
+    return mean / length if length > 1e-3 else directions[0]
+
+
+# --- keyframes: [·, 7], position and quaternion ---
+
+
+def _aligned(keys: np.ndarray) -> np.ndarray:
+    """Quaternions with signs such that neighbours are less than half a turn apart."""
+    keys = keys.copy()
+    for before, key in pairwise(keys):
+        if before[3:] @ key[3:] < 0:
+            key[3:] *= -1
+    return keys
+
+
+def _steps(keys: np.ndarray, scale: float) -> np.ndarray:
+    """How far neighbours are apart; a turn counts as moving ``scale`` away."""
+    moved = np.linalg.norm(np.diff(keys[:, :3], axis=0), axis=1)
+    quats = keys[:, 3:] / np.linalg.norm(keys[:, 3:], axis=1, keepdims=True)
+    # Of unit quaternions: the chord is 2 sin(turn / 4).
+    chord = np.linalg.norm(np.diff(quats, axis=0), axis=1)
+    return np.hypot(moved, scale * 4 * np.arcsin(np.minimum(chord / 2, 1)))
+
+
+def _tangents(keys: np.ndarray, knots: np.ndarray, closed: bool) -> np.ndarray:
+    """Derivatives at the keyframes: of the parabola through each and its neighbours.
+
+    At the ends of an open path, of the one through the three keyframes there.
+    """
+    gaps = np.diff(knots)[:, None]
+    slopes = np.diff(keys, axis=0) / gaps
+    tangents = np.empty_like(keys)
+    tangents[1:-1] = _between(slopes[:-1], slopes[1:], gaps[:-1], gaps[1:])
+    if closed:
+        # The last keyframe is the first one; its quaternion may have the other sign.
+        sign = np.ones(7)
+        sign[3:] = np.sign(keys[0, 3:] @ keys[-1, 3:])
+        tangents[0] = _between(sign * slopes[-1], slopes[0], gaps[-1], gaps[0])
+        tangents[-1] = sign * tangents[0]
+    elif len(keys) == 2:
+        tangents[:] = slopes[0]
+    else:
+        tangents[0] = 2 * slopes[0] - tangents[1]
+        tangents[-1] = 2 * slopes[-1] - tangents[-2]
+    return tangents
+
+
+def _between(before, after, gap_before, gap_after):
+    return (before * gap_after + after * gap_before) / (gap_before + gap_after)
+
+
+def _matrices(keys: np.ndarray) -> np.ndarray:
+    """viewmats [S, 4, 4] of keys."""
+    from scipy.spatial.transform import Rotation
+
+    viewmats = np.tile(np.eye(4), (len(keys), 1, 1))
+    viewmats[:, :3, :3] = Rotation.from_quat(keys[:, 3:]).as_matrix()
+    viewmats[:, :3, 3] = -np.einsum("bij,bj->bi", viewmats[:, :3, :3], keys[:, :3])
+    return viewmats

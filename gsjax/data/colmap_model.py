@@ -1,0 +1,239 @@
+"""What a COLMAP model holds, and the checks that both of its file forms share.
+
+Poses are world → camera, quaternions wxyz; pixel centres at + 0.5. The models of
+cameras and their numbers are those of COLMAP's `src/colmap/sensor/models.h`.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from gsjax.data.types import Lens, intrinsic_matrix
+from gsjax.errors import InputError
+
+MAX_NAME_BYTES = 1024
+MAX_SIDE = 1 << 20
+# Coordinates are bounded so that products stay finite and float32 holds the result.
+MAX_COORDINATE = 1e30
+
+
+class CameraKind(NamedTuple):
+    """A camera model of COLMAP.
+
+    Attributes:
+      name: as in cameras.txt.
+      number: as in cameras.bin.
+      size: how many parameters it has.
+      focals: how many of them are focal lengths (1: fx = fy); cx and cy follow.
+      lens: kind of `Lens` of what is left, "" if nothing is; None if unsupported.
+      order: where each left-over parameter stands in the coefficients of the lens.
+    """
+
+    name: str
+    number: int
+    size: int
+    focals: int = 2
+    lens: str | None = None
+    order: tuple[int, ...] = ()
+
+
+_RADIAL, _FISHEYE = "radial_tangential", "fisheye"
+CAMERA_KINDS = (
+    CameraKind("SIMPLE_PINHOLE", 0, 3, 1, ""),
+    CameraKind("PINHOLE", 1, 4, 2, ""),
+    CameraKind("SIMPLE_RADIAL", 2, 4, 1, _RADIAL, (0,)),
+    CameraKind("RADIAL", 3, 5, 1, _RADIAL, (0, 1)),
+    CameraKind("OPENCV", 4, 8, 2, _RADIAL, (0, 1, 2, 3)),
+    CameraKind("OPENCV_FISHEYE", 5, 8, 2, _FISHEYE, (0, 1, 2, 3)),
+    CameraKind("FULL_OPENCV", 6, 12, 2, _RADIAL, (0, 1, 2, 3, 4, 5, 6, 7)),
+    CameraKind("FOV", 7, 5),
+    CameraKind("SIMPLE_RADIAL_FISHEYE", 8, 4, 1, _FISHEYE, (0,)),
+    CameraKind("RADIAL_FISHEYE", 9, 5, 1, _FISHEYE, (0, 1)),
+    CameraKind("THIN_PRISM_FISHEYE", 10, 12),
+    CameraKind("RAD_TAN_THIN_PRISM_FISHEYE", 11, 16),
+    CameraKind("SIMPLE_DIVISION", 12, 4, 1),
+    CameraKind("DIVISION", 13, 5),
+    CameraKind("SIMPLE_FISHEYE", 14, 3, 1, _FISHEYE),
+    CameraKind("FISHEYE", 15, 4, 2, _FISHEYE),
+    CameraKind("EUCM", 16, 6),
+    CameraKind("EQUIRECTANGULAR", 17, 2),
+)
+KIND_OF_NUMBER = {kind.number: kind for kind in CAMERA_KINDS}
+KIND_OF_NAME = {kind.name: kind for kind in CAMERA_KINDS}
+
+
+class ColmapCamera(NamedTuple):
+    """Intrinsics: [3, 3] in px of an image of width × height, and the lens."""
+
+    width: int
+    height: int
+    K: np.ndarray
+    lens: Lens | None
+
+
+class ColmapImage(NamedTuple):
+    """A registered image: world → camera as [4] unit wxyz and [3]."""
+
+    name: str
+    camera: int
+    quat: np.ndarray
+    translation: np.ndarray
+
+
+class ColmapPoints(NamedTuple):
+    """Points sorted by their number.
+
+    Attributes:
+      ids: [M] uint64.
+      xyz: [M, 3] float64.
+      colors: [M, 3] uint8.
+      errors: [M] mean reprojection error, px; negative or NaN where unknown.
+      track_lengths: [M] int64, in how many images each point was seen.
+    """
+
+    ids: np.ndarray
+    xyz: np.ndarray
+    colors: np.ndarray
+    errors: np.ndarray
+    track_lengths: np.ndarray
+
+
+def kind_of(where: str, key: int | str) -> CameraKind:
+    """The camera model of a number or name, known to us or not supported."""
+    kind = KIND_OF_NUMBER.get(key) if isinstance(key, int) else KIND_OF_NAME.get(key)
+    if kind is None:
+        raise InputError(
+            f"{where}: camera model {key!r} is unknown; the file is damaged, or newer "
+            "than this reader: export it again, with a model of "
+            f"{', '.join(k.name for k in CAMERA_KINDS if k.lens is not None)}"
+        )
+    return kind
+
+
+def make_colmap_camera(
+    where: str, kind: CameraKind, size: tuple[int, int], params: tuple[float, ...]
+) -> ColmapCamera:
+    """Check the values of a camera and put them into our terms."""
+    if kind.lens is None:
+        raise InputError(
+            f"{where}: camera model {kind.name} is not supported; undistort the images "
+            "with `colmap image_undistorter`, or estimate the cameras anew with "
+            "`gsjax sfm`; supported: "
+            + ", ".join(k.name for k in CAMERA_KINDS if k.lens is not None)
+        )
+    if not all(1 <= side <= MAX_SIDE for side in size):
+        raise InputError(
+            f"{where}: image size {size[0]} × {size[1]}; 1 to {MAX_SIDE} px a side is "
+            "wanted; the file is damaged: export or copy it again"
+        )
+    if not all(math.isfinite(p) and abs(p) < MAX_COORDINATE for p in params):
+        raise InputError(
+            f"{where}: parameters {params}; finite numbers are wanted: estimate the "
+            "camera again"
+        )
+    cx, cy = params[kind.focals : kind.focals + 2]
+    K = intrinsic_matrix(where, (params[0], params[kind.focals - 1]), (cx, cy))
+    rest = params[kind.focals + 2 :]
+    return ColmapCamera(*size, K, _lens(kind, rest))
+
+
+def _lens(kind: CameraKind, rest: tuple[float, ...]) -> Lens | None:
+    # A fisheye of zero coefficients is equidistant, not a pinhole.
+    if not kind.lens or (kind.lens == _RADIAL and not any(rest)):
+        return None
+    coefficients = [0.0] * max(4, len(rest))
+    for at, value in zip(kind.order, rest):
+        coefficients[at] = value
+    return Lens(kind.lens, tuple(coefficients))
+
+
+def make_colmap_image(
+    where: str, name: str, camera: int, pose: tuple[float, ...]
+) -> ColmapImage:
+    """Check a pose (qw, qx, qy, qz, tx, ty, tz) and normalise its quaternion."""
+    values = np.asarray(pose, np.float64)
+    if not (np.abs(values) < MAX_COORDINATE).all():
+        raise InputError(
+            f"{where}: pose {values.tolist()} of {name!r}; finite numbers are wanted; "
+            "remove the image from the model"
+        )
+    quat = values[:4]
+    largest = np.abs(quat).max()
+    if largest < 1e-30:
+        raise InputError(
+            f"{where}: the quaternion of {name!r} is zero; a rotation is wanted; "
+            "remove the image from the model"
+        )
+    if not name:
+        raise InputError(
+            f"{where}: the name of the image is empty; remove it from the model"
+        )
+    norm = np.linalg.norm(quat)
+    # A norm that is 1 but for rounding is left alone: the pose is then the file's.
+    quat = quat if abs(norm - 1) < 1e-12 else quat / norm
+    return ColmapImage(name, camera, quat, values[4:])
+
+
+def twice(where: str, identity: int, what: str) -> InputError:
+    """The error of an id that another camera or image has."""
+    return InputError(
+        f"{where}: the id {identity} is that of another {what}; the file is damaged: "
+        "export or copy it again"
+    )
+
+
+def sorted_points(where: str, points: ColmapPoints) -> ColmapPoints:
+    """Points in the order of their ids, which are checked, as are the coordinates.
+
+    They are put in order where they are, field by field: no copy is made of all.
+    """
+    if (points.ids[1:] < points.ids[:-1]).any():
+        order = np.argsort(points.ids, kind="stable")
+        for values in points:
+            values[:] = values[order]
+    again = np.flatnonzero(points.ids[1:] == points.ids[:-1])
+    if len(again):
+        raise InputError(
+            f"{where}: {len(again)} points have an id that another one has, the first: "
+            f"{points.ids[again[:5]].tolist()}; the file is damaged: export or copy it "
+            "again"
+        )
+    wild = ~(np.abs(points.xyz) < MAX_COORDINATE).all(axis=1)
+    if wild.any():
+        raise InputError(
+            f"{where}: {wild.sum()} of {len(points.xyz)} points have coordinates that "
+            f"are no finite numbers, the first: point {points.ids[wild][:5].tolist()}; "
+            "remove them from the model"
+        )
+    return points
+
+
+def viewmat_of(quat: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """World → camera [4, 4] of a unit quaternion wxyz and a translation."""
+    w, x, y, z = quat
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    viewmat[:3, 3] = translation
+    return viewmat
+
+
+def quat_of(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternion wxyz, w ≥ 0, of a rotation matrix [3, 3]."""
+    # The eigenvector of the largest eigenvalue of a symmetric 4 × 4 matrix (Bar-Itzhack
+    # 2000): no branches, and the nearest rotation if the matrix is slightly off.
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    symmetric = np.asarray(
+        [
+            [a + e + i, h - f, c - g, d - b],
+            [h - f, a - e - i, b + d, c + g],
+            [c - g, b + d, e - a - i, f + h],
+            [d - b, c + g, f + h, i - a - e],
+        ]
+    )
+    quat = np.linalg.eigh(symmetric)[1][:, -1]
+    return -quat if quat[0] < 0 else quat

@@ -1,0 +1,239 @@
+"""Pictures in a row to files: .gif, .webp, .webm (VP9), or a folder of PNGs.
+
+OpenCV encodes all of them. A movie is written beside its name and then renamed: it
+appears complete or not at all.
+"""
+
+import os
+import re
+import secrets
+import shutil
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from gsjax.errors import InputError
+from gsjax.io import images
+from gsjax.runtime.files import make_folder, refuse_existing, write_file, writing
+
+MOVIE_KINDS = (".gif", ".webp", ".webm", ".png")
+
+
+def check_movie(path: Path, *, overwrite: bool = False) -> None:
+    """Whether `write_movie` would take the name: to ask before rendering for it.
+
+    Raises:
+      InputError: on an unknown suffix, or if the movie exists.
+    """
+    if path.suffix.lower() not in (*MOVIE_KINDS, ""):
+        raise InputError(
+            f"{path}: {path.suffix} is no kind of movie; {', '.join(MOVIE_KINDS[:3])}, "
+            "or .png (or no suffix) for a folder of PNGs is wanted"
+        )
+    folder = _png_folder(path)
+    if folder is None:
+        refuse_existing([path], overwrite, "another name with -o")
+    elif folder.exists():
+        _refuse_folder(folder, overwrite)
+
+
+def write_movie(
+    path: Path,
+    frames: Iterable[np.ndarray],
+    *,
+    fps: float = 24.0,
+    overwrite: bool = False,
+) -> int:
+    """Write frames, as the suffix says; returns how many there were.
+
+    Args:
+      path: .gif, .webp or .webm; ``name.png``, or a name without suffix, is the
+        folder ``name`` with frame_0001.png and so on. Folders above are created.
+      frames: [H, W, 3] RGB uint8, all of one size, taken one by one. For .webm, whose
+        pixels come in twos, an odd last column or row is repeated.
+      fps: frames per second; folders have none. A GIF has times in 1/100 s, and at
+        most 50 per second, which is what browsers show.
+      overwrite: whether a movie that exists may be replaced; of a folder, only one
+        with nothing but such frames in it.
+
+    Raises:
+      InputError: on an unknown suffix, a movie that exists, no frames, frames of
+        another kind, or if the file cannot be written.
+      MissingExtraError: if OpenCV is absent.
+    """
+    check_movie(path, overwrite=overwrite)
+    if not 0.1 <= fps <= 1000:
+        raise InputError(f"fps is {fps:g}; 0.1 to 1000 frames per second are wanted")
+    images.opencv()
+    checked = _checked(frames)
+    first = next(checked, None)
+    if first is None:
+        raise InputError(f"{path}: there are no frames to write")
+    checked = chain([first], checked)
+    folder, suffix = _png_folder(path), path.suffix.lower()
+    make_folder((folder or path).parent)
+    if folder is not None:
+        return _write_folder(folder, checked)
+    if suffix == ".webm":
+        return _write_vp9(path, checked, fps)
+    pictures = list(checked)
+    write_file(path, encode_animation(suffix, pictures, fps))
+    return len(pictures)
+
+
+def played_rate(suffix: str, fps: float) -> float:
+    """Frames per second at which a movie of that suffix is played, if ``fps`` are
+    asked for: a GIF has no more than 50."""
+    return min(fps, 50.0) if suffix == ".gif" else fps
+
+
+def encode_animation(suffix: str, frames: Iterable[np.ndarray], fps: float) -> bytes:
+    """An animation that loops for ever, of RGB uint8 frames of one size.
+
+    Args:
+      suffix: ".gif" or ".webp".
+      frames: [H, W, 3] each.
+      fps: frames per second.
+
+    Raises:
+      InputError: if OpenCV cannot encode it.
+    """
+    cv2 = images.opencv()
+    animation = cv2.Animation()
+    animation.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
+    # Rounded at the ends of frames, so that the whole takes as long as it should.
+    unit, rate = 10 if suffix == ".gif" else 1, played_rate(suffix, fps)
+    ends = np.rint(np.arange(len(animation.frames) + 1) * 1000 / (rate * unit)) * unit
+    animation.durations = np.diff(ends).astype(int).tolist()
+    if suffix == ".gif":
+        # Of the settings tried on a turntable the one of the best PSNR: 34 dB, 25 by
+        # default (without dither, or of 6 bits of colour).
+        settings = [cv2.IMWRITE_GIF_QUALITY, 8, cv2.IMWRITE_GIF_DITHER, 2]
+    else:
+        settings = [cv2.IMWRITE_WEBP_QUALITY, 90]
+    done, data = cv2.imencodeanimation(suffix, animation, settings)
+    if not done:
+        raise InputError(f"OpenCV cannot encode the animation as {suffix}")
+    return data.tobytes()
+
+
+def _png_folder(path: Path) -> Path | None:
+    return path.with_suffix("") if path.suffix.lower() in ("", ".png") else None
+
+
+def _checked(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    shape = None
+    for index, frame in enumerate(frames):
+        shape = frame.shape if shape is None else shape
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+            raise InputError(
+                f"frame {index} is {frame.shape} {frame.dtype}; [H, W, 3] uint8 is "
+                "wanted"
+            )
+        if frame.shape != shape or 0 in shape:
+            raise InputError(
+                f"frame {index} is {frame.shape}, the first is {shape}; one size, and "
+                "not an empty one, is wanted"
+            )
+        yield frame
+
+
+def _refuse_folder(folder: Path, overwrite: bool) -> None:
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is a file; a folder of frames is to be there")
+    names = [entry.name for entry in folder.iterdir()]
+    other = [name for name in names if not re.fullmatch(r"frame_\d+\.png", name)]
+    if other:
+        raise InputError(
+            f"{folder}: has files that are no frames ({other[0]}); pass a new folder"
+        )
+    if names and not overwrite:
+        raise InputError(
+            f"{folder}: has {len(names)} frames; pass --overwrite, or another name"
+        )
+
+
+def _write_folder(folder: Path, frames: Iterable[np.ndarray]) -> int:
+    """Into a folder beside it, which then takes its place."""
+    temporary = _temporary(folder)
+    count = 0
+    try:
+        make_folder(temporary)
+        for count, frame in enumerate(frames, start=1):
+            data = images.encode_png(frame)
+            write_file(temporary / f"frame_{count:04d}.png", data)
+        with writing(folder):
+            if folder.exists():  # nothing but frames, which may be replaced
+                shutil.rmtree(folder)
+            os.replace(temporary, folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    return count
+
+
+def _write_vp9(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
+    cv2 = images.opencv()
+    temporary = _temporary(path)
+    writer, count = None, 0
+    try:
+        for frame in frames:
+            height, width = frame.shape[:2]
+            even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
+            writer = writer or _vp9_writer(temporary, even, fps)
+            writer.write(np.ascontiguousarray(even[..., ::-1]))
+            count += 1
+        if writer is not None:
+            writer.release()
+        # The encoder does not report a full disk; a file cut short has no duration.
+        written = cv2.VideoCapture(str(temporary)).get(cv2.CAP_PROP_FRAME_COUNT)
+        if abs(written - count) > 1:
+            raise InputError(
+                f"{path}: {written:g} of {count} frames could be written; check the "
+                "space that is left"
+            )
+        with writing(path):
+            os.replace(temporary, path)
+    finally:
+        if writer is not None:
+            writer.release()
+        temporary.unlink(missing_ok=True)
+    return count
+
+
+def _vp9_writer(path: Path, frame: np.ndarray, fps: float):
+    cv2 = images.opencv()
+    size, code = (frame.shape[1], frame.shape[0]), cv2.VideoWriter.fourcc(*"VP90")
+    with _muted_stderr():  # it complains of a code that WebM does without
+        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, fps, size)
+    if not writer.isOpened():
+        raise InputError(
+            f"{path.parent}: this OpenCV cannot write VP9 there; check permissions, or "
+            "use the suffix .webp"
+        )
+    return writer
+
+
+def _temporary(path: Path) -> Path:
+    """A name beside ``path`` with its suffix, which tells OpenCV the container; from
+    the root, as FFmpeg takes a relative "10:30.webm" for an address.
+    """
+    name = f".gsjax-{secrets.token_hex(6)}{path.suffix.lower()}"
+    return path.absolute().with_name(name)
+
+
+@contextmanager
+def _muted_stderr() -> Iterator[None]:
+    """Nothing that C code prints to the standard error meanwhile is seen."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as null:
+            os.dup2(null.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

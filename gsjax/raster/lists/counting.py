@@ -1,0 +1,80 @@
+"""Sums of counts, the lists that they stand for, and what is looked up there. No
+derivative is taken here.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from gsjax.raster.types import Array
+from gsjax.runtime import loops
+
+# A total above this is reported as 2^31 - 1: int32 sums must not wrap.
+COUNT_LIMIT = 2**30
+
+
+def total_count(counts: Array) -> tuple[Array, Array]:
+    """Sum of int32 counts, saturating: (total, whether it is below `COUNT_LIMIT`)."""
+    safe = jnp.sum(counts.astype(jnp.float32)) < COUNT_LIMIT
+    total = jnp.sum(jnp.where(safe, counts, 0), dtype=jnp.int32)
+    return jnp.where(safe, total, 2**31 - 1), safe
+
+
+def cumulative_sum(counts: Array) -> Array:
+    """Inclusive sums [n] int32 of counts [n]."""
+    if jax.default_backend() == "cpu":
+        return loops.cumulative_sum(counts.astype(jnp.int32))
+    return jnp.cumsum(counts, dtype=jnp.int32)
+
+
+def segment_ids(ends: Array, room: int, start: Array | int = 0) -> Array:
+    """Whose item each is of ``room`` items from item ``start`` on.
+
+    Args:
+      ends: [n] int32, `cumulative_sum` of how many items each has.
+      room: how many to unroll.
+      start: [] the first of them.
+
+    Returns:
+      [room] int32, rising; n past the last.
+    """
+    place = jnp.maximum(ends - start, 0)
+    if jax.default_backend() == "cpu":
+        passed = jnp.zeros(room, jnp.int32).at[place].add(1, mode="drop")
+        return cumulative_sum(passed)
+    # Here whoever writes to one place waits for the others: so each owner that has
+    # items is put where they begin, one to a place. It is the last that ends there.
+    following = jnp.append(place[1:], jnp.int32(2**31 - 1))
+    place = jnp.where(place < following, place, room)
+    owner = lax.iota(jnp.int32, ends.shape[0]) + 1
+    passed = jnp.zeros(room, jnp.int32).at[place].set(owner, mode="drop")
+    return lax.cummax(passed)
+
+
+def compact_indices(chosen: Array, room: int) -> tuple[Array, Array]:
+    """Indices of what is chosen, together at the front.
+
+    Args:
+      chosen: [n] bool.
+      room: for how many; of more, the first are kept.
+
+    Returns:
+      index: [room] int32, rising; n past the last.
+      count: [] int32 of what is chosen, not limited to ``room``.
+    """
+    size = chosen.shape[0]
+    if jax.default_backend() == "cpu":
+        whole = jnp.pad(chosen, (0, -size % loops.STRETCH))
+        some = jnp.any(whole.reshape(-1, loops.STRETCH), axis=1)
+        past = jnp.full(room + 1, size, jnp.int32)
+        index, count = loops.places(chosen, some, past)
+        return index[:room], count
+    place = cumulative_sum(chosen)
+    target = jnp.where(chosen, place - 1, room)
+    index = jnp.full(room, size, jnp.int32)
+    return index.at[target].set(lax.iota(jnp.int32, size), mode="drop"), place[-1]
+
+
+def take(values: Array, index: Array) -> Array:
+    """``values`` at ``index``, 0 past the last."""
+    return values.at[index].get(mode="fill", fill_value=0)

@@ -1,0 +1,346 @@
+"""Photographs of a small still life, by casting rays: data to train on, from nothing.
+
+Nothing here knows of Gaussians: hits are in closed form (a torus is marched), light is
+a sun with a soft shadow and a sky, and no surface looks different from elsewhere, so
+the photographs are a fair task for a trainer. Right-handed, z up, floor at z = 0.
+
+Axis legend: R rays or points ([3, R] arrays), H W image, M points, F cameras.
+"""
+
+from functools import cache
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from gsjax.cameras.camera import look_at, make_camera
+from gsjax.data.transforms import CameraEntry
+from gsjax.data.transforms_writer import transforms_json
+from gsjax.errors import InputError
+from gsjax.io import images
+from gsjax.runtime.files import make_folder, refuse_existing, write_file
+from gsjax.synthetic import albedo
+from gsjax.synthetic.shapes import Solid, box, disc, dot, sphere, torus
+
+# What trainers assume where nothing is.
+BACKGROUND = (0.0, 0.0, 0.0)
+TARGET = np.asarray([0.0, 0.0, 0.10])
+GROUND_RADIUS = 2.1
+
+_SUN = np.asarray([0.52, -0.40, 0.76]) / np.linalg.norm([0.52, -0.40, 0.76])
+_PENUMBRA = 0.12  # tangent of the sun's apparent diameter, as wide as looks soft
+_SHADOW_STEPS, _LEAST_STEP, _MOST_STEP = 24, 0.025, 0.5
+_CHUNK = 1 << 16  # rays at a time: arrays then stay in the cache
+
+
+class DemoDatasetSettings(NamedTuple):
+    """How many photographs, how large, and what comes with them."""
+
+    photos: int = 40
+    width: int = 320
+    height: int = 240
+    samples: int = 2
+    points: int = 4000
+    seed: int = 0
+    background: tuple[float, float, float] = BACKGROUND
+
+
+def cast(
+    viewmat, K, width: int, height: int, samples: int = 3, *, background=BACKGROUND
+) -> tuple[np.ndarray, np.ndarray]:
+    """A photograph of the still life, and its depth.
+
+    Args:
+      viewmat: [4, 4] world → camera; the camera stands above the floor and outside
+        the solids.
+      K: [3, 3] intrinsics in px, pixel centres at + 0.5.
+      width, height: size in px.
+      samples: a pixel is the mean of samples × samples rays on a regular grid.
+      background: RGB where there is nothing.
+
+    Returns:
+      rgb [H, W, 3] float32 in [0, 1], and depth [H, W] float64: camera z at the
+      centre of each pixel, 0 where nothing is.
+
+    Raises:
+      InputError: if ``samples`` is below 1.
+    """
+    rgb = _picture(viewmat, K, (width, height), samples, background)
+    u, v = (a.ravel() + 0.5 for a in np.meshgrid(np.arange(width), np.arange(height)))
+    depth, _ = _first_hits(*_rays(viewmat, K, u, v))
+    return rgb, np.where(np.isfinite(depth), depth, 0).reshape(height, width)
+
+
+def surface_points(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Points as structure from motion would give: seen from the orbit, a little off.
+
+    Args:
+      count: how many.
+      seed: of the pixels that are looked through and of the noise.
+
+    Returns:
+      points [M, 3] float64 with noise of 0.004 in each coordinate, and their shaded
+      colours [M, 3] uint8.
+    """
+    rng = np.random.default_rng(seed)
+    viewmats, K = demo_cameras(24, 1, 1)
+    points, colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    while len(points) < count:
+        share = -(-count // len(viewmats))
+        for viewmat in viewmats:
+            origin, directions = _rays(viewmat, K, *rng.uniform(size=(2, share)))
+            t, which = _first_hits(origin, directions)
+            hit = np.isfinite(t)
+            places = origin[:, None] + t[hit] * directions[:, hit]
+            points = np.concatenate([points, places.T])
+            shaded = images.to_8_bit(_shade(places, which[hit]).T)
+            colors = np.concatenate([colors, shaded])
+    chosen = rng.permutation(len(points))[:count]
+    points = points[chosen] + rng.normal(0, 0.004, (count, 3))
+    return points, colors[chosen]
+
+
+def demo_cameras(
+    count: int, width: int, height: int
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Cameras on two rings about the still life, the lower one first.
+
+    Args:
+      count: how many; the lower ring has half of them, or one more.
+      width, height: image size in px.
+
+    Returns:
+      viewmats [4, 4] (world → camera), and the K [3, 3] that they share.
+    """
+    focal = 0.5 * min(width, height) / np.tan(np.radians(41) / 2)
+    K = np.asarray([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    lower = -(-count // 2)
+    viewmats = []
+    for index in range(count):
+        ring, size = (0, lower) if index < lower else (1, count - lower)
+        turn = 2 * np.pi * ((index - ring * lower + 0.5 * ring) / size) - 0.9
+        elevation, radius = np.radians((23.0, 46.0)[ring]), (5.2, 5.8)[ring]
+        flat = np.cos(elevation)
+        direction = flat * np.cos(turn), flat * np.sin(turn), np.sin(elevation)
+        viewmats.append(look_at(TARGET + radius * np.asarray(direction), TARGET))
+    return viewmats, K
+
+
+def write_demo_dataset(
+    folder: str | PathLike[str],
+    settings: DemoDatasetSettings | None = None,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write `images/photo_000.png` …, `transforms.json` and `points.ply`.
+
+    Args:
+      folder: created if missing.
+      settings: how much of it.
+      overwrite: whether files that exist may be replaced.
+
+    Raises:
+      InputError: if a file exists and ``overwrite`` is not set, or cannot be written.
+      MissingExtraError: if OpenCV is absent.
+    """
+    folder, settings = Path(folder), settings or DemoDatasetSettings()
+    size = settings.width, settings.height
+    viewmats, K = demo_cameras(settings.photos, *size)
+    names = [f"images/photo_{index:03d}" for index in range(len(viewmats))]
+    photos = [folder / f"{name}.png" for name in names]
+    cameras, points = folder / "transforms.json", folder / "points.ply"
+    refuse_existing([*photos, cameras, points], overwrite)
+    images.opencv()
+    make_folder(folder / "images")
+    entries = []
+    for name, photo, viewmat in zip(names, photos, viewmats):
+        rgb = _picture(viewmat, K, size, settings.samples, settings.background)
+        write_file(photo, images.encode_png(images.to_8_bit(rgb)))
+        camera = make_camera(viewmat=viewmat, K=K, width=size[0], height=size[1])
+        entries.append(CameraEntry(name, camera))
+    cloud = _points_ply(*surface_points(settings.points, settings.seed))
+    write_file(points, cloud)
+    text = transforms_json(entries, ply_file_path=points.name)
+    write_file(cameras, text.encode())
+
+
+@cache
+def solids() -> tuple[Solid, ...]:
+    """The still life; the floor comes first."""
+    flat = np.eye(3)
+
+    def turned(degrees: float) -> np.ndarray:
+        cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        return np.asarray([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+
+    upright = turned(35) @ np.asarray([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    tilted = np.asarray([[0.8, 0, 0.6], [0, 1.0, 0], [-0.6, 0, 0.8]])
+
+    def put(shape, place, axes, paint):
+        return Solid(shape, np.asarray(place, float), axes, paint)
+
+    half, major, minor = 0.46, 0.46, 0.17
+    return (
+        put(disc(GROUND_RADIUS), (0, 0, 0), flat, albedo.ground(GROUND_RADIUS)),
+        put(sphere(0.56), (-0.85, -0.35, 0.56), tilted, albedo.bands),
+        put(box((half, half, half)), (0.1, 0.9, half), turned(24), albedo.crate(half)),
+        put(
+            torus(major, minor),
+            (0.72, -0.62, major + minor),
+            upright,
+            albedo.helix(major),
+        ),
+        put(sphere(0.24), (-0.12, -1.22, 0.24), turned(70), albedo.rings),
+    )
+
+
+def _picture(viewmat, K, size: tuple[int, int], samples: int, background):
+    """[H, W, 3] float32: means over samples² rays a pixel."""
+    if samples < 1:
+        raise InputError(f"samples is {samples}; at least 1 ray a pixel is wanted")
+    width, height = size
+    u = (np.arange(width * samples) + 0.5) / samples
+    rows = max(1, _CHUNK // (width * samples * samples))
+    picture = np.empty((height, width, 3), np.float32)
+    for top in range(0, height, rows):
+        bottom = min(top + rows, height)
+        v = (np.arange(top * samples, bottom * samples) + 0.5) / samples
+        grid = (a.ravel() for a in np.meshgrid(u, v))
+        # float32 is half the time, and exact to 1e-6 of the scene.
+        origin, directions = (a.astype(np.float32) for a in _rays(viewmat, K, *grid))
+        rgb = _radiance(origin, directions, background)
+        rgb = rgb.reshape(3, bottom - top, samples, width, samples).mean(axis=(2, 4))
+        picture[top:bottom] = np.moveaxis(rgb, 0, -1)
+    return picture
+
+
+def _rays(viewmat, K, u: np.ndarray, v: np.ndarray):
+    """Origin [3] and directions [3, R] through pixels (u, v), with camera z 1.
+
+    So the parameter of a hit is its depth.
+    """
+    viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
+    x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+    rotation = viewmat[:3, :3]
+    directions = rotation.T @ np.stack([x, y, np.ones_like(x)])
+    return -rotation.T @ viewmat[:3, 3], directions
+
+
+def _first_hits(origin: np.ndarray, directions: np.ndarray):
+    """(t [R], index [R]) of the first solid that each ray meets; inf where none."""
+    first = np.full(directions.shape[1], np.inf, directions.dtype)
+    which = np.zeros(directions.shape[1], int)
+    square = dot(directions, directions)
+    for index, solid in enumerate(solids()):
+        centre, axes = (a.astype(origin.dtype) for a in (solid.centre, solid.axes))
+        offset, reach = origin - centre, solid.shape.reach
+        beyond = offset @ offset - reach * reach
+        middle = offset @ directions
+        rays = np.flatnonzero((middle * middle >= square * beyond) & (middle < 0))
+        t = solid.shape.hit(axes.T @ offset, axes.T @ directions.take(rays, axis=1))
+        nearer = t < first[rays]
+        first[rays[nearer]], which[rays[nearer]] = t[nearer], index
+    return first, which
+
+
+def _radiance(origin: np.ndarray, directions: np.ndarray, background) -> np.ndarray:
+    rgb = np.asarray(background, directions.dtype)[:, None]
+    rgb = np.tile(rgb, directions.shape[1])
+    t, which = _first_hits(origin, directions)
+    hit = np.flatnonzero(np.isfinite(t))
+    points = origin[:, None] + t[hit] * directions.take(hit, axis=1)
+    rgb[:, hit] = _shade(points, which[hit])
+    return rgb
+
+
+def _shade(points: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """Colours [3, R] in [0, 1] of points on the solids ``which`` [R]."""
+    albedo, normals = np.empty_like(points), np.empty_like(points)
+    for index, solid in enumerate(solids()):
+        mine = np.flatnonzero(which == index)
+        local = solid.local(points.take(mine, axis=1))
+        albedo[:, mine] = solid.paint(local)
+        normals[:, mine] = solid.axes.astype(local.dtype) @ solid.shape.normal(local)
+    facing = np.maximum(_SUN.astype(normals.dtype) @ normals, 0)
+    sun, sky = facing, 0.66 + 0.34 * normals[2]
+    for index, solid in enumerate(solids()[1:], start=1):
+        other = which != index
+        asked = (facing > 0) & (other if solid.shape.convex else True)
+        sun = sun * _sunlit(solid, points, normals, asked)
+        sky = sky * _open_sky(solid, points, normals, other)
+    # The floor hides the sky from what stands on it.
+    sky *= np.where(which > 0, 0.55 + 0.45 * np.minimum(2 * points[2], 1), 1)
+    warm, cool = np.asarray([(0.82, 0.79, 0.72), (0.50, 0.54, 0.59)], sun.dtype)
+    light = np.outer(warm, sun) + np.outer(cool, sky)
+    return np.minimum(albedo * light, 1)
+
+
+def _sunlit(solid: Solid, points, normals, asked: np.ndarray) -> np.ndarray:
+    """[R] in [0, 1]: how much of the sun passes by ``solid``; 1 where not ``asked``.
+
+    The least angle by which a ray to the sun clears it, from marching along the ray,
+    with the closest approach between two steps estimated (S. Aaltonen, GDC 2018).
+    """
+    lit = np.ones_like(points[0])
+    offset = points - solid.centre.astype(points.dtype)[:, None]
+    ahead = -(
+        _SUN.astype(points.dtype) @ offset
+    )  # along the ray to where it is nearest the centre
+    reach = solid.shape.reach
+    wide = reach + _PENUMBRA * np.maximum(ahead + reach, 0)
+    aside = dot(offset, offset) - ahead * ahead
+    rays = np.flatnonzero(asked & (ahead > -reach) & (aside < wide * wide))
+    sun = (solid.axes.T @ _SUN).astype(points.dtype)[:, None]
+    start = solid.local((points + 1e-3 * normals).take(rays, axis=1))
+    end = ahead[rays] + reach
+    t = np.maximum(ahead[rays] - 1.5 * reach, 0.02)
+    least, step = np.ones_like(t), np.zeros_like(t)
+    for _ in range(_SHADOW_STEPS):
+        gap = solid.shape.distance(start + t * sun)
+        # Had the last step the length of the gap there, then two balls are known to
+        # be free, and nearest to the ray is where they meet, ``back`` from here.
+        back = np.minimum(gap * gap / (2 * np.maximum(step, 1e-9)), gap)
+        back = back * ((back < step) & (step > _LEAST_STEP) & (step < _MOST_STEP))
+        closest = np.sqrt(gap * gap - back * back) * (gap > 0)
+        least = np.minimum(least, closest / (_PENUMBRA * (t - back)))
+        lit[rays] = least * least * (3 - 2 * least)
+        step = np.minimum(np.maximum(gap, _LEAST_STEP), _MOST_STEP)
+        t = t + step
+        going = np.flatnonzero((least > 1e-3) & (t < end))
+        if len(going) < 0.7 * len(rays):  # copying fewer costs more than it saves
+            rays, start, end = rays[going], start.take(going, axis=1), end[going]
+            step, t, least = step[going], t[going], least[going]
+    return lit
+
+
+def _open_sky(solid: Solid, points, normals, other: np.ndarray) -> np.ndarray:
+    """[R] in [0, 1]: how little ``solid`` hides of the sky (a heuristic).
+
+    By how much nearer than free space it is to a point above the surface.
+    """
+    height = 0.45
+    above = points + height * normals
+    offset = above - solid.centre.astype(points.dtype)[:, None]
+    wide = solid.shape.reach + height
+    near = np.flatnonzero(other & (dot(offset, offset) < wide * wide))
+    gap = solid.shape.distance(solid.local(above.take(near, axis=1)))
+    sky = np.ones_like(points[0])
+    sky[near] = 1 - 0.6 * np.clip(1 - gap / height, 0, 1)
+    return sky
+
+
+def _points_ply(points: np.ndarray, colors: np.ndarray) -> bytes:
+    """The PLY of a point cloud, as nerfstudio writes it: xyz, red green blue."""
+    kinds = [(name, "<f4") for name in "xyz"]
+    kinds += [(name, "u1") for name in ("red", "green", "blue")]
+    rows = np.empty(len(points), kinds)
+    for name, column in zip("xyz", points.T):
+        rows[name] = column
+    for name, column in zip(("red", "green", "blue"), colors.T):
+        rows[name] = column
+    names = {"<f4": "float", "u1": "uchar"}
+    properties = [f"property {names[kind]} {name}" for name, kind in kinds]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [*properties, "end_header", ""]
+    return "\n".join(header).encode() + rows.tobytes()

@@ -1,0 +1,465 @@
+"""Adaptive density control: who gets a slot, and what becomes of whom.
+
+The size of all scenes here is one, so that each program is compiled once.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import gsjax
+from gsjax.densify.adaptive import AdaptiveSettings, AdaptiveStats, adaptive
+from gsjax.densify.mcmc import McmcSettings, mcmc
+from gsjax.densify.slots import assign, copy_into
+from gsjax.densify.types import Observation, apply_edit
+from gsjax.errors import InputError
+from gsjax.math.rotations import covariance
+from gsjax.train.optimiser import init_moments
+
+SLOTS, EXTENT = 24, 10.0
+SETTINGS = AdaptiveSettings(start=0, stop=1000, every=10, reset_every=0)
+GARBAGE = (np.nan, np.inf, -1e30)
+
+jitted_assign = jax.jit(assign)
+
+
+@st.composite
+def requests(draw):
+    """Candidates, priorities (with ties), free slots and a limit."""
+    flags = st.lists(st.booleans(), min_size=SLOTS, max_size=SLOTS)
+    numbers = st.sampled_from([0.0, 1.0, 2.5, -1.0, np.inf, -np.inf])
+    priority = st.lists(numbers, min_size=SLOTS, max_size=SLOTS)
+    limit = st.integers(0, SLOTS + 3)
+    return tuple(np.asarray(draw(s)) for s in (flags, priority, flags, limit))
+
+
+@settings(max_examples=150, deadline=None)
+@given(requests())
+def test_slots_go_to_the_best(request):
+    candidates, priority, free, limit = request
+    source, chosen = (np.asarray(a) for a in jitted_assign(*request))
+    places = np.flatnonzero(candidates)
+    ranked = places[np.argsort(-priority[places], kind="stable")]
+    count = min(len(ranked), free.sum(), limit)
+    got = np.flatnonzero(source < SLOTS)
+    assert free[got].all()
+    np.testing.assert_array_equal(got, np.flatnonzero(free)[:count])
+    np.testing.assert_array_equal(source[got], ranked[:count])
+    assert (source[source >= SLOTS] == SLOTS).all()
+    np.testing.assert_array_equal(np.flatnonzero(chosen), np.sort(ranked[:count]))
+
+
+def test_a_candidate_without_a_priority_goes_last_but_before_none():
+    candidates = np.asarray([False, True, False, True])
+    priority = np.asarray([9.0, np.nan, 9.0, 1.0])
+    free = np.asarray([True, False, True, False])
+    source, chosen = assign(candidates, priority, free, 4)
+    assert source.tolist() == [3, 4, 1, 4]
+    assert chosen.tolist() == [False, True, False, True]
+
+
+def scene_with(seed=0, count=16, scales=0.05, opacities=0.5, garbage=0.0):
+    """``count`` Gaussians in SLOTS slots at random places; garbage in the others."""
+    rng = np.random.default_rng(seed)
+    live = np.sort(rng.permutation(SLOTS)[:count])
+    active = np.isin(np.arange(SLOTS), live)
+    opacities = np.broadcast_to(opacities, SLOTS)
+    fields = {
+        "means": rng.normal(size=(SLOTS, 3)),
+        "quats": rng.normal(size=(SLOTS, 4)),
+        "log_scales": np.log(np.broadcast_to(scales, (SLOTS, 3)))
+        + 0.1 * rng.normal(size=(SLOTS, 3)),
+        "logit_opacities": np.log(opacities) - np.log1p(-opacities),
+        "sh": rng.normal(size=(SLOTS, 4, 3)),
+    }
+    for value in fields.values():
+        value[~active] = garbage
+    made = gsjax.make_gaussians(**fields)
+    return made.replace(active=jnp.asarray(active)), live
+
+
+def stats_with(hot, value=1e-3):
+    """As if each of ``hot`` had been seen in three views, at this gradient."""
+    gradient = np.zeros(SLOTS)
+    gradient[np.asarray(hot, int)] = 3 * np.broadcast_to(value, len(hot))
+    return AdaptiveStats(
+        *map(jnp.asarray, (gradient, np.full(SLOTS, 3.0), np.zeros(SLOTS)))
+    )
+
+
+def planned(config, key, step, gaussians, stats):
+    return adaptive(config, EXTENT).plan(key, step, gaussians, stats)[0]
+
+
+jitted_planned = jax.jit(planned, static_argnums=0)
+
+
+def plan(gaussians, stats, step=10, seed=0, **changes):
+    config = AdaptiveSettings(**{**vars(SETTINGS), **changes})
+    return planned(config, jax.random.key(seed), jnp.int32(step), gaussians, stats)
+
+
+def rows(params, slots):
+    return jax.tree.map(lambda a: np.asarray(a)[np.asarray(slots)], params)
+
+
+def assert_rows_equal(first, slots, second, others, leave_out=()):
+    for name, a in vars(rows(first, slots)).items():
+        if name not in leave_out:
+            np.testing.assert_array_equal(a, getattr(rows(second, others), name), name)
+
+
+def new_slots(edit, gaussians):
+    return np.flatnonzero(np.asarray(edit.active) & ~np.asarray(gaussians.active))
+
+
+def test_small_ones_are_cloned():
+    gaussians, live = scene_with()
+    hot = live[[2, 5, 6]]
+    edit = plan(gaussians, stats_with(hot, [2e-3, 1e-3, 3e-3]))
+    born = new_slots(edit, gaussians)
+    free = np.flatnonzero(~np.asarray(gaussians.active))
+    np.testing.assert_array_equal(born, free[:3])
+    assert_rows_equal(edit.params, live, gaussians.params, live)
+    assert_rows_equal(edit.params, born, gaussians.params, hot[[2, 0, 1]])
+    np.testing.assert_array_equal(np.flatnonzero(edit.cleared), np.sort(free))
+    assert edit.wanted == 19
+    assert not edit.opacities_reset
+
+
+def test_large_ones_are_split():
+    gaussians, live = scene_with(scales=0.3)
+    hot = live[4]
+    cov = np.asarray(
+        covariance(gaussians.params.quats, jnp.exp(gaussians.params.log_scales))
+    )[hot]
+    shifts = []
+    for seed in range(300):
+        given = jax.random.key(seed), jnp.int32(10), gaussians, stats_with([hot])
+        edit = jitted_planned(SETTINGS, *given)
+        (born,) = new_slots(edit, gaussians)
+        pair = [hot, born]
+        found, parent = rows(edit.params, pair), rows(gaussians.params, [hot, hot])
+        shifts += list(found.means - parent.means)
+    shifts = np.asarray(shifts)
+    np.testing.assert_allclose(
+        found.log_scales, parent.log_scales - np.log(1.6), rtol=1e-12
+    )
+    same = ("quats", "logit_opacities", "sh")
+    for name in same:
+        np.testing.assert_array_equal(getattr(found, name), getattr(parent, name))
+    assert edit.cleared[hot]
+    assert edit.cleared[born]
+    others = live[live != hot]
+    assert_rows_equal(edit.params, others, gaussians.params, others)
+    assert not np.asarray(edit.cleared)[others].any()
+    assert edit.wanted == 17
+    # Drawn from the parent: mean there, and its covariance; 600 samples.
+    whitened = shifts @ np.linalg.inv(np.linalg.cholesky(cov)).T
+    assert np.abs(whitened.mean(0)).max() < 4 / np.sqrt(600)
+    assert np.abs(np.cov(whitened.T) - np.eye(3)).max() < 4 * np.sqrt(2 / 600)
+    assert (shifts[::2] != shifts[1::2]).all()  # the two go different ways
+
+
+def test_the_threshold_is_of_the_mean_over_views():
+    gaussians, live = scene_with()
+    at, below = live[:2]
+    stats = stats_with([at, below], [2e-4 * (1 + 1e-9), 2e-4 * (1 - 1e-9)])
+    edit = plan(gaussians, stats)
+    assert edit.wanted == 17
+    (born,) = new_slots(edit, gaussians)
+    assert_rows_equal(edit.params, [born], gaussians.params, [at])
+    unseen = AdaptiveStats(stats.gradient * 0, stats.views * 0, stats.radius)
+    assert plan(gaussians, unseen).wanted == 16
+
+
+@pytest.mark.parametrize("garbage", GARBAGE)
+def test_transparent_ones_go(garbage):
+    opacities = np.full(SLOTS, 0.5)
+    opacities[::3] = 0.0049
+    gaussians, live = scene_with(opacities=opacities, garbage=garbage)
+    gone = live[live % 3 == 0]
+    edit = plan(gaussians, stats_with(gone))  # hot as they may be
+    kept = live[live % 3 != 0]
+    np.testing.assert_array_equal(np.flatnonzero(edit.active), kept)
+    assert_rows_equal(edit.params, kept, gaussians.params, kept)
+    assert np.asarray(edit.cleared)[gone].all()
+    assert edit.wanted == len(kept)
+    assert 3 < len(kept) < 16
+
+
+def test_one_that_is_no_number_goes():
+    gaussians, live = scene_with()
+    logits = gaussians.params.logit_opacities.at[live[3]].set(np.nan)
+    broken = gaussians.replace(params=gaussians.params.replace(logit_opacities=logits))
+    edit = plan(broken, stats_with(live[[3]], np.nan))
+    np.testing.assert_array_equal(np.flatnonzero(edit.active), np.delete(live, 3))
+
+
+def test_large_ones_go_after_the_first_reset():
+    scales = np.full((SLOTS, 1), 0.05)
+    scales[::4] = 3.0
+    gaussians, live = scene_with(scales=scales)
+    large = live[live % 4 == 0]
+    assert 2 < len(large) < 10
+    for step, every, expected in ((100, 100, 0), (110, 100, 1), (500, 0, 0)):
+        edit = plan(gaussians, stats_with([]), step, reset_every=every)
+        assert edit.wanted == 16 - expected * len(large)
+        assert np.asarray(edit.active)[large].all() == (not expected)
+    wide = stats_with([])._replace(radius=jnp.where(jnp.arange(SLOTS) == live[1], 1, 0))
+    kwargs = {"prune_scale": 100.0, "prune_radius": 0.5, "reset_every": 100}
+    assert plan(gaussians, wide, 100, **kwargs).wanted == 16
+    edit = plan(gaussians, wide, 110, **kwargs)
+    np.testing.assert_array_equal(np.flatnonzero(edit.active), np.delete(live, 1))
+
+
+@pytest.mark.parametrize("by", ["scale", "radius"])
+def test_what_a_split_makes_small_enough_is_split(by):
+    """Growth comes before pruning (Kerbl et al.'s code): there is no hole after it."""
+    limit = 0.5
+    sizes = np.full(SLOTS, 0.2)
+    gaussians, live = scene_with()
+    hot, cold, huge = live[:3]
+    sizes[[hot, cold, huge]] = 1.2 * limit, 1.2 * limit, 2 * limit
+    stats, kwargs = stats_with([hot, huge]), {"reset_every": 100}
+    if by == "scale":
+        kwargs |= {"prune_scale": limit / EXTENT}
+        params = gaussians.params.replace(
+            log_scales=jnp.log(sizes)[:, None].repeat(3, 1)
+        )
+        gaussians = gaussians.replace(params=params)
+    else:
+        kwargs |= {"prune_scale": 100.0, "prune_radius": limit, "clone_below": 1e-6}
+        stats = stats._replace(radius=jnp.asarray(sizes))
+    edit = plan(gaussians, stats, 110, **kwargs)
+    born = new_slots(edit, gaussians)
+    wanted = gaussians.params.log_scales[hot] - np.log(SETTINGS.shrink)
+    assert len(born) == 1
+    for slot in (hot, born[0]):
+        assert edit.active[slot]
+        np.testing.assert_allclose(edit.params.log_scales[slot], wanted, rtol=1e-12)
+    assert not edit.active[cold]
+    assert not edit.active[huge]
+    # Without room for a split it is as large as it is.
+    full = plan(gaussians, stats, 110, max_gaussians=14, **kwargs)
+    assert not full.active[hot]
+    assert full.wanted == edit.wanted == 15
+
+
+def test_when_slots_run_out_the_best_get_them():
+    gaussians, live = scene_with(count=20)
+    free = np.flatnonzero(~np.asarray(gaussians.active))
+    values = np.linspace(1e-3, 2e-3, 20)[np.random.default_rng(0).permutation(20)]
+    edit = plan(gaussians, stats_with(live, values))
+    assert edit.active.all()
+    best = live[np.argsort(-values)[:4]]
+    assert_rows_equal(edit.params, free, gaussians.params, best)
+    assert edit.wanted == 40
+    assert plan(gaussians, stats_with(live, values), max_gaussians=30).wanted == 40
+
+
+@pytest.mark.parametrize(("most", "count"), [(18, 18), (16, 16), (7, 16)])
+def test_never_more_than_the_most(most, count):
+    gaussians, live = scene_with()
+    edit = plan(gaussians, stats_with(live), max_gaussians=most)
+    assert edit.active.sum() == count
+    assert edit.wanted == 32
+
+
+def test_revised_opacity_keeps_the_pair_as_opaque():
+    for scales in (0.05, 0.3):
+        opacities = np.linspace(0.02, 0.999, SLOTS)
+        gaussians, live = scene_with(scales=scales, opacities=opacities)
+        hot = live[[0, 7, 15]]
+        edit = plan(gaussians, stats_with(hot), revised_opacity=True)
+        born = new_slots(edit, gaussians)
+        after = jax.nn.sigmoid(edit.params.logit_opacities)
+        np.testing.assert_allclose(
+            1 - (1 - after[hot]) * (1 - after[born]), opacities[hot], rtol=1e-9
+        )
+        others = np.setdiff1d(live, hot)
+        assert_rows_equal(edit.params, others, gaussians.params, others)
+
+
+def test_reset_lowers_opacities_and_clears_their_moments_only():
+    opacities = np.where(np.arange(SLOTS) % 2 == 0, 0.9, 0.007)
+    gaussians, live = scene_with(opacities=opacities)
+    edit = plan(gaussians, stats_with([]), 200, reset_every=100)
+    after = np.asarray(jax.nn.sigmoid(edit.params.logit_opacities))[live]
+    np.testing.assert_allclose(after, np.minimum(opacities[live], 0.01), rtol=1e-9)
+    low = live[live % 2 == 1]
+    assert_rows_equal(edit.params, low, gaussians.params, low)
+    assert_rows_equal(edit.params, live, gaussians.params, live, ["logit_opacities"])
+    assert edit.opacities_reset
+    moments = some_moments(gaussians)
+    _, found = apply_edit(edit, moments)
+    for before, moment in ((moments.mu, found.mu), (moments.nu, found.nu)):
+        assert_rows_equal(moment, live, before, live, ["logit_opacities"])
+        assert (moment.logit_opacities == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("every", "reset_every", "resets"),
+    [
+        (10, 50, [50, 100, 150]),
+        # Edits that miss its multiples: the first after each.
+        (7, 50, [56, 105, 154]),
+        (10, 0, []),
+        (60, 50, [60, 120]),  # at 180 nothing would be pruned after
+    ],
+)
+def test_resets_come_when_they_are_due(every, reset_every, resets):
+    gaussians, _ = scene_with()
+    config = AdaptiveSettings(start=0, stop=200, every=every, reset_every=reset_every)
+    due = adaptive(config, EXTENT).due
+    found = [
+        step
+        for step in range(1, 201)
+        if due(step)
+        and planned(
+            config, jax.random.key(0), jnp.int32(step), gaussians, stats_with([])
+        ).opacities_reset
+    ]
+    assert found == resets
+
+
+def test_due_in_its_time_only():
+    due = jax.vmap(adaptive(AdaptiveSettings(start=20, stop=50, every=10), 1.0).due)
+    steps = jnp.arange(200)
+    assert np.flatnonzero(due(steps)).tolist() == [30, 40, 50]
+
+
+def some_moments(gaussians):
+    rng = np.random.default_rng(9)
+
+    def fill(leaf):
+        return jnp.asarray(rng.uniform(0.1, 1, leaf.shape))
+
+    zero = init_moments(gaussians.params)
+    return zero._replace(mu=jax.tree.map(fill, zero.mu), nu=jax.tree.map(fill, zero.nu))
+
+
+def test_moments_follow_the_slots():
+    opacities = np.full(SLOTS, 0.5)
+    gaussians, live = scene_with(opacities=opacities, scales=0.3)
+    large = np.array(gaussians.params.log_scales)
+    large[live[0]] = np.log(0.05)  # this one is cloned, the next split, the last goes
+    logits = np.array(gaussians.params.logit_opacities)
+    logits[live[-1]] = -9.0
+    params = gaussians.params.replace(
+        log_scales=jnp.asarray(large), logit_opacities=jnp.asarray(logits)
+    )
+    gaussians = gaussians.replace(params=params)
+    edit = plan(gaussians, stats_with(live[:2]))
+    moments = some_moments(gaussians)
+    after, found = apply_edit(edit, moments)
+    born = new_slots(edit, gaussians)
+    assert len(born) == 2
+    zero = np.concatenate([born, live[[1, -1]]])
+    kept = np.setdiff1d(live, zero)
+    assert live[0] in kept
+    for before, moment in ((moments.mu, found.mu), (moments.nu, found.nu)):
+        assert_rows_equal(moment, kept, before, kept)
+        for leaf in jax.tree.leaves(rows(moment, zero)):
+            assert (leaf == 0).all()
+    assert found.count == moments.count
+    np.testing.assert_array_equal(after.active, edit.active)
+
+
+@pytest.mark.parametrize("garbage", GARBAGE)
+def test_contents_of_dead_slots_do_not_matter(garbage):
+    for scales in (0.05, 0.3):
+        clean, live = scene_with(scales=scales)
+        dirty, _ = scene_with(scales=scales, garbage=garbage)
+        stats = stats_with(live[::3])
+        bad = jnp.where(clean.active, stats.gradient, garbage)
+        first = plan(clean, stats, 100, reset_every=100)
+        second = plan(dirty, stats._replace(gradient=bad), 100, reset_every=100)
+        for name in ("active", "cleared", "wanted", "opacities_reset"):
+            np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+        slots = np.flatnonzero(first.active)
+        assert len(slots) == 22
+        assert_rows_equal(first.params, slots, second.params, slots)
+
+
+def test_statistics_are_of_the_views_that_show_it():
+    gaussians, _ = scene_with()
+    strategy = adaptive(SETTINGS, EXTENT)
+    stats = strategy.init(gaussians)
+    rng = np.random.default_rng(0)
+    wanted = np.zeros((3, SLOTS))
+    for _ in range(4):
+        gradient = rng.normal(size=(2, SLOTS, 2))
+        radii = np.maximum(rng.normal(size=(2, SLOTS)), 0) * 5
+        stats = strategy.observe(stats, Observation(gradient, radii, 40, 30))
+        norm = np.hypot(20 * gradient[..., 0], 15 * gradient[..., 1])
+        wanted[0] += (norm * (radii > 0)).sum(0)
+        wanted[1] += (radii > 0).sum(0)
+        wanted[2] = np.maximum(wanted[2], radii.max(0) / 40)
+    for found, values in zip(stats, wanted):
+        np.testing.assert_allclose(found, values, rtol=1e-12)
+    _, fresh = strategy.plan(jax.random.key(0), jnp.int32(10), gaussians, stats)
+    assert all((leaf == 0).all() for leaf in fresh)
+
+
+def test_statistics_are_in_units_of_each_image():
+    """Of images that differ as of each alone; of equal ones as of one size."""
+    gaussians, _ = scene_with()
+    strategy, rng = adaptive(SETTINGS, EXTENT), np.random.default_rng(1)
+    start = strategy.init(gaussians)
+    gradient, radii = rng.normal(size=(2, SLOTS, 2)), rng.normal(size=(2, SLOTS))
+    sizes = np.asarray([[40, 30], [30, 40]])
+    both = Observation(gradient, radii, *sizes.T)
+    alone = start
+    for index, (width, height) in enumerate(sizes.tolist()):
+        own = slice(index, index + 1)
+        seen = Observation(gradient[own], radii[own], width, height)
+        alone = strategy.observe(alone, seen)
+    for found, wanted in zip(strategy.observe(start, both), alone):
+        np.testing.assert_allclose(found, wanted, rtol=1e-12)
+    equal = both._replace(width=np.full(2, 40), height=np.full(2, 30))
+    one = strategy.observe(start, both._replace(width=40, height=30))
+    for found, wanted in zip(strategy.observe(start, equal), one):
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_the_penalties_are_those_of_mcmc():
+    """Where they are asked for; by default, as in the paper, there are none."""
+    gaussians, _ = scene_with(garbage=np.nan)
+    assert adaptive(AdaptiveSettings(), 3.0).penalty is None
+    weights = {"opacity_penalty": 0.3, "scale_penalty": 0.7}
+    penalty = adaptive(AdaptiveSettings(**weights), 3.0).penalty
+    wanted = mcmc(McmcSettings(**weights), 3.0).penalty
+    assert penalty is not None
+    assert wanted is not None
+    assert penalty(gaussians) == wanted(gaussians) > 0.3 * 0.5
+
+
+def test_copies_are_exact():
+    gaussians, _ = scene_with()
+    born = jax.tree.map(lambda a: a + 1, gaussians.params)
+    source = np.full(SLOTS, SLOTS)
+    source[[1, 4]] = [7, 0]
+    found = copy_into(gaussians.params, jnp.asarray(source), born)
+    assert_rows_equal(found, [1, 4], born, [7, 0])
+    rest = np.delete(np.arange(SLOTS), [1, 4])
+    assert_rows_equal(found, rest, gaussians.params, rest)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"every": 0},
+        {"start": -1},
+        {"reset_opacity": 1.0},
+        {"opacity_penalty": -0.1},
+        {"max_gaussians": 0},
+    ],
+    ids=str,
+)
+def test_settings_out_of_range(changes):
+    with pytest.raises(InputError, match=rf"AdaptiveSettings.{next(iter(changes))} = "):
+        AdaptiveSettings(**changes)

@@ -1,0 +1,379 @@
+"""Density control as Markov chain Monte Carlo: sharing, relocation, growth, noise."""
+
+import math
+from decimal import Decimal, getcontext
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import COMPAT, HEIGHT, WIDTH, assert_not_empty, camera_of, psnr, render
+
+import gsjax
+from gsjax.densify.mcmc import McmcSettings, mcmc, shared_opacity, shared_scale, spawn
+from gsjax.densify.types import apply_edit
+from gsjax.errors import InputError
+from gsjax.math.rotations import covariance
+from gsjax.train.optimiser import init_moments
+
+SLOTS = 96
+SETTINGS = McmcSettings(start=0, stop=1000, every=10, max_gaussians=1000)
+GARBAGE = (np.nan, np.inf, -1e30)
+
+
+def area_of_equation_9(shared: Fraction, count: int) -> Decimal:
+    """Σᵢ Σₖ C(i−1, k) (−1)ᵏ o'^(k+1) / √(k+1), i = 1 … n, to 60 digits.
+
+    The sum over i is C(n, k+1), so that one sum is left; it alternates all the same.
+    """
+    getcontext().prec = 60
+    total = Decimal(0)
+    for k in range(count):
+        terms = sum(math.comb(i - 1, k) for i in range(1, count + 1))
+        term = Fraction((-1) ** k * terms) * shared ** (k + 1)
+        root = Decimal(k + 1).sqrt()
+        total += Decimal(term.numerator) / Decimal(term.denominator) / root
+    return total
+
+
+@pytest.mark.parametrize("opacity", [1e-3, 0.05, 0.5, 0.9, 0.99, 1 - 2**-12])
+def test_scale_is_equation_9(opacity, report):
+    counts = np.arange(2, 52)
+    single = np.full(50, opacity, np.float32)
+    shared = shared_opacity(single, jnp.asarray(counts, jnp.int32))
+    found = shared_scale(single, shared, jnp.asarray(counts, jnp.int32))
+    assert shared.dtype == found.dtype == jnp.float32
+    worst = 0.0
+    for count, one, value in zip(counts, np.asarray(shared), np.asarray(found)):
+        # The share as it was rounded, so that the formula alone is compared.
+        area = area_of_equation_9(Fraction(float(one)), int(count))
+        wanted = Decimal(float(single[0])) / area
+        worst = max(worst, abs(float(Decimal(float(value)) / wanted - 1)))
+    report(f"equation 9 at opacity {opacity:.4f}", worst, 1e-5)
+    assert worst <= 1e-5
+
+
+def test_of_one_nothing_changes():
+    opacity = jnp.linspace(1e-4, 0.999, 64)
+    one = jnp.ones(64, jnp.int32)
+    np.testing.assert_allclose(shared_opacity(opacity, one), opacity, rtol=1e-12)
+    np.testing.assert_allclose(shared_scale(opacity, opacity, one), 1, rtol=1e-6)
+
+
+def test_together_they_are_as_opaque():
+    opacity = np.float64([1e-6, 0.005, 0.3, 0.9, 0.999999])[:, None]
+    count = jnp.arange(1, 200)
+    shared = np.asarray(shared_opacity(opacity, count))
+    covered = -np.expm1(count * np.log1p(-shared))
+    np.testing.assert_allclose(covered, opacity + 0 * covered, rtol=1e-9)
+    assert (np.diff(shared, axis=1) < 0).all()
+    wide = shared_scale(opacity + 0 * shared, shared, count)
+    assert (wide <= 1 + 1e-6).all()
+    assert (wide > 0).all()
+
+
+def test_shares_of_extremes_are_finite():
+    for opacity in (0.0, 1.0):
+        value = jnp.full(3, opacity, jnp.float32)
+        count = jnp.asarray([1, 2, 10_000])
+        shared = shared_opacity(value, count)
+        factor = shared_scale(value, shared, count)
+        assert np.isfinite(shared).all()
+        assert (factor > 0).all()
+        assert np.isfinite(factor).all()
+
+
+def scene_with(opacities, active, garbage=0.0, seed=0, scales=0.1, spread=1.0):
+    rng = np.random.default_rng(seed)
+    opacities, active = np.broadcast_to(opacities, SLOTS), np.asarray(active)
+    fields = {
+        "means": spread * rng.normal(size=(SLOTS, 3)),
+        "quats": rng.normal(size=(SLOTS, 4)),
+        "log_scales": np.log(scales) + 0.3 * rng.normal(size=(SLOTS, 3)),
+        "logit_opacities": np.log(opacities) - np.log1p(-opacities),
+        "sh": rng.normal(size=(SLOTS, 4, 3)),
+    }
+    for value in fields.values():
+        value[~active] = garbage
+    made = gsjax.make_gaussians(**fields)
+    return made.replace(active=jnp.asarray(active))
+
+
+def planned(config, key, gaussians):
+    return mcmc(config).plan(key, jnp.int32(10), gaussians, ())[0]
+
+
+def first(count):
+    return np.arange(SLOTS) < count
+
+
+def children_of(edit, gaussians, slots):
+    """For each of ``slots`` the slot that it is a copy of, told by its colour."""
+    table, found = (np.asarray(p.sh)[:, 0, 0] for p in (gaussians.params, edit.params))
+    return [int(np.flatnonzero(table == found[slot])[0]) for slot in slots]
+
+
+def mixed(dead=24, count=80, garbage=0.0):
+    opacities = np.linspace(0.05, 0.95, SLOTS)
+    opacities[:dead] = 0.004
+    return scene_with(opacities, first(count), garbage)
+
+
+def test_dead_ones_move_onto_live_ones():
+    gaussians = mixed()
+    before = gaussians.params
+    edit = planned(
+        McmcSettings(**{**vars(SETTINGS), "growth": 1.0}), jax.random.key(0), gaussians
+    )
+    np.testing.assert_array_equal(edit.active, gaussians.active)
+    assert edit.wanted == 80
+    parents = children_of(edit, gaussians, range(24))
+    assert min(parents) >= 24
+    assert max(parents) < 80
+    copies = np.bincount(parents, minlength=SLOTS)
+    opacity = np.asarray(jax.nn.sigmoid(before.logit_opacities))
+    after = np.asarray(jax.nn.sigmoid(edit.params.logit_opacities))
+    for parent in set(parents):
+        count = copies[parent] + 1
+        group = [parent, *(i for i in range(24) if parents[i] == parent)]
+        np.testing.assert_allclose(
+            1 - (1 - after[group]) ** count, opacity[parent], rtol=1e-9
+        )
+        factor = shared_scale(opacity[parent], after[parent], count)
+        for slot in group:
+            np.testing.assert_array_equal(edit.params.means[slot], before.means[parent])
+            np.testing.assert_allclose(
+                edit.params.log_scales[slot],
+                before.log_scales[parent] + np.log(factor),
+                rtol=1e-9,
+            )
+    apart = 24 + np.flatnonzero(copies[24:80] == 0)
+    assert 20 < len(apart) < 56
+    for name, leaf in vars(edit.params).items():
+        np.testing.assert_array_equal(leaf[apart], getattr(before, name)[apart])
+    # Moments: of sources and of those that moved.
+    zero = jax.tree.map(jnp.ones_like, init_moments(before).mu)
+    moments = init_moments(before)._replace(mu=zero, nu=zero)
+    _, found = apply_edit(edit, moments)
+    changed = np.union1d(np.arange(24), parents)
+    for leaf in (found.mu.means, found.nu.sh):
+        assert (leaf[changed] == 0).all()
+        assert (leaf[apart] == 1).all()
+
+
+def test_they_are_drawn_by_opacity():
+    """χ² of 9600 draws: 71 degrees of freedom, 0.9999 below 120."""
+    opacities = np.linspace(0.05, 0.95, SLOTS)
+    alive = first(72)
+    gaussians = scene_with(opacities, np.ones(SLOTS, bool))
+    counts = np.zeros(SLOTS)
+    drawn = jax.jit(lambda key, alive: spawn(key, gaussians, ~alive, alive, SETTINGS))
+    for seed in range(400):
+        edit = drawn(jax.random.key(seed), alive)
+        for parent in children_of(edit, gaussians, range(72, SLOTS)):
+            counts[parent] += 1
+    assert counts[72:].sum() == 0
+    assert counts.sum() == 9600
+    expected = 9600 * opacities[:72] / opacities[:72].sum()
+    assert np.sum((counts[:72] - expected) ** 2 / expected) < 120
+
+
+@pytest.mark.parametrize(
+    ("count", "growth", "cap", "wanted", "got"),
+    [
+        (40, 1.05, 1000, 42, 42),
+        (40, 1.5, 1000, 60, 60),
+        (40, 1.5, 45, 45, 45),
+        (40, 1.5, 40, 40, 40),
+        (40, 1.5, 30, 30, 40),  # more than the cap are there already
+        (80, 1.5, 1000, 120, 96),  # not enough slots
+        (0, 1.5, 1000, 0, 0),
+        # Of few the factor alone would be none more: by one at least.
+        (1, 1.05, 1000, 2, 2),
+        (9, 1.1, 1000, 10, 10),
+        (19, 1.05, 1000, 20, 20),
+        (20, 1.05, 1000, 21, 21),
+        (19, 1.05, 19, 19, 19),
+        (19, 1.0, 1000, 19, 19),
+    ],
+)
+def test_growth(count, growth, cap, wanted, got):
+    config = McmcSettings(start=0, stop=9, every=1, growth=growth, max_gaussians=cap)
+    gaussians = scene_with(0.5, first(count))
+    edit = planned(config, jax.random.key(1), gaussians)
+    assert edit.wanted == wanted
+    assert config.likely(count, 3, 4) == max(count, wanted)
+    assert edit.active.sum() == got
+    assert edit.active[:count].all()
+    born = np.flatnonzero(np.asarray(edit.active) & ~first(count))
+    assert np.asarray(edit.cleared)[born].all()
+    assert all(p < count for p in children_of(edit, gaussians, born))
+
+
+def test_what_is_likely_is_edit_after_edit():
+    config = McmcSettings(start=3, stop=9, every=2, growth=1.5, max_gaussians=100)
+    steps = [(0, 3), (0, 4), (4, 5), (4, 8), (4, 9), (4, 99), (8, 99)]
+    assert [config.likely(10, *some) for some in steps] == [10, 15, 10, 22, 22, 22, 10]
+    assert config.likely(40, 0, 99) == 100
+    assert config.likely(400, 0, 99) == 400
+
+
+def test_where_all_are_dead_they_stay():
+    gaussians = scene_with(0.004, first(40))
+    config = McmcSettings(start=0, stop=9, every=1, growth=1.0)
+    edit = planned(config, jax.random.key(1), gaussians)
+    np.testing.assert_array_equal(edit.active, gaussians.active)
+    for a, b in zip(jax.tree.leaves(edit.params), jax.tree.leaves(gaussians.params)):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("garbage", GARBAGE)
+def test_contents_of_dead_slots_do_not_matter(garbage):
+    clean, dirty = mixed(), mixed(garbage=garbage)
+    strategy, key = mcmc(SETTINGS), jax.random.key(2)
+    first_edit, second = (planned(SETTINGS, key, g) for g in (clean, dirty))
+    for name in ("active", "cleared", "wanted"):
+        np.testing.assert_array_equal(getattr(first_edit, name), getattr(second, name))
+    live = np.asarray(first_edit.active)
+    assert live.sum() == 84
+    pairs = [(first_edit.params, second.params, live)]
+    moved = [strategy.perturb(key, g, jnp.asarray(1e-4)) for g in (clean, dirty)]
+    pairs.append((*moved, np.asarray(clean.active)))
+    for a, b, slots in pairs:
+        for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b)):
+            np.testing.assert_array_equal(one[slots], other[slots])
+    still = dirty.params.means[80:]
+    np.testing.assert_array_equal(moved[1].means[80:], still)
+
+    def penalty(params, gaussians):
+        return strategy.penalty(gaussians.replace(params=params))
+
+    values = [jax.value_and_grad(penalty)(g.params, g) for g in (clean, dirty)]
+    for a, b in zip(*(jax.tree.leaves(v) for v in values)):
+        np.testing.assert_array_equal(a, b)
+        assert np.isfinite(a).all()
+
+
+def test_penalty_is_of_the_means():
+    gaussians = mixed()
+    config = McmcSettings(opacity_penalty=0.3, scale_penalty=0.7)
+    live = np.asarray(gaussians.active)
+    opacity = jax.nn.sigmoid(gaussians.params.logit_opacities)[live]
+    scales = jnp.exp(gaussians.params.log_scales)[live]
+    wanted = 0.3 * opacity.mean() + 0.7 * scales.mean()
+    np.testing.assert_allclose(mcmc(config).penalty(gaussians), wanted, rtol=1e-12)
+    none = gaussians.replace(active=gaussians.active & False)
+    assert mcmc(config).penalty(none) == 0
+
+
+def test_noise_explores_with_what_is_transparent():
+    """Covariance of the shifts: (gate · noise · rate)² Σ²; none where it is opaque."""
+    opacities = np.where(np.arange(SLOTS) % 2 == 0, 1e-4, 0.5)
+    gaussians = scene_with(opacities, first(80))
+    gaussians = jax.tree.map(  # the same two, 48 times, so that one call is a sample
+        lambda a: (
+            a
+            if a.ndim == 1 and a.dtype == bool
+            else jnp.tile(a[:2], (48,) + (1,) * (a.ndim - 1))
+        ),
+        gaussians,
+    )
+    perturb, rate = jax.jit(mcmc(SETTINGS).perturb), jnp.asarray(1e-6)
+    shifts = np.stack(
+        [
+            perturb(jax.random.key(seed), gaussians, rate).means
+            - gaussians.params.means
+            for seed in range(60)
+        ]
+    )
+    params = gaussians.params
+    cov = np.asarray(covariance(params.quats, jnp.exp(params.log_scales)))[0]
+    gate = 1 / (1 + np.exp(100 * (1e-4 - 0.005)))
+    transparent = shifts[:, 0:80:2].reshape(-1, 3) / (gate * 5e5 * 1e-6)
+    whitened = transparent @ np.linalg.inv(cov)
+    samples = len(whitened)
+    assert samples == 2400
+    assert np.abs(whitened.mean(0)).max() < 4 / np.sqrt(samples)
+    assert np.abs(np.cov(whitened.T) - np.eye(3)).max() < 4 * np.sqrt(2 / samples)
+    assert np.abs(shifts[:, 1:80:2]).max() < 1e-15
+    assert (shifts[:, 80:] == 0).all()
+
+
+def test_the_unit_of_length_does_not_matter():
+    """Noise and penalty of a scene in other units, of which the extent tells."""
+    gaussians, rate, key = mixed(), jnp.asarray(1e-4), jax.random.key(1)
+    params = gaussians.params
+    for unit in (1e-3, 1e3):
+        larger = gaussians.replace(
+            params=params.replace(
+                means=params.means * unit,
+                log_scales=params.log_scales + np.log(unit),
+            )
+        )
+        here, there = mcmc(SETTINGS, 3.0), mcmc(SETTINGS, 3.0 * unit)
+        moved = here.perturb(key, gaussians, rate).means - params.means
+        found = there.perturb(key, larger, rate * unit).means - larger.params.means
+        assert np.abs(moved).max() > 1e-6
+        np.testing.assert_allclose(found, moved * unit, rtol=1e-6, atol=1e-12 * unit)
+        wanted = here.penalty(gaussians)
+        np.testing.assert_allclose(there.penalty(larger), wanted, rtol=1e-9)
+
+
+def test_noise_keeps_the_type():
+    narrow = jax.tree.map(
+        lambda a: a if a.dtype == bool else a.astype(jnp.float32), mixed()
+    )
+    moved = mcmc(SETTINGS).perturb(jax.random.key(0), narrow, jnp.asarray(1e-4))
+    assert moved.means.dtype == jnp.float32
+
+
+def test_one_that_becomes_several_looks_alike(report):
+    """The paper's Eq. 9 matches the light of each, not its shape: a moderate bound."""
+    rng = np.random.default_rng(3)
+    eye = np.eye(4)
+    points = np.column_stack([rng.uniform(-1, 1, (SLOTS, 2)), np.full(SLOTS, 3.0)])
+    opacities = rng.uniform(0.2, 0.9, SLOTS)
+    opacities[24:] = 0.004
+    gaussians = scene_with(opacities, np.ones(SLOTS, bool), scales=0.25)
+    colors = jnp.asarray(rng.uniform(0.5, 1.7, (SLOTS, 4, 3))).at[:, 1:].set(0)
+    params = gaussians.params.replace(means=jnp.asarray(points), sh=colors)
+    alone = gaussians.replace(params=params, active=jnp.asarray(first(24)))
+    whole = gaussians.replace(params=params)
+    camera = camera_of(WIDTH, HEIGHT, eye)
+    config = McmcSettings(start=0, stop=9, every=1, growth=1.0)
+    edit = planned(config, jax.random.key(4), whole)
+    assert np.bincount(children_of(edit, whole, range(SLOTS)))[:24].max() > 4
+    moved = whole.replace(params=edit.params)
+    before, after = (render(g, camera, COMPAT) for g in (alone, moved))
+    assert_not_empty(before.alpha)
+    total = [np.sum(np.asarray(r.alpha)) for r in (before, after)]
+    report("light after relocation", abs(total[1] / total[0] - 1), 0.05)
+    assert total[1] == pytest.approx(total[0], rel=0.05)
+    quality = psnr(after.rgb, before.rgb)
+    report("relocation, −dB", -quality, -28)
+    assert quality > 28
+    # Without the sharing it would not.
+    params = edit.params.replace(
+        logit_opacities=params.logit_opacities[
+            jnp.asarray(children_of(edit, whole, range(SLOTS)))
+        ]
+    )
+    assert psnr(
+        render(whole.replace(params=params), camera, COMPAT).rgb, before.rgb
+    ) < (quality - 6)
+
+
+def test_due_in_its_time_only():
+    due = jax.vmap(mcmc(McmcSettings(start=20, stop=50, every=10)).due)
+    assert np.flatnonzero(due(jnp.arange(200))).tolist() == [30, 40, 50]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"every": 0}, {"growth": 0.9}, {"dead_opacity": 0.0}, {"noise": -1.0}],
+    ids=str,
+)
+def test_settings_out_of_range(changes):
+    with pytest.raises(InputError, match=rf"McmcSettings.{next(iter(changes))} = "):
+        McmcSettings(**changes)

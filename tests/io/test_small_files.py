@@ -1,0 +1,404 @@
+"""SPZ and `.splat` files, held against their layouts written out number by number.
+
+The bytes of `THEIRS` are what another program (@playcanvas/splat-transform 2.7.1) makes
+of the Gaussians of `given`, in version 3 of SPZ.
+"""
+
+import gzip
+import math
+import struct
+from base64 import b64decode
+from itertools import pairwise
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import gsjax
+from gsjax.cli.main import main
+from gsjax.errors import InputError
+from gsjax.io.common import to_bytes
+from gsjax.io.spz import write_spz
+
+pytestmark = pytest.mark.usefixtures("float32")
+
+THEIRS = b64decode(
+    "TkdTUAMAAAADAAAAAwwAAAAYAAAkAAD+/wDA+QDQ/wCI/wAAAAAAAAAIAOFFkoeXkICXdmN4Y3BgSKCwCIC"
+    "AgGmlnRZKeEupdVWy5LioMOhAQHhYULCQgJDwwKDwUNBw4CCAgDBwgIBQIMBgwKDwQEBQ0IBAYLAwkGjYmK"
+    "jIQGjgkHBgYEBwUHAw4MBgsNCgQEAwMJBAQDCAwDBgcHBwUOAwkJBgsNAgYJB4MGCQqKCAUNBA4CCwwNCQQ"
+    "CCgwIBQwEBgQKAwcKCwIIDggIAwUJBw0A=="
+)
+C0 = 0.28209479177387814
+NAMES = ("means", "log_scales", "logit_opacities", "sh")
+
+
+def given(degree: int = 3, **changes) -> gsjax.Gaussians:
+    """Three, the values of which SPZ holds almost all of."""
+    rng = np.random.default_rng(7)
+    fields = {
+        "means": [[1.5, -2.25, 0.125], [-100.0, 3.0, 7.5], [0, 0, -0.5]],
+        "quats": [[0.5, 0.5, -0.5, 0.5], [0.1, -0.2, 0.3, -0.9], [-0.8, 0.1, 0.2, 0.5]],
+        "log_scales": [[-3, -4, -5.5], [0, 1, -9.5], [-2, -2, -2]],
+        "logit_opacities": [2.0, -1.0, 0.3],
+        "sh": np.round(rng.uniform(-0.8, 0.8, (3, 16, 3)) * 16) / 16,
+    }
+    fields["sh"] = fields["sh"][:, : (degree + 1) ** 2]
+    return gsjax.make_gaussians(**fields | changes)
+
+
+def rotations(gaussians: gsjax.Gaussians) -> np.ndarray:
+    """[N, 3, 3]"""
+    w, *xyz = np.asarray(gaussians.params.quats).T
+    return matrices(*xyz, w)
+
+
+def matrices(x, y, z, w) -> np.ndarray:
+    return Rotation.from_quat(np.stack([x, y, z, w], -1)).as_matrix()
+
+
+def opacities(logits) -> np.ndarray:
+    return 1 / (1 + np.exp(-np.asarray(logits, np.float64)))
+
+
+def assert_alike(found: gsjax.Gaussians, wanted: gsjax.Gaussians, sh: float) -> None:
+    """To half a step of SPZ in each number, ``sh`` for harmonics."""
+    for name in NAMES:
+        values = [np.asarray(getattr(one.params, name)) for one in (found, wanted)]
+        if name == "logit_opacities":
+            values = map(opacities, values)
+        bound = {"means": 2.0**-13, "log_scales": 1 / 32, "sh": sh}.get(name, 0.5 / 255)
+        np.testing.assert_allclose(*values, rtol=0, atol=bound + 1e-6)
+    np.testing.assert_allclose(rotations(found), rotations(wanted), atol=6e-3)
+
+
+# --- SPZ ---
+
+
+def test_what_another_program_writes_is_read(tmp_path):
+    (tmp_path / "a.SPZ").write_bytes(gzip.compress(THEIRS))
+    found = gsjax.load(tmp_path / "a.SPZ")
+    assert found.sh_degree == 3
+    # Its harmonics above degree 1 are rounded to 4 bits.
+    assert_alike(found, given(), 1 / 16)
+
+
+def by_the_book(raw: bytes) -> list[dict[str, list[float]]]:
+    """Each Gaussian of version 3, as Niantic's README says."""
+    magic, version, count, degree, fraction, flags, reserved = struct.unpack_from(
+        "<4sIIBBBB", raw
+    )
+    assert (magic, version, flags, reserved) == (b"NGSP", 3, 0, 0)
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    starts = np.cumsum([16, *(count * width for width in (9, 1, 3, 3, 4, rest))])
+    assert len(raw) == starts[-1]
+    parts = [raw[a:b] for a, b in pairwise(starts)]
+    found = []
+    for index in range(count):
+        means, alpha, color, scale, quat, sh = (
+            part[index * (len(part) // count) :][: len(part) // count] for part in parts
+        )
+        bits = int.from_bytes(quat, "little")
+        largest, xyzw = bits >> 30, [0.0] * 4
+        for axis in (3, 2, 1, 0):
+            if axis != largest:
+                size = (bits & 511) / 511 / math.sqrt(2)
+                xyzw[axis] = -size if bits & 512 else size
+                bits >>= 10
+        xyzw[largest] = math.sqrt(1 - sum(v * v for v in xyzw))
+        found.append({
+            "means": [
+                int.from_bytes(means[3 * k : 3 * k + 3], "little", signed=True)
+                / 2**fraction
+                for k in range(3)
+            ],
+            "opacity": [alpha[0] / 255],
+            "color": [0.5 + C0 * (c / 255 - 0.5) / 0.15 for c in color],
+            "log_scales": [s / 16 - 10 for s in scale],
+            "xyzw": xyzw,
+            "sh": [(v - 128) / 128 for v in sh],
+        })  # fmt: skip
+    return found
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_what_is_written_is_as_the_format_says(tmp_path, degree):
+    """In axes of which y and z point the other way; what is inactive is not written."""
+    scene = gsjax.concatenate(given(degree), given(degree))
+    scene = gsjax.select(scene, np.arange(6) > 2)
+    gsjax.save(tmp_path / "a.spz", scene)
+    raw = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    rows = by_the_book(raw)
+    assert len(rows) == 3
+    # Of 100, 24 bits hold 2⁻¹⁶.
+    assert raw[13] == 16
+    turn = np.diag([1, -1, -1])
+    params, turned = given(degree).params, turn @ rotations(given()) @ turn
+    shares = opacities(params.logit_opacities)
+    signs = {1: [-1, -1, 1], 2: [-1, 1, 1, -1, 1], 3: [-1, 1, -1, -1, 1, -1, 1]}
+    for index, row in enumerate(rows):
+        np.testing.assert_array_equal(row["means"], params.means[index] @ turn)
+        np.testing.assert_allclose(row["opacity"][0], shares[index], atol=0.5 / 255)
+        wanted = 0.5 + C0 * params.sh[index, 0]
+        np.testing.assert_allclose(row["color"], wanted, atol=0.51 / 255 * 1.9)
+        np.testing.assert_array_equal(row["log_scales"], params.log_scales[index])
+        found = matrices(*row["xyzw"])
+        np.testing.assert_allclose(found, turned[index], atol=6e-3)
+        sign = [s for band in range(1, degree + 1) for s in signs[band]]
+        wanted = np.asarray(params.sh[index, 1:]) * np.asarray(sign).reshape(-1, 1)
+        # To 6 bits in degree 1, 5 above, of which these have all.
+        np.testing.assert_array_equal(row["sh"], wanted.ravel())
+
+
+def test_means_are_as_fine_as_their_range_allows(tmp_path):
+    for largest, step in ((0.5, 2**-20), (7.9, 2**-20), (8.1, 2**-19), (1e6, 2**-3)):
+        means = np.asarray([[largest, 0, 0], [1 / 3, -1 / 3, 0.1], [0, 0, 0]])
+        scene = given(0, means=means, log_scales=np.full((3, 3), 5.0))
+        gsjax.save(tmp_path / "a.spz", scene, overwrite=True)
+        found = np.asarray(gsjax.load(tmp_path / "a.spz").params.means)
+        error = np.abs(found[1] - np.asarray(scene.params.means)[1]).max()
+        assert step / 10 < error <= step / 2
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_what_is_read_is_written_to_the_same_bytes(tmp_path, degree):
+    """Nothing is rounded twice, and nothing in the file depends on when or where."""
+    rng = np.random.default_rng(degree)
+    count = 200
+    scene = gsjax.make_gaussians(
+        means=rng.normal(size=(count, 3)) * 10,
+        quats=rng.normal(size=(count, 4)),
+        log_scales=rng.uniform(-9.9, 5, (count, 3)),
+        logit_opacities=rng.normal(size=count) * 8,
+        sh=rng.uniform(-0.99, 0.99, (count, (degree + 1) ** 2, 3)),
+    )
+    gsjax.save(tmp_path / "a.spz", scene)
+    once = gsjax.load(tmp_path / "a.spz")
+    gsjax.save(tmp_path / "b.spz", once)
+    assert_alike(once, scene, 1 / 32)
+    first, second = ((tmp_path / f"{n}.spz").read_bytes() for n in "ab")
+    whole = [np.frombuffer(gzip.decompress(raw), np.uint8) for raw in (first, second)]
+    quats = slice(16 + 16 * count, 16 + 20 * count)
+    # Of two components that are largest either may be left out.
+    packed = [one[quats].view("<u4") for one in whole]
+    assert np.mean(packed[0] != packed[1]) < 0.02
+    same = [np.delete(one, np.r_[quats]) for one in whole]
+    np.testing.assert_array_equal(*same)
+
+
+def as_version_2(raw: bytes, quats: np.ndarray) -> bytes:
+    """The same file with x, y and z of quaternions [N, 4] xyzw in a byte each."""
+    count = len(quats)
+    packed = to_bytes(127.5 + 127.5 * quats[:, :3] * np.sign(quats[:, 3:]))
+    start = 16 + 16 * count
+    body = raw[8:start] + packed.tobytes() + raw[start + 4 * count :]
+    return b"NGSP" + struct.pack("<I", 2) + body
+
+
+def test_version_2_is_read(tmp_path):
+    quats = np.asarray([row["xyzw"] for row in by_the_book(THEIRS)])
+    (tmp_path / "a.spz").write_bytes(gzip.compress(as_version_2(THEIRS, quats)))
+    found = gsjax.load(tmp_path / "a.spz")
+    for name in NAMES:
+        theirs = gsjax.load(save_raw(tmp_path / "b.spz", THEIRS))
+        np.testing.assert_array_equal(
+            getattr(found.params, name), getattr(theirs.params, name)
+        )
+    np.testing.assert_allclose(rotations(found), rotations(given()), atol=0.03)
+
+
+def save_raw(path: Path, raw: bytes) -> Path:
+    path.write_bytes(gzip.compress(raw))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("flags", "told"), [(0, "bytes behind the last"), (2, "extensions are not read")]
+)
+def test_what_follows_is_told_of(tmp_path, flags, told):
+    raw = THEIRS[:14] + bytes([flags]) + THEIRS[15:] + b"more"
+    with pytest.warns(UserWarning, match=told):
+        found = gsjax.load(save_raw(tmp_path / "a.spz", raw))
+    assert_alike(found, given(), 1 / 16)
+
+
+def test_antialiasing_is_told_of(tmp_path):
+    write_spz(tmp_path / "a.spz", given(0), antialias=True)
+    with pytest.warns(UserWarning, match=r"looks right with RasterConfig\(antialias"):
+        gsjax.load(tmp_path / "a.spz")
+
+
+def test_opacities_of_zero_and_one_stay_so(tmp_path):
+    gsjax.save(tmp_path / "a.spz", given(0, logit_opacities=[-np.inf, np.inf, -9.0]))
+    found = gsjax.load(tmp_path / "a.spz").params.logit_opacities
+    np.testing.assert_allclose(opacities(found), [0, 1, 0], atol=0.5 / 255)
+    assert np.isfinite(found).all()
+
+
+def test_an_empty_scene_is_written_and_read(tmp_path):
+    empty = gsjax.select(given(1), np.zeros(3, bool))
+    for suffix in (".spz", ".splat"):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("warnings.warn", lambda *_, **__: None)
+            gsjax.save(tmp_path / f"a{suffix}", empty)
+    assert int(gsjax.num_active(gsjax.load(tmp_path / "a.spz"))) == 0
+    assert (tmp_path / "a.splat").read_bytes() == b""
+
+
+# --- what they do not hold ---
+
+FEW = np.asarray([[1.0, 0, 0], [0, 0, 0], [1, 2, 3]])
+BEYOND = {
+    "log scales": ({"log_scales": np.full((3, 3), -11.0), "means": 0 * FEW}, 3),
+    "colours": ({"sh": np.full((3, 1, 3), 4.0)}, 3),
+    "harmonics": ({"sh": np.ones((3, 4, 3)) * [[[0]], [[1.5]], [[-1]]]}, 1),
+    "means": ({"means": 9e4 * FEW}, 2),
+}
+
+
+@pytest.mark.parametrize("what", BEYOND)
+def test_what_is_clipped_is_told_of(tmp_path, what):
+    changes, count = BEYOND[what]
+    message = f"{count} of 3 Gaussians have {what} "
+    with pytest.warns(UserWarning, match=message) as told:
+        gsjax.save(tmp_path / "a.spz", given(0, **changes))
+    assert len(told) == 1
+
+
+def test_what_is_clipped_is_the_nearest(tmp_path):
+    sh = np.zeros((3, 4, 3))
+    sh[0, :] = (9.0, -9.0, 0.5)
+    scene = given(1, sh=sh, log_scales=[[9, -19, 0], [0, 0, 0], [1, 1, 1]])
+    with pytest.warns(UserWarning, match="beyond"):
+        gsjax.save(tmp_path / "a.spz", scene)
+    found = gsjax.load(tmp_path / "a.spz").params
+    np.testing.assert_array_equal(found.log_scales[0], [255 / 16 - 10, -10, 0])
+    np.testing.assert_allclose(found.sh[0, 0], [10 / 3, -10 / 3, 0.5], atol=0.014)
+    for basis in (1, 2, 3):
+        np.testing.assert_allclose(found.sh[0, basis], [1, -1, 0.5], atol=1 / 128)
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".splat"])
+def test_what_is_not_finite_is_refused(tmp_path, suffix):
+    for name in ("means", "quats", "log_scales", "sh"):
+        wrong = np.array(getattr(given(0).params, name))
+        wrong[1] = np.inf
+        with pytest.raises(InputError, match=r"1 of 3 Gaussians are NaN or infinite"):
+            gsjax.save(tmp_path / f"a{suffix}", given(0, **{name: wrong}))
+    with pytest.raises(InputError, match="NaN or infinite"):
+        gsjax.save(tmp_path / f"a{suffix}", given(0, logit_opacities=[0, np.nan, 0]))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".splat"])
+def test_what_is_never_drawn_is_left_out(tmp_path, suffix):
+    quats = np.asarray([[1, 0, 0, 0], [0, 0, 0, 0], [0, 1e-20, 0, 0]])
+    path = tmp_path / f"a{suffix}"
+    with pytest.warns(UserWarning, match="1 of 3 quaternions are zero"):
+        gsjax.save(path, given(0, quats=quats))
+    if suffix == ".splat":
+        assert path.stat().st_size == 64
+    else:
+        assert gsjax.load(path).capacity == 2
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".splat"])
+def test_what_would_draw_nothing_is_refused(tmp_path, suffix):
+    nothing = given(0, quats=np.zeros((3, 4)))
+    with pytest.raises(InputError, match="quaternions of all 3 Gaussians are zero"):
+        gsjax.save(tmp_path / f"a{suffix}", nothing)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_means_beyond_float32_have_no_place_in_splat(tmp_path):
+    means = 1e39 * np.asarray([[1, 0, 0], [0, 0, 0], [0, 0, -1]])
+    with jax.enable_x64(True):
+        far = given(0, means=means)
+        with pytest.raises(InputError, match="2 of 3 means are beyond float32"):
+            gsjax.save(tmp_path / "a.splat", far)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_has_no_place_in_spz_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"SH degree 4; SPZ has up to 3.*--sh-degree"):
+        gsjax.save(tmp_path / "a.spz", gsjax.with_sh_degree(given(), 4))
+    far = given(0, means=np.asarray([[1e7, 0, 0], [0, 0, 0], [0, 0, 0]]))
+    with pytest.raises(InputError, match="beyond the 8,388,607 of SPZ"):
+        gsjax.save(tmp_path / "a.spz", far)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- .splat ---
+
+
+def test_a_splat_file_is_as_viewers_read_it(tmp_path):
+    """32 bytes each; what covers most comes first."""
+    with pytest.warns(UserWarning, match="degree 1 to 3 are left out") as caught:
+        gsjax.save(tmp_path / "a.splat", given())
+    assert len(caught) == 1
+    raw = (tmp_path / "a.splat").read_bytes()
+    assert len(raw) == 3 * 32
+    params = given().params
+    for place, index in enumerate((2, 1, 0)):
+        *floats, red, green, blue, alpha, w, x, y, z = struct.unpack_from(
+            "<6f8B", raw, 32 * place
+        )
+        np.testing.assert_array_equal(floats[:3], params.means[index])
+        np.testing.assert_allclose(
+            floats[3:], np.exp(np.asarray(params.log_scales[index])), rtol=1e-6
+        )
+        wanted = 0.5 + C0 * np.asarray(params.sh[index, 0])
+        found = np.asarray([red, green, blue]) / 255
+        np.testing.assert_allclose(found, wanted, atol=0.5 / 255)
+        wanted = opacities(params.logit_opacities[index])
+        np.testing.assert_allclose(alpha / 255, wanted, atol=0.5 / 255)
+        found = matrices(*((np.asarray([x, y, z, w]) - 128) / 128))
+        np.testing.assert_allclose(found, rotations(given())[index], atol=0.03)
+
+
+def test_a_colour_beyond_white_is_told_of(tmp_path):
+    sh = np.zeros((3, 1, 3))
+    sh[2, 0, 1] = 2.0
+    with pytest.warns(UserWarning, match="1 of 3 colours are darker than black or"):
+        gsjax.save(tmp_path / "a.splat", given(0, sh=sh))
+    raw = (tmp_path / "a.splat").read_bytes()
+    assert {raw[32 * k + 25] for k in range(3)} == {128, 255}
+
+
+def test_a_splat_file_far_from_the_origin_is_told_of(tmp_path):
+    means = np.asarray([[5e6 + 0.3, 0, 0], [0, 0, 0], [1, 2, 3]])
+    with jax.enable_x64(True):
+        far = given(0, means=means)
+        with pytest.warns(UserWarning, match="1 of 3 Gaussians have means rounded by"):
+            gsjax.save(tmp_path / "a.splat", far)
+
+
+def test_a_splat_file_is_not_read(tmp_path):
+    gsjax.save(tmp_path / "a.splat", given(0))
+    with pytest.raises(InputError, match=r"known: \.ply, \.spz; convert"):
+        gsjax.load(tmp_path / "a.splat")
+
+
+# --- the command line ---
+
+
+def test_scenes_are_exported_by_suffix(tmp_path, capsys):
+    gsjax.save(tmp_path / "a.ply", given())
+    out = tmp_path / "new" / "b.spz"
+    assert main.main(["export", str(tmp_path / "a.ply"), str(out)]) == 0
+    assert capsys.readouterr().out.startswith(f"{out}  3 Gaussians")
+    assert_alike(gsjax.load(out), given(), 1 / 32)
+    assert main.main(["info", str(out)]) == 0
+    assert "Gaussians         3" in capsys.readouterr().out
+    args = ["export", str(out), str(tmp_path / "c.splat")]
+    assert main.main(args) == 0
+    assert "degree 1 to 3 are left out" in capsys.readouterr().err
+    assert main.main([*args, "--overwrite", "--sh-degree", "0"]) == 0
+    assert capsys.readouterr().err == ""
+    quats = np.asarray([[1, 0, 0, 0], [0, 0, 0, 0], [0, 1, 0, 0]])
+    gsjax.save(tmp_path / "e.ply", given(quats=quats))
+    assert main.main(["export", str(tmp_path / "e.ply"), str(tmp_path / "e.spz")]) == 0
+    assert "2 of 3 Gaussians" in capsys.readouterr().out
+    assert main.main(["export", str(out), str(tmp_path / "d.xyz")]) == 3
+    assert "known: .ply, .splat, .spz; " in capsys.readouterr().err

@@ -1,0 +1,161 @@
+"""Projection and SH against an independent float64 reference on real points.
+
+The file holds float32 inputs and float64 outputs for 2000 points and 3 views.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import COMPAT, oracle_data
+
+import gsjax
+from gsjax.math.rotations import covariance
+from gsjax.math.sh import eval_sh, sh_basis
+from gsjax.raster.lists.depth_order import depth_order
+from gsjax.raster.primitives.ellipsoid import conics_of, project
+
+VALUE, DERIVATIVE = 1e-9, 1e-8
+# Nothing is culled by its opacity; antialiasing fills in the compensation.
+CONFIG = COMPAT.replace(alpha_min=1e-300, alpha_max=1.0)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return oracle_data("projection_oracle")
+
+
+@jax.jit
+def project_all(params, camera):
+    """Every slot in the order of the file: (u v, depth, conic, compensation)."""
+    count = params.means.shape[0]
+    gaussians = gsjax.Gaussians(params=params, active=jnp.ones(count, bool))
+    out = project(gaussians, camera, CONFIG, jnp.arange(count), jnp.int32(count))
+    means2d = jnp.stack([out.u, out.v], -1)
+    return means2d, out.depth, conics_of(out), out.compensation
+
+
+def inputs(data, view):
+    gaussians = gsjax.make_gaussians(
+        means=data["in_means"],
+        quats=data["in_quats"],
+        log_scales=np.log(data["in_scales"].astype(np.float64)),
+        logit_opacities=np.zeros(len(data["in_means"])),
+        sh=np.zeros((len(data["in_means"]), 1, 3)),
+    )
+    camera = gsjax.make_camera(
+        viewmat=data["in_viewmats"][view],
+        K=data["in_Ks"][view],
+        width=int(data["in_width"]),
+        height=int(data["in_height"]),
+        near=data["in_near"],
+        far=data["in_far"],
+    )
+    return gaussians.params, camera
+
+
+def relative(found, wanted):
+    """Largest error relative to the size of each row (a vector, a matrix)."""
+    found, wanted = (np.asarray(a).reshape(len(a), -1) for a in (found, wanted))
+    assert np.isfinite(found).all()
+    size = np.linalg.norm(wanted, axis=-1)
+    assert (size > 0).mean() > 0.99
+    return np.max(np.linalg.norm(found - wanted, axis=-1) / np.maximum(size, 1e-30))
+
+
+@pytest.mark.parametrize("view", range(3))
+def test_projection_agrees(data, view, report):
+    seen = (data["f64_radii"][view] > 0).all(-1)
+    assert seen.sum() > 100
+    out = project_all(*inputs(data, view))
+    names = ("means2d", "depths", "conics", "compensations")
+    for name, found in zip(names, out):
+        error = relative(found[seen], data[f"f64_{name}"][view][seen])
+        report(f"{name}, view {view}", error, VALUE)
+        assert error <= VALUE, name
+
+
+def test_covariances_agree(data, report):
+    quats, scales = (data[f"in_{n}"].astype(np.float64) for n in ("quats", "scales"))
+    error = relative(covariance(quats, scales), data["f64_covars"])
+    report("covariances", error, VALUE)
+    assert error <= VALUE
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_spherical_harmonics_agree(data, degree, report):
+    wanted = data[f"sh_deg{degree}_f64"]
+    coefficients = data["in_sh_coeffs"][:, : (degree + 1) ** 2]
+    directions = data["in_sh_dirs"]  # of any length
+    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    error = relative(eval_sh(coefficients, directions), wanted)
+    report(f"SH degree {degree}", error, VALUE)
+    assert error <= VALUE
+
+
+def test_vector_jacobian_product_agrees(data, report):
+    params, camera = inputs(data, 0)
+    seen = (data["f64_radii"][0] > 0).all(-1)
+    cotangents = [
+        np.where(seen.reshape(-1, *[1] * (c.ndim - 1)), c, 0)
+        for c in (data[f"vjp_cot_{n}"][0] for n in ("means2d", "depths", "conics"))
+    ]
+
+    @jax.jit
+    def pull(params, cotangents):
+        _, vjp = jax.vjp(lambda p: project_all(p, camera)[:3], params)
+        return vjp(tuple(cotangents))[0]
+
+    grads = pull(params, cotangents)
+    found = {
+        "means": grads.means,
+        "quats": grads.quats,
+        "scales": grads.log_scales / np.exp(params.log_scales),
+    }
+    for name, value in found.items():
+        wanted = data[f"vjp_{name}"]
+        assert np.linalg.norm(wanted[seen]) > 0
+        error = np.linalg.norm(value - wanted) / np.linalg.norm(wanted)
+        rows = relative(value[seen], wanted[seen])
+        report(f"vjp of {name}, L2", error, DERIVATIVE)
+        report(f"vjp of {name}, worst row", rows, DERIVATIVE)
+        assert max(error, rows) <= DERIVATIVE, name
+
+
+@pytest.mark.as_users
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_colours_of_many_gaussians(degree):
+    """In float32 and compiled: some reductions of XLA go wrong for long arrays."""
+    count, bases = 40_000, (degree + 1) ** 2
+    rng = np.random.default_rng(degree)
+    means = rng.uniform(-1, 1, (count, 3)) + (0, 0, 4)
+    sh = rng.normal(size=(count, bases, 3))
+    scene = gsjax.make_gaussians(
+        means=means.astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.full((count, 3), np.float32(-5)),
+        logit_opacities=np.zeros(count, np.float32),
+        sh=sh.astype(np.float32),
+    )
+    K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    camera = gsjax.make_camera(viewmat=np.eye(4), K=K, width=64, height=48)
+    scene, camera = jax.tree.map(
+        lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a,
+        (scene, camera),
+    )
+    config = gsjax.RasterConfig()
+
+    @jax.jit
+    def colours(scene, camera):
+        order, seen = depth_order(scene, camera, config)
+        return order, seen, project(scene, camera, config, order, seen).colors
+
+    order, seen, found = colours(scene, camera)
+    seen = int(seen)
+    assert seen > count // 2
+    chosen = np.asarray(order)[:seen]
+    directions = means / np.linalg.norm(means, axis=1, keepdims=True)
+    basis = np.stack(sh_basis(degree, *jnp.asarray(directions.T)), -1)
+    wanted = np.maximum((basis[..., None] * sh).sum(1) + 0.5, 0)
+    assert wanted.std() > 0.1
+    np.testing.assert_allclose(found.T[:seen], wanted[chosen], atol=2e-5)

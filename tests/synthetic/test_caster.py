@@ -1,0 +1,195 @@
+"""The demonstration's photographs, against geometry computed without the caster."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+import gsjax
+from gsjax.data.transforms import load_transforms
+from gsjax.synthetic import raycaster
+from gsjax.synthetic.raycaster import DemoDatasetSettings
+from gsjax.synthetic.shapes import box, disc, sphere, torus
+
+SIZE = 96, 72
+
+
+def photograph(index=0, samples=2, size=SIZE, **kwargs):
+    """(rgb, depth, viewmat, K) of one of eight cameras of the orbit."""
+    viewmats, K = raycaster.demo_cameras(8, *size)
+    rgb, depth = raycaster.cast(viewmats[index], K, *size, samples, **kwargs)
+    return rgb, depth, viewmats[index], K
+
+
+def unproject(depth, viewmat, K):
+    """World points [H, W, 3] by a linear solve, one camera coordinate at a time."""
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
+    local = np.stack([u * depth, v * depth, depth], -1) @ np.linalg.inv(K).T
+    whole = np.concatenate([local, np.ones_like(depth)[..., None]], -1)
+    return (whole @ np.linalg.inv(viewmat).T)[..., :3]
+
+
+@pytest.mark.parametrize("index", [0, 6])
+def test_depth_is_where_the_plane_and_the_sphere_are(index):
+    """Pixels whose ray meets only floor or ball, by textbook formulas."""
+    _, depth, viewmat, K = photograph(index)
+    points = unproject(depth, viewmat, K)
+    found = depth > 0
+    floor = found & (points[..., 2] < 1e-3)
+    ball = raycaster.solids()[1]
+    to_ball = np.linalg.norm(points - ball.centre, axis=-1)
+    on_ball = found & (np.abs(to_ball - ball.shape.reach) < 1e-3)
+    assert floor.sum() > 500
+    assert on_ball.sum() > 100
+    np.testing.assert_allclose(points[floor][:, 2], 0, atol=1e-9)
+    np.testing.assert_allclose(to_ball[on_ball], ball.shape.reach, atol=1e-9)
+    # The first of the two crossings: it faces the camera.
+    eye = np.linalg.inv(viewmat)[:3, 3]
+    outward = points[on_ball] - ball.centre
+    assert ((eye - points[on_ball]) * outward).sum(-1).min() > -1e-9
+    # And where the plane z = 0 is, no ray goes on below it.
+    assert points[found][:, 2].min() > -1e-9
+
+
+def test_the_disc_ends_in_the_background():
+    background = (0.1, 0.6, 0.3)
+    rgb, depth, viewmat, K = photograph(5, background=background)
+    plane = unproject(np.ones_like(depth), viewmat, K)
+    eye = np.linalg.inv(viewmat)[:3, 3]
+    along = plane - eye
+    ground = eye + along * (-eye[2] / along[..., 2])[..., None]
+    beyond = np.hypot(ground[..., 0], ground[..., 1]) > raycaster.GROUND_RADIUS
+    assert not (depth[~beyond] == 0).any()
+    empty = (depth == 0) & (cv2.erode((depth == 0).astype(np.uint8), np.ones((3, 3))))
+    assert empty.mean() > 0.2
+    # A pixel of the edge has a share of the floor, even where its centre has not.
+    np.testing.assert_allclose(rgb[empty > 0] - background, 0, atol=1e-6)
+
+
+def test_colours_are_in_range_bright_and_deterministic():
+    rgb, _, _, _ = photograph(3)
+    again, _, _, _ = photograph(3)
+    assert rgb.dtype == np.float32
+    assert rgb.shape == (*SIZE[::-1], 3)
+    assert 0 <= rgb.min() < rgb.max() <= 1
+    assert (rgb.max(axis=-1) > 0.3).mean() > 0.25
+    np.testing.assert_array_equal(rgb, again)
+
+
+def test_more_samples_converge():
+    wanted = photograph(2, samples=8)[0]
+    errors = [
+        np.sqrt(np.mean(np.square(photograph(2, samples=n)[0] - wanted)))
+        for n in (1, 2, 4)
+    ]
+    assert errors[2] < 0.6 * errors[1] < 0.36 * errors[0]
+    assert errors[2] < 0.012
+    with pytest.raises(gsjax.InputError, match="at least 1"):
+        photograph(0, samples=0)
+
+
+def test_a_pixel_is_the_mean_of_its_samples():
+    """So a photograph of half the size is the mean over 2 × 2 pixels."""
+    half = photograph(1, samples=2, size=(48, 36))[0]
+    full = photograph(1, samples=1, size=(96, 72))[0]
+    mean = full.reshape(36, 2, 48, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(half, mean, atol=2e-5)
+
+
+def test_points_lie_on_what_is_seen():
+    points, colors = raycaster.surface_points(800, seed=3)
+    assert points.shape == colors.shape == (800, 3)
+    assert colors.dtype == np.uint8
+    nearest = np.min(
+        [np.abs(s.shape.distance(s.local(points.T))) for s in raycaster.solids()],
+        axis=0,
+    )
+    assert nearest.max() < 0.02  # five times the noise
+    assert 0.001 < nearest.mean() < 0.006
+    same, _ = raycaster.surface_points(800, seed=3)
+    np.testing.assert_array_equal(points, same)
+    rgb, depth, viewmat, K = photograph(6, size=(320, 240), samples=1)
+    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    u, v = ((local @ K.T)[:, :2] / local[:, 2:]).astype(int).T
+    inside = (u >= 0) & (u < 320) & (v >= 0) & (v < 240)
+    u, v, z = u[inside], v[inside], local[inside, 2]
+    gap = z - depth[v, u]
+    seen = np.abs(gap) < 0.05
+    assert seen.mean() > 0.5
+    assert (gap > -0.05).mean() > 0.97  # nothing floats before the surfaces
+    off = rgb[v, u][seen] - colors[inside][seen] / 255
+    assert np.median(np.abs(off)) < 0.02  # no surface depends on the view
+
+
+SHAPES = {
+    "sphere": sphere(0.7),
+    "box": box((0.5, 0.3, 0.6)),
+    "torus": torus(0.6, 0.2),
+    "disc": disc(0.8),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_hits_are_on_the_surface_and_first(name, dtype):
+    """Against the signed distance sampled along each ray, which knows no hit."""
+    shape = SHAPES[name]
+    rng = np.random.default_rng(0)
+    origin = np.asarray([1.4, -1.1, 0.9], dtype)
+    aims = rng.uniform(-0.8, 0.8, (3, 400)).astype(dtype)
+    directions = (aims - origin[:, None]) * dtype(0.4)
+    t = shape.hit(origin, directions)
+    hit = np.isfinite(t)
+    assert t.dtype == dtype
+    assert 60 < hit.sum() < 390
+    at = origin[:, None] + t[hit] * directions[:, hit]
+    assert np.abs(shape.distance(at)).max() < 1e-5
+    normals = shape.normal(at)
+    np.testing.assert_allclose((normals**2).sum(axis=0), 1, atol=1e-5)
+    step = 1e-2
+    rise = shape.distance(at + dtype(step) * normals)
+    np.testing.assert_allclose(rise, step, atol=2e-5)
+    for share in np.linspace(0, 0.995, 100):
+        before = shape.distance(origin[:, None] + share * t[hit] * directions[:, hit])
+        assert before.min() > 0
+    if name != "disc":
+        for past in np.linspace(0, 6, 300):
+            missed = origin[:, None] + past * directions[:, ~hit]
+            assert shape.distance(missed).min() > -1e-3
+
+
+def test_rays_from_inside_leave():
+    origin = np.zeros(3)
+    directions = np.eye(3)
+    np.testing.assert_allclose(sphere(0.7).hit(origin, directions), 0.7)
+    half = (0.5, 0.3, 0.6)
+    np.testing.assert_allclose(box(half).hit(origin, directions), half)
+    found = torus(0.6, 0.2).hit(origin, directions)
+    np.testing.assert_allclose(found, [0.4, 0.4, np.inf], atol=1e-5)
+
+
+def test_dataset_files(tmp_path):
+    settings = DemoDatasetSettings(photos=6, width=64, height=48, points=200)
+    raycaster.write_demo_dataset(tmp_path / "set", settings)
+    folder = tmp_path / "set"
+    entries = load_transforms(folder / "transforms.json")
+    assert len(entries) == 6
+    data = json.loads((folder / "transforms.json").read_text())
+    files = [folder / frame["file_path"] for frame in data["frames"]]
+    pixels = cv2.imread(str(files[4]))[..., ::-1]
+    viewmats, K = raycaster.demo_cameras(6, 64, 48)
+    rgb, _ = raycaster.cast(viewmats[4], K, 64, 48, 2)
+    np.testing.assert_allclose(pixels / 255, rgb, atol=0.6 / 255)
+    np.testing.assert_allclose(entries[4].camera.viewmat, viewmats[4], atol=1e-6)
+    raw = (folder / data["ply_file_path"]).read_bytes()
+    head, _, body = raw.partition(b"end_header\n")
+    assert b"element vertex 200" in head
+    kinds = [(n, "<f4") for n in "xyz"] + [(n, "u1") for n in "rgb"]
+    rows = np.frombuffer(body, kinds)
+    points, colors = raycaster.surface_points(200)
+    np.testing.assert_allclose(rows["z"], points[:, 2], atol=1e-6)
+    np.testing.assert_array_equal(rows["g"], colors[:, 1])
+    with pytest.raises(gsjax.InputError, match="exists"):
+        raycaster.write_demo_dataset(folder, settings)
+    raycaster.write_demo_dataset(folder, settings, overwrite=True)

@@ -1,0 +1,132 @@
+"""Adam: against one written out here, with a rate for each kind of number."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsjax.gaussians import GaussianParams
+from gsjax.train.optimiser import Rates, adam_step, cooled, init_moments, means_rate
+
+COUNT, EXTENT, STEPS = 5, 3.0, 7
+RATES = Rates(means=(2e-3, 5e-5), quats=3e-3, cooling=0.2)
+SHAPES = {
+    "means": (3,),
+    "quats": (4,),
+    "log_scales": (3,),
+    "logit_opacities": (),
+    "sh": (9, 3),
+}
+
+step = jax.jit(adam_step, static_argnums=3)
+
+
+def draw(rng, dtype=np.float64):
+    return GaussianParams(
+        **{
+            name: jnp.asarray(rng.normal(size=(COUNT, *shape)), dtype)
+            for name, shape in SHAPES.items()
+        }
+    )
+
+
+def rate_of(name, fraction):
+    if name == "means":
+        first, last = RATES.means
+        logs = (1 - fraction) * np.log(first) + fraction * np.log(last)
+        return EXTENT * np.exp(logs)
+    share = 1 if fraction < 0.6 else 0.2 ** ((fraction - 0.6) / 0.4)
+    if name == "sh":
+        return share * np.where(np.arange(9) == 0, RATES.sh_dc, RATES.sh_rest)[:, None]
+    return share * getattr(RATES, name)
+
+
+def test_is_plain_adam():
+    rng = np.random.default_rng(0)
+    params = draw(rng)
+    moments = init_moments(params)
+    wanted = {name: np.asarray(getattr(params, name)) for name in SHAPES}
+    first = {name: np.zeros_like(value) for name, value in wanted.items()}
+    second = {name: np.zeros_like(value) for name, value in wanted.items()}
+    for count in range(1, STEPS + 1):
+        grads = draw(rng)
+        fraction = (count - 1) / STEPS
+        params, moments = step(params, grads, moments, RATES, fraction, EXTENT)
+        for name in SHAPES:
+            g = np.asarray(getattr(grads, name))
+            first[name] = 0.9 * first[name] + 0.1 * g
+            second[name] = 0.999 * second[name] + 0.001 * g * g
+            m, v = first[name] / (1 - 0.9**count), second[name] / (1 - 0.999**count)
+            wanted[name] = wanted[name] - rate_of(name, fraction) * m / (
+                np.sqrt(v) + 1e-15
+            )
+            np.testing.assert_allclose(getattr(params, name), wanted[name], rtol=1e-10)
+            np.testing.assert_allclose(getattr(moments.mu, name), first[name])
+
+
+def test_the_first_step_is_the_rate():
+    """Of every number alike: ± its rate, whatever the size of the gradient."""
+    rng = np.random.default_rng(1)
+    params = draw(rng)
+    grads = jax.tree.map(lambda a: a * 1e-6, draw(rng))
+    moved, _ = step(params, grads, init_moments(params), RATES, 0.0, EXTENT)
+    for name in SHAPES:
+        shift = getattr(moved, name) - getattr(params, name)
+        wanted = -np.sign(getattr(grads, name)) * rate_of(name, 0.0)
+        np.testing.assert_allclose(shift, wanted, rtol=1e-4)  # of ε
+
+
+def test_schedule_of_the_means():
+    fractions = np.linspace(0, 1, 11)
+    found = [means_rate(RATES, f, EXTENT) for f in fractions]
+    wanted = np.geomspace(2e-3, 5e-5, 11) * EXTENT
+    np.testing.assert_allclose(found, wanted, rtol=1e-6)
+    assert means_rate(RATES, 2.0, EXTENT) == pytest.approx(wanted[-1], rel=1e-6)
+    for rate in (0.0, 1e-3):  # constant, 0 included
+        held = means_rate(Rates(means=(rate, rate)), jnp.asarray(0.3), EXTENT)
+        assert held == pytest.approx(rate * EXTENT)
+
+
+def test_schedule_of_the_others():
+    """Constant, then log-linear to the share left; exactly 1 without cooling."""
+    fractions = jnp.asarray([0.0, 0.3, 0.6, 0.8, 1.0, 1.5])
+    wanted = [1.0, 1.0, 1.0, np.sqrt(0.2), 0.2, 0.2]
+    np.testing.assert_allclose(cooled(RATES, fractions), wanted, rtol=1e-6)
+    assert (cooled(Rates(), fractions) == 1).all()
+    early = RATES._replace(cooling_from=0.0)
+    np.testing.assert_allclose(cooled(early, fractions), 0.2 ** fractions.clip(0, 1))
+
+
+@pytest.mark.parametrize("garbage", [0.0, -1.5, np.nan, np.inf, 1e30])
+def test_without_gradient_nothing_moves(garbage):
+    """Inactive slots: gradient and moments are zero, the contents anything."""
+    rng = np.random.default_rng(2)
+    dead = np.asarray([False, True, False, True, False])
+
+    def fill(value):
+        def one(leaf):
+            wide = dead.reshape(-1, *(1,) * (leaf.ndim - 1))
+            return jnp.where(wide, jnp.asarray(value, leaf.dtype), leaf)
+
+        return one
+
+    start = jax.tree.map(fill(garbage), draw(rng, np.float32))
+    params, moments = start, init_moments(start)
+    for _ in range(3):
+        grads = jax.tree.map(fill(0), draw(rng, np.float32))
+        params, moments = step(params, grads, moments, RATES, 0.5, EXTENT)
+    for name in SHAPES:
+        before, after = getattr(start, name), getattr(params, name)
+        assert after.dtype == np.float32
+        np.testing.assert_array_equal(after[dead], before[dead])
+        assert (after[~dead] != before[~dead]).all()
+        for moment in (moments.mu, moments.nu):
+            assert (getattr(moment, name)[dead] == 0).all()
+
+
+def test_times_multiplies_every_rate():
+    rates = RATES.times(3.0)
+    assert rates[-2:] == RATES[-2:]  # when they fall, and how far
+    for found, one in zip(jax.tree.leaves(rates[:-2]), jax.tree.leaves(RATES[:-2])):
+        assert found == pytest.approx(3 * one)
+    assert isinstance(rates.means, tuple)
