@@ -23,6 +23,7 @@ from gsjax.planning.types import Plan
 from gsjax.raster.render import exact_config, render
 from gsjax.raster.types import RasterConfig
 from gsjax.runtime.console import progress
+from gsjax.runtime.devices import on_cpu
 from gsjax.runtime.machine import all_of, usable_cores
 from gsjax.runtime.timing import interleaved
 from gsjax.synthetic.stress_scenes import StressScene
@@ -161,7 +162,7 @@ def _ready_runs(
         return run
 
     every = [exact, *settings]
-    if jax.default_backend() == "cpu":
+    if on_cpu():
         # All cores compile one, and the programs, which take them all, would meet.
         return [ready(point) for point in progress(every, "pictures")]
     with ThreadPoolExecutor(usable_cores()) as pool:

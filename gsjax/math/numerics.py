@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.runtime.devices import on_cpu
 
 Array = jax.Array
 
@@ -86,7 +87,7 @@ def held(mask: Array) -> Array:
     By a division: XLA's CPU backend (jax 0.10.2) takes all that leads to a mask for so
     cheap that it does it anew in each kernel that uses it.
     """
-    if jax.default_backend() != "cpu":
+    if not on_cpu():
         return mask
     one = np.float32(1)
     return one / jnp.where(mask, one, np.float32(np.inf)) > 0
@@ -99,7 +100,7 @@ def once(values: tuple[Array, ...], mask: Array) -> tuple[Array, ...]:
       values: equally shaped arrays.
       mask: what of them counts; the rest may come out as halves.
     """
-    if jax.default_backend() != "cpu":
+    if not on_cpu():
         return values
     one = jnp.where(mask, 1, 2).astype(values[0].dtype)
     return tuple(value / one for value in values)
@@ -178,7 +179,7 @@ def exp_negative(x: Array) -> Array:
     In float32 on a CPU in fewer operations than `jnp.exp`: nothing has to be guarded
     above, and one term less is enough. Elsewhere it is `jnp.exp`.
     """
-    if x.dtype != jnp.float32 or jax.default_backend() != "cpu":
+    if x.dtype != jnp.float32 or not on_cpu():
         return jnp.exp(x)
     power = jnp.maximum(x * np.float32(np.log2(np.e)), -126)
     whole = jax.lax.round(power, jax.lax.RoundingMethod.TO_NEAREST_EVEN)

@@ -22,6 +22,7 @@ from gsjax.planning.sizes import shown, tuned, with_capacities
 from gsjax.planning.types import Plan, Reason
 from gsjax.raster.render import DEFAULT_CONFIG, requires_concrete_values
 from gsjax.raster.types import COLOR_LIMIT, RasterConfig
+from gsjax.runtime.devices import platform_name
 
 _CAMERAS = 12  # to measure on, at most
 _SH_SHARE = 0.25
@@ -87,7 +88,7 @@ def plan(
         told = Reason(
             "tile_size, chunk_size",
             f"{config.tile_size} px and {config.chunk_size} Gaussians: the defaults "
-            f"of {jax.default_backend()}, not timed (tune=True does)",
+            f"of {platform_name()}, not timed (tune=True does)",
         )
     reasons.append(told)
     demands = None if measured is None or tune else measured.demands

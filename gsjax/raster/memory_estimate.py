@@ -17,6 +17,7 @@ from gsjax.raster.compositing import fused, fused_vjp, parallel, schedules
 from gsjax.raster.lists import binning
 from gsjax.raster.tile_render import default_pair_capacity
 from gsjax.raster.types import RasterConfig
+from gsjax.runtime.devices import on_cpu
 from gsjax.runtime.memory import Estimate
 
 _PAIRS = "for (tile, Gaussian) pairs"
@@ -65,7 +66,7 @@ def render_estimate(
     share = -(-capacity // devices)
     channels = 1 + 3 * ("rgb" in config.outputs) + ("depth" in config.outputs)
     numbers = 11 + 3 * bases
-    by_turns = jax.default_backend() == "cpu"
+    by_turns = on_cpu()
     count = _by_turns if by_turns else _side_by_side
     if gradients and by_turns and fused_vjp.suits(3, width, grid, config):
         blended = kept = fused.look_capacity(share, grid) * config.tile_size**2

@@ -20,7 +20,7 @@ from gsjax.raster.lists.depth_order import depth_order
 from gsjax.raster.primitives.ellipsoid import project
 from gsjax.raster.tile_render import device_count, rasterise
 from gsjax.raster.types import COLOR_LIMIT, Array, Demand, RasterConfig
-from gsjax.runtime.devices import shard_rows
+from gsjax.runtime.devices import on_cpu, shard_rows
 
 
 @partial(
@@ -65,7 +65,7 @@ def draw(
     # The names that a profile shows.
     with jax.named_scope("order"):
         order, visible = depth_order(gaussians, camera, config, features)
-    if features is None and gaussians.sh_degree > 0 and jax.default_backend() == "cpu":
+    if features is None and gaussians.sh_degree > 0 and on_cpu():
         # Colours that turn with the view are worth what it costs to bring the parts
         # together again; a mean and a covariance alone are not.
         order = shard_rows(order, device_count(config), fill=gaussians.capacity)

@@ -19,7 +19,7 @@ from gsjax.raster.compositing.parallel import composite_parallel
 from gsjax.raster.lists import binning
 from gsjax.raster.lists.counting import COUNT_LIMIT
 from gsjax.raster.types import Array, Demand, Projected, RasterConfig
-from gsjax.runtime.devices import spread
+from gsjax.runtime.devices import on_cpu, spread
 
 
 def default_pair_capacity(ranks: int, grid: binning.Grid) -> int:
@@ -101,7 +101,7 @@ def _rasterise_local(
             geometry, spans, grid, device, capacity, config.num_size_buckets, tiles
         )
     with jax.named_scope("composite"):
-        if jax.default_backend() == "cpu":
+        if on_cpu():
             images, wanted = _composite_by_turns(projected, lists, device, grid, config)
         else:
             images = composite_parallel(projected, lists, device, grid, config)

@@ -40,6 +40,16 @@ _KERNEL_OPTION = "xla_cpu_small_while_loop_byte_threshold"
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4
 
 
+def platform_name() -> str:
+    """Return JAX's default platform, such as "cpu", "gpu" or "tpu"; starts JAX."""
+    return jax.default_backend()
+
+
+def on_cpu() -> bool:
+    """Return True if JAX computes on a CPU by default; starts JAX."""
+    return platform_name() == "cpu"
+
+
 def use_all_cores(count: int | None = None, *, queued: bool = True) -> int:
     """Let JAX show ``count`` CPU devices (default: the cores this process may use).
 
@@ -77,7 +87,7 @@ def use_all_cores(count: int | None = None, *, queued: bool = True) -> int:
         try:
             jax.config.update("jax_num_cpu_devices", count)
         except RuntimeError as error:
-            if jax.default_backend() != "cpu" or jax.local_device_count() == count:
+            if not on_cpu() or jax.local_device_count() == count:
                 return jax.local_device_count()
             raise RuntimeError(
                 "use_all_cores came after JAX had started; call it before the first "

@@ -87,7 +87,9 @@ def available() -> int | None:
     """
     import jax
 
-    if jax.default_backend() != "cpu":
+    from gsjax.runtime.devices import on_cpu
+
+    if not on_cpu():
         stats = jax.local_devices()[0].memory_stats() or {}
         if not {"bytes_limit", "bytes_in_use"} <= set(stats):
             return None

@@ -17,6 +17,7 @@ from gsjax.errors import CapacityError
 from gsjax.gaussians import Gaussians, capacity_bucket, grow
 from gsjax.raster.render import count_demand
 from gsjax.raster.types import RasterConfig
+from gsjax.runtime.devices import on_cpu
 from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Frames
 from gsjax.train.state import TrainState
@@ -48,7 +49,7 @@ _ON_ACCELERATOR = _Price(16 / 1e-9, 16 / 0.3e-9, 4.0)  # an H100
 
 
 def _price() -> _Price:
-    return _ON_CPU if jax.default_backend() == "cpu" else _ON_ACCELERATOR
+    return _ON_CPU if on_cpu() else _ON_ACCELERATOR
 
 
 def pairs_for(state: TrainState, frames: Frames, config: TrainConfig) -> int:

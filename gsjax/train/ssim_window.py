@@ -16,6 +16,7 @@ from jax import lax
 from jax.custom_batching import sequential_vmap
 
 from gsjax.runtime.custom_transpose import custom_transpose
+from gsjax.runtime.devices import on_cpu
 from gsjax.runtime.loops import each, part_at, with_part
 
 Array = jax.Array
@@ -30,7 +31,7 @@ _STRETCH = 1024
 def window_means(planes: Sequence[Array]) -> list[Array]:
     """Means of planes [H, W, C], all of one shape and type, under the window at each
     pixel and channel, alike."""
-    by = _by_loops if jax.default_backend() == "cpu" else _by_products
+    by = _by_loops if on_cpu() else _by_products
     return custom_transpose(
         lambda *planes: list(by(planes)),
         lambda *cotangents: window_means(cotangents),

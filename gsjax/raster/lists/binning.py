@@ -10,7 +10,6 @@ Axis legend: R ranks (front to back), T tiles, P pairs.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
@@ -19,6 +18,7 @@ from gsjax.raster.lists.blocks import block_size
 from gsjax.raster.lists.counting import cumulative_sum, segment_ids, total_count
 from gsjax.raster.lists.tile_lists import choose_list_builder
 from gsjax.raster.types import Array, Projected
+from gsjax.runtime.devices import platform_name
 
 
 class Grid(NamedTuple):
@@ -239,7 +239,7 @@ def make_lists(
         ones of their row on both sides is listed all the same.)
       platform: that the lists are made for; None means that of JAX.
     """
-    platform = platform or jax.default_backend()
+    platform = platform or platform_name()
     ranks = projected.u.shape[0]
     _, countable = total_count(spans.rows)
     past = jnp.where(spans.rows > 0, lax.iota(jnp.int32, ranks) + 1, 0)

@@ -18,6 +18,7 @@ from jax import lax
 from gsjax.raster.lists.counting import compact_indices
 from gsjax.raster.types import Array
 from gsjax.raster.vmap_branching import any_in_batch
+from gsjax.runtime.devices import on_cpu
 
 T = TypeVar("T")
 
@@ -26,7 +27,7 @@ BLOCK = 8192  # slots; what they hold stays in a core's cache
 
 def block_size(size: int, times: int = 1) -> int:
     """Slots of a block, ``times`` the usual many, where there are ``size`` in all."""
-    cpu = jax.default_backend() == "cpu"
+    cpu = on_cpu()
     return max(1, min(times * BLOCK, size) if cpu else size)
 
 

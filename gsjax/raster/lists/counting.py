@@ -2,12 +2,12 @@
 derivative is taken here.
 """
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
 from gsjax.raster.types import Array
 from gsjax.runtime import loops
+from gsjax.runtime.devices import on_cpu
 
 # A total above this is reported as 2^31 - 1: int32 sums must not wrap.
 COUNT_LIMIT = 2**30
@@ -22,7 +22,7 @@ def total_count(counts: Array) -> tuple[Array, Array]:
 
 def cumulative_sum(counts: Array) -> Array:
     """Inclusive sums [n] int32 of counts [n]."""
-    if jax.default_backend() == "cpu":
+    if on_cpu():
         return loops.cumulative_sum(counts.astype(jnp.int32))
     return jnp.cumsum(counts, dtype=jnp.int32)
 
@@ -39,7 +39,7 @@ def segment_ids(ends: Array, room: int, start: Array | int = 0) -> Array:
       [room] int32, rising; n past the last.
     """
     place = jnp.maximum(ends - start, 0)
-    if jax.default_backend() == "cpu":
+    if on_cpu():
         passed = jnp.zeros(room, jnp.int32).at[place].add(1, mode="drop")
         return cumulative_sum(passed)
     # Here whoever writes to one place waits for the others: so each owner that has
@@ -63,7 +63,7 @@ def compact_indices(chosen: Array, room: int) -> tuple[Array, Array]:
       count: [] int32 of what is chosen, not limited to ``room``.
     """
     size = chosen.shape[0]
-    if jax.default_backend() == "cpu":
+    if on_cpu():
         whole = jnp.pad(chosen, (0, -size % loops.STRETCH))
         some = jnp.any(whole.reshape(-1, loops.STRETCH), axis=1)
         past = jnp.full(room + 1, size, jnp.int32)

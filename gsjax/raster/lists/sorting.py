@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from gsjax.runtime.devices import on_cpu
+
 Array = jax.Array
 
 _REST_BITS = 31
@@ -23,7 +25,7 @@ _REST_BITS = 31
 
 def _sort(keys: Array) -> Array:
     """Equal keys are the same, so their order is a matter of speed alone."""
-    return lax.sort(keys, is_stable=jax.default_backend() == "cpu")
+    return lax.sort(keys, is_stable=on_cpu())
 
 
 def bits_for(count: int) -> int:
