@@ -5,14 +5,16 @@ Coordinates are those of the package, pixel centres at + 0.5.
 
 import numpy as np
 
-from gsjax.data.types import Lens
+from gsjax.data.types import Distortion
 from gsjax.errors import InputError
 
 _SAMPLES = 4096
 _BAND = 256
 
 
-def distort(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def distort(
+    lens: Distortion, x: np.ndarray, y: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Distorted image coordinates at unit focal length of undistorted ones.
 
     Brown–Conrady with a rational radial part, or Kannala–Brandt, both as OpenCV
@@ -25,7 +27,7 @@ def distort(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nd
     """
     radius = np.hypot(x, y)
     limit = _fold(lens, float(radius.max(initial=0.0)))
-    if lens.kind == "fisheye":
+    if lens.model == "fisheye":
         scale = _radial(lens, radius)
         xd, yd = x * scale, y * scale
     else:
@@ -39,21 +41,21 @@ def distort(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nd
     return xd, yd
 
 
-def _coefficients(lens: Lens) -> list[float]:
+def _coefficients(lens: Distortion) -> list[float]:
     """All coefficients of the kind, those that are not given as 0."""
     counts = {"radial_tangential": ((4, 5, 8), 8), "fisheye": ((4,), 4)}
-    given, full = counts.get(lens.kind, ((), 0))
+    given, full = counts.get(lens.model, ((), 0))
     if len(lens.coefficients) not in given:
         raise InputError(
-            f"lens {lens.kind!r} with {len(lens.coefficients)} coefficients; wanted: "
+            f"lens {lens.model!r} with {len(lens.coefficients)} coefficients; wanted: "
             "radial_tangential with 4, 5 or 8, or fisheye with 4"
         )
     return [*lens.coefficients, *[0.0] * (full - len(lens.coefficients))]
 
 
-def _radial(lens: Lens, radius: np.ndarray) -> np.ndarray:
+def _radial(lens: Distortion, radius: np.ndarray) -> np.ndarray:
     """Distorted over undistorted radius."""
-    if lens.kind == "fisheye":
+    if lens.model == "fisheye":
         k1, k2, k3, k4 = _coefficients(lens)
         angle = np.arctan(radius)
         t = angle * angle
@@ -67,7 +69,7 @@ def _radial(lens: Lens, radius: np.ndarray) -> np.ndarray:
     return above / np.where(below > 0, below, np.nan)
 
 
-def _fold(lens: Lens, largest: float) -> float:
+def _fold(lens: Distortion, largest: float) -> float:
     """Radius up to which the distorted radius grows, searched for up to ``largest``."""
     radii = np.linspace(0, largest * (1 + 1 / _SAMPLES), _SAMPLES)
     distorted = radii * _radial(lens, radii)
@@ -76,7 +78,7 @@ def _fold(lens: Lens, largest: float) -> float:
 
 
 def undistortion_maps(
-    lens: Lens, K: np.ndarray, width: int, height: int
+    lens: Distortion, K: np.ndarray, width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sources of the pixels of an ideal pinhole of the same K and size.
 

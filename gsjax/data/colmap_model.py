@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsjax.data.types import Lens, intrinsic_matrix
+from gsjax.data.types import Distortion, intrinsic_matrix
 from gsjax.errors import InputError
 
 MAX_NAME_BYTES = 1024
@@ -26,7 +26,7 @@ class CameraKind(NamedTuple):
       number: as in cameras.bin.
       size: how many parameters it has.
       focals: how many of them are focal lengths (1: fx = fy); cx and cy follow.
-      lens: kind of `Lens` of what is left, "" if nothing is; None if unsupported.
+      lens: kind of `Distortion` of what is left, "" if nothing is; None if unsupported.
       order: where each left-over parameter stands in the coefficients of the lens.
     """
 
@@ -69,7 +69,7 @@ class ColmapCamera(NamedTuple):
     width: int
     height: int
     K: np.ndarray
-    lens: Lens | None
+    lens: Distortion | None
 
 
 class ColmapImage(NamedTuple):
@@ -138,14 +138,14 @@ def make_colmap_camera(
     return ColmapCamera(*size, K, _lens(kind, rest))
 
 
-def _lens(kind: CameraKind, rest: tuple[float, ...]) -> Lens | None:
+def _lens(kind: CameraKind, rest: tuple[float, ...]) -> Distortion | None:
     # A fisheye of zero coefficients is equidistant, not a pinhole.
     if not kind.lens or (kind.lens == _RADIAL and not any(rest)):
         return None
     coefficients = [0.0] * max(4, len(rest))
     for at, value in zip(kind.order, rest):
         coefficients[at] = value
-    return Lens(kind.lens, tuple(coefficients))
+    return Distortion(kind.lens, tuple(coefficients))
 
 
 def make_colmap_image(

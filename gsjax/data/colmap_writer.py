@@ -58,7 +58,7 @@ def _camera(view: View) -> bytes:
     name, rest = "PINHOLE", ()
     if view.lens is not None:
         rest = view.lens.coefficients
-        if view.lens.kind == "fisheye":
+        if view.lens.model == "fisheye":
             name = "OPENCV_FISHEYE"
         else:
             name = "OPENCV" if len(rest) == 4 else "FULL_OPENCV"

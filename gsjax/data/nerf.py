@@ -32,7 +32,7 @@ from gsjax.data.transforms_fields import (
     text_of,
     warn_of_scaled,
 )
-from gsjax.data.types import Dataset, Lens, View, intrinsic_matrix
+from gsjax.data.types import Dataset, Distortion, View, intrinsic_matrix
 from gsjax.errors import InputError
 from gsjax.io.point_cloud import read_point_cloud
 
@@ -194,7 +194,7 @@ def _view(
 ) -> View:
     lens = _lens(frame)
     width, height = size
-    model = "fisheye" if lens is not None and lens.kind == "fisheye" else "pinhole"
+    model = "fisheye" if lens is not None and lens.model == "fisheye" else "pinhole"
     fx, fy = focal_lengths(frame, width, height, model)
     cx, cy = first_number(frame, "cx"), first_number(frame, "cy")
     cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
@@ -267,7 +267,7 @@ def _warn_of_dynamic_masks(views: list[View]) -> None:
         )
 
 
-def _lens(frame: Frame) -> Lens | None:
+def _lens(frame: Frame) -> Distortion | None:
     model = model_of(frame)
     if model not in (*_PERSPECTIVE, *_FISHEYE):
         raise InputError(
@@ -281,7 +281,7 @@ def _lens(frame: Frame) -> Lens | None:
             raise InputError(
                 f"{frame.where}: a fisheye has no p1, p2; found {p1}, {p2}"
             )
-        return Lens("fisheye", (k1, k2, k3, k4))
+        return Distortion("fisheye", (k1, k2, k3, k4))
     if not any((k1, k2, k3, k4, p1, p2)):
         return None
     # As nerfstudio and instant-ngp, which read no rational denominator.
@@ -291,7 +291,7 @@ def _lens(frame: Frame) -> Lens | None:
             f"{frame.where}: {', '.join(k for k, v in higher.items() if v)} of a lens "
             "that is no fisheye is not supported; undistort the photographs first"
         )
-    return Lens("radial_tangential", (k1, k2, p1, p2, k3))
+    return Distortion("radial_tangential", (k1, k2, p1, p2, k3))
 
 
 def _coefficients(frame: Frame) -> list[float]:

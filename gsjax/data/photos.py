@@ -17,7 +17,7 @@ import numpy as np
 from gsjax.cameras.distortion import undistortion_maps
 from gsjax.data.decode import decode, telling_of_damage
 from gsjax.data.image_header import image_size
-from gsjax.data.types import Lens, Photo, View
+from gsjax.data.types import Distortion, Photo, View
 from gsjax.errors import InputError
 from gsjax.io.images import opencv
 from gsjax.runtime.machine import all_of, usable_cores
@@ -230,7 +230,7 @@ _maps_lock = threading.Lock()
 _maps_of: OrderedDict[tuple, Future] = OrderedDict()
 
 
-def _maps(lens: Lens, K: np.ndarray, width: int, height: int):
+def _maps(lens: Distortion, K: np.ndarray, width: int, height: int):
     """`undistortion_maps`: made by one thread of those that want the same."""
     key = (lens, tuple(K.ravel().tolist()), width, height)
     with _maps_lock:
@@ -253,7 +253,7 @@ def _maps(lens: Lens, K: np.ndarray, width: int, height: int):
 
 def _undistorted(
     path: Path,
-    lens: Lens,
+    lens: Distortion,
     K: np.ndarray,
     pixels: np.ndarray,
     alpha: np.ndarray | None,
@@ -265,7 +265,7 @@ def _undistorted(
         told = ", ".join(f"{value:g}" for value in lens.coefficients)
         raise InputError(
             f"{path}: of its {seen.size:,} pixels {int(seen.sum())} are left when the "
-            f"lens of its camera ({lens.kind}, {told}) is undone; estimate the camera "
+            f"lens of its camera ({lens.model}, {told}) is undone; estimate the camera "
             "again, or remove the photograph"
         )
     cv2 = opencv()

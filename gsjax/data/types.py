@@ -39,16 +39,16 @@ def intrinsic_matrix(
     return np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
-class Lens(NamedTuple):
+class Distortion(NamedTuple):
     """Distortion of a photograph, in OpenCV's terms.
 
     Attributes:
-      kind: "radial_tangential" (`cv2.undistort`: k1 k2 p1 p2 [k3 [k4 k5 k6]]) or
+      model: "radial_tangential" (`cv2.undistort`: k1 k2 p1 p2 [k3 [k4 k5 k6]]) or
         "fisheye" (`cv2.fisheye`: k1 k2 k3 k4, Kannala–Brandt).
-      coefficients: as many as the kind takes, in OpenCV's order.
+      coefficients: as many as the model takes, in OpenCV's order.
     """
 
-    kind: str
+    model: str
     coefficients: tuple[float, ...]
 
 
@@ -76,7 +76,7 @@ class View:
     K: np.ndarray
     width: int
     height: int
-    lens: Lens | None = None
+    lens: Distortion | None = None
     mask: Path | None = None
     split: str | None = None
     near: float = NEAR

@@ -18,7 +18,7 @@ from gsjax.data.colmap_writer import write_colmap
 from gsjax.data.dataset import load_dataset
 from gsjax.data.image_files import find_mask
 from gsjax.data.photos import load_photo
-from gsjax.data.types import Lens
+from gsjax.data.types import Distortion
 from gsjax.errors import InputError
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -141,7 +141,7 @@ def test_camera_models(tmp_path, kind):
             assert "PINHOLE" in kind.name
             found = x, y
         else:
-            assert ours.lens.kind == kind.lens
+            assert ours.lens.model == kind.lens
             found = distort(ours.lens, x, y)
         pixels = np.stack([*found, np.ones(50)]).T @ ours.K.T
         wanted = camera.img_from_cam(np.stack([x, y, np.ones(50)], -1))
@@ -159,7 +159,7 @@ def test_no_distortion_is_no_lens(tmp_path):
     found = colmap_binary.read_cameras(tmp_path / "cameras.bin")
     assert found[1].lens is None
     assert found[2].lens is None
-    assert found[3].lens == Lens("fisheye", (0.0,) * 4)  # equidistant: no pinhole
+    assert found[3].lens == Distortion("fisheye", (0.0,) * 4)  # equidistant: no pinhole
 
 
 # --- poses ---
@@ -185,9 +185,9 @@ def test_quaternions_there_and_back():
 @pytest.mark.parametrize("at", [(0, 0, 0), (5e5, -4.1e6, 120)])
 def test_written_and_read(tmp_path, at):
     scene = scene_of_views(at=np.asarray(at))
-    lenses = [None, Lens("radial_tangential", (0.1, 0.0, 0.0, 0.02))]
-    lenses += [Lens("radial_tangential", (0.1, 0.0, 0.0, 0.02, 0.3))]
-    lenses += [Lens("fisheye", (0.1, 0.0, 0.0, 0.02)), None]
+    lenses = [None, Distortion("radial_tangential", (0.1, 0.0, 0.0, 0.02))]
+    lenses += [Distortion("radial_tangential", (0.1, 0.0, 0.0, 0.02, 0.3))]
+    lenses += [Distortion("fisheye", (0.1, 0.0, 0.0, 0.02)), None]
     views = tuple(replace(v, lens=lens) for v, lens in zip(scene.views, lenses))
     scene = replace(scene, views=views)
     write_colmap(tmp_path / "a" / "b", scene)
@@ -200,7 +200,7 @@ def test_written_and_read(tmp_path, at):
         assert (camera.width, camera.height) == SIZE
         assert (camera.lens is None) == (view.lens is None)
         if view.lens is not None and camera.lens is not None:
-            assert camera.lens.kind == view.lens.kind
+            assert camera.lens.model == view.lens.model
             given = view.lens.coefficients
             assert camera.lens.coefficients[: len(given)] == given
         found = viewmat_of(image.quat, image.translation)

@@ -10,7 +10,7 @@ from captures import SIZE, save_photo, scene_of_views, to_opengl
 from gsjax.data.dataset import load_dataset
 from gsjax.data.photos import load_photo
 from gsjax.data.transforms import load_transforms
-from gsjax.data.types import Lens
+from gsjax.data.types import Distortion
 from gsjax.errors import InputError
 from gsjax.io.point_cloud import read_point_cloud
 
@@ -78,7 +78,9 @@ def test_nerfstudio(tmp_path):
         np.testing.assert_array_equal(
             view.K, [[40, 0, 15.5], [0, 42, 12.25], [0, 0, 1]]
         )
-        assert view.lens == Lens("radial_tangential", (0.1, -0.02, 0.001, 0.002, 0.0))
+        assert view.lens == Distortion(
+            "radial_tangential", (0.1, -0.02, 0.001, 0.002, 0.0)
+        )
         assert view.image.is_file()
         assert view.split is None
     np.testing.assert_allclose(scene.points, made.points, rtol=1e-6)
@@ -95,7 +97,7 @@ def test_instant_ngp(tmp_path):
     put(tmp_path, frames, aabb_scale=16, scale=0.33, **PIXELS, **more)
     views = load_dataset(tmp_path).views
     assert [v.name for v in views] == ["images/0.jpg", "images/1.jpg", "images/2.jpg"]
-    assert views[0].lens == Lens("radial_tangential", (0.05, 0.01, 0.0, 0.0, 0.0))
+    assert views[0].lens == Distortion("radial_tangential", (0.05, 0.01, 0.0, 0.0, 0.0))
     assert views[0].K[0, 0] == 40
 
 
@@ -107,7 +109,7 @@ def test_fisheye(tmp_path, more):
         tmp_path, k1=0.1, k2=0.2, k3=0.3, k4=0.4, **{"camera_model": None, **more}
     )
     view = load_dataset(tmp_path).views[0]
-    assert view.lens == Lens("fisheye", (0.1, 0.2, 0.3, 0.4))
+    assert view.lens == Distortion("fisheye", (0.1, 0.2, 0.3, 0.4))
 
 
 def synthetic(folder):
@@ -203,7 +205,7 @@ def test_intrinsics_of_frames(tmp_path):
     views = load_dataset(tmp_path).views
     assert views[0].lens is None
     assert (views[1].width, views[1].K[0, 0], views[1].K[1, 2]) == (64, 99, 20)
-    assert views[2].lens == Lens("radial_tangential", (0.1, 0.2, 0.01, 0.02, 0.3))
+    assert views[2].lens == Distortion("radial_tangential", (0.1, 0.2, 0.01, 0.02, 0.3))
 
 
 def test_splits_by_name(tmp_path):

@@ -19,7 +19,7 @@ from gsjax.cameras.distortion import distort
 from gsjax.data.decode import telling_of_damage
 from gsjax.data.image_header import MAX_PIXELS, check_image, image_size
 from gsjax.data.photos import load_photo, load_photos, undistorted_view
-from gsjax.data.types import Lens, View
+from gsjax.data.types import Distortion, View
 from gsjax.errors import InputError
 from gsjax.sfm.photos import read_upright
 
@@ -196,7 +196,7 @@ def test_orientation_of_a_tiff_is_ignored(tmp_path, orientation, dtype):
 def test_a_lens_that_leaves_nothing_is_told(tmp_path):
     """And not taken for a mask."""
     path = save_photo(tmp_path / "a.png", NOISE)
-    lens = Lens("radial_tangential", (1e20, 0.0, 0.0, 0.0))
+    lens = Distortion("radial_tangential", (1e20, 0.0, 0.0, 0.0))
     wanted = r"a\.png: of its 768 pixels 0 are left .* \(radial_tangential, 1e\+20, 0"
     with pytest.raises(InputError, match=wanted):
         load_photo(view_of(path, lens=lens))
@@ -285,13 +285,13 @@ def test_max_size_is_checked(tmp_path):
 # --- lenses ---
 
 LENSES = {
-    "barrel": Lens("radial_tangential", (-0.12, 0.02, 0.003, -0.002)),
-    "pincushion": Lens("radial_tangential", (0.15, 0.05, -0.002, 0.004, 0.01)),
-    "rational": Lens(
+    "barrel": Distortion("radial_tangential", (-0.12, 0.02, 0.003, -0.002)),
+    "pincushion": Distortion("radial_tangential", (0.15, 0.05, -0.002, 0.004, 0.01)),
+    "rational": Distortion(
         "radial_tangential", (0.3, 0.1, 0.001, 0.002, 0.02, 0.35, 0.1, 0.01)
     ),
-    "fisheye": Lens("fisheye", (0.05, -0.02, 0.01, -0.003)),
-    "equidistant": Lens("fisheye", (0.0, 0.0, 0.0, 0.0)),
+    "fisheye": Distortion("fisheye", (0.05, -0.02, 0.01, -0.003)),
+    "equidistant": Distortion("fisheye", (0.0, 0.0, 0.0, 0.0)),
 }
 WIDE = np.asarray([[110.0, 0, 118.5], [0, 115.0, 93.25], [0, 0, 1]])
 WIDE_SIZE = (240, 180)
@@ -302,7 +302,7 @@ def through_lens(lens, x, y):
     points = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 1, 3)
     zero, coefficients = np.zeros(3), np.asarray(lens.coefficients)
     K = WIDE - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-    if lens.kind == "fisheye":
+    if lens.model == "fisheye":
         found, _ = cv2.fisheye.projectPoints(points, zero, zero, K, coefficients)
     else:
         found, _ = cv2.projectPoints(points, zero, zero, K, coefficients)
@@ -359,7 +359,7 @@ def test_valid_is_what_the_lens_saw(tmp_path, lens):
 def test_past_the_fold_nothing_is_valid(tmp_path):
     # r(1 − 0.5 r²) turns back at r = 0.816, where it reaches 0.544: all of the wider
     # field would be shown again, mirrored.
-    lens = Lens("radial_tangential", (-0.5, 0.0, 0.0, 0.0))
+    lens = Distortion("radial_tangential", (-0.5, 0.0, 0.0, 0.0))
     path = save_photo(tmp_path / "a.png", np.full(WIDE_SIZE[::-1], 200, np.uint8))
     photo = load_photo(view_of(path, *WIDE_SIZE, WIDE, lens=lens))
     x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in WIDE_SIZE))
@@ -378,7 +378,7 @@ def made_by(lens):
 def test_maps_of_cameras_are_made_at_a_time_and_each_once(monkeypatch):
     """A camera for each photograph, as COLMAP has it unless it is asked for one, is no
     queue; and threads that want the same wait for one of them."""
-    lenses = [Lens("radial_tangential", (k, 0, 0, 0)) for k in (0.1, 0.2)]
+    lenses = [Distortion("radial_tangential", (k, 0, 0, 0)) for k in (0.1, 0.2)]
     both, made = Barrier(2, timeout=20), []
 
     def maps(lens, *_):
@@ -394,7 +394,7 @@ def test_maps_of_cameras_are_made_at_a_time_and_each_once(monkeypatch):
 
 
 def test_maps_that_failed_are_tried_again(monkeypatch):
-    lens = Lens("radial_tangential", (0.3, 0, 0, 0))
+    lens = Distortion("radial_tangential", (0.3, 0, 0, 0))
     for error in (MemoryError, MemoryError, None):
 
         def maps(*_, error=error):
@@ -429,7 +429,9 @@ def test_undistorted_view(tmp_path):
     np.testing.assert_array_equal(ideal.K, photo.K)
 
 
-@pytest.mark.parametrize("lens", [Lens("fisheye", (0.1,)), Lens("mirror", (0.0,) * 4)])
+@pytest.mark.parametrize(
+    "lens", [Distortion("fisheye", (0.1,)), Distortion("mirror", (0.0,) * 4)]
+)
 def test_unknown_lenses(tmp_path, lens):
     path = save_photo(tmp_path / "a.png", NOISE)
     with pytest.raises(InputError, match=r"lens '.*' with . coefficients; wanted"):
