@@ -1,10 +1,9 @@
-"""The scene as a pytree: fixed-capacity float arrays with an active mask beside them.
+"""Gaussians as a pytree: float arrays of fixed capacity, and a mask of active slots.
 
 Axis legend: N capacity (slots), K spherical-harmonic bases.
 
-The floats (`GaussianParams`) are exactly what is differentiated; the mask lives
-beside them because `jax.grad` refuses a pytree with a boolean leaf. What stands in
-an inactive slot never matters, whatever it is: NaN included.
+`GaussianParams` holds the differentiable floats. The mask is kept beside them because
+`jax.grad` rejects boolean leaves. Values of inactive slots are ignored, even NaN.
 """
 
 import chex
@@ -16,6 +15,7 @@ from jax.core import Tracer
 from gsjax.errors import InputError
 from gsjax.math import sh as sh_lib
 from gsjax.math.numerics import exp_log_scale, real_floats, to_device
+from gsjax.runtime.devices import replicate
 from gsjax.runtime.settings import whole
 
 Array = jax.Array
@@ -23,7 +23,7 @@ Array = jax.Array
 
 @chex.dataclass(frozen=True, mappable_dataclass=False)
 class GaussianParams:
-    """The 14 + 3 (K - 1) numbers of each Gaussian (59 at degree 3), as stored.
+    """The 11 + 3 K numbers of each Gaussian (59 at degree 3), as stored.
 
     Attributes:
       means: [N, 3] world position.
@@ -42,11 +42,11 @@ class GaussianParams:
 
 @chex.dataclass(frozen=True, mappable_dataclass=False)
 class Gaussians:
-    """A scene: parameters, and which slots hold a Gaussian.
+    """A scene: parameters, and a mask of the slots that hold a Gaussian.
 
     Attributes:
-      params: N slots; what is differentiated.
-      active: [N] bool; what the other slots hold never matters, NaN included.
+      params: N slots of parameters, the differentiable part.
+      active: [N] bool; values of inactive slots are ignored, even NaN.
     """
 
     params: GaussianParams
@@ -62,6 +62,53 @@ class Gaussians:
         """Static degree of the spherical harmonics."""
         return sh_lib.degree_of(self.params.sh.shape[-2])
 
+    def __repr__(self) -> str:
+        try:
+            *batch, slots = self.active.shape
+            told = [f"batch={tuple(batch)}"] * bool(batch)
+            if isinstance(self.active, np.ndarray) or _has_values(self.active):
+                count = np.count_nonzero(np.asarray(self.active))
+                told.append(f"active={count}/{self.active.size}")
+            else:
+                told.append(f"capacity={slots}")
+            told += [f"sh_degree={self.sh_degree}", str(self.params.means.dtype)]
+            return f"Gaussians({', '.join(told)})"
+        except (AttributeError, InputError, IndexError, TypeError, ValueError):
+            # Transformations of JAX put other things than arrays into the leaves.
+            return f"Gaussians(params={self.params!r}, active={self.active!r})"
+
+
+def _has_values(array) -> bool:
+    """Return True for an array of JAX whose values can be read now."""
+    return (
+        isinstance(array, jax.Array)
+        and not isinstance(array, Tracer)
+        and not array.is_deleted()
+        and array.is_fully_addressable
+    )
+
+
+def check_gaussians(value, argument: str = "gaussians") -> None:
+    """Check the type of an argument.
+
+    Raises:
+      InputError: if ``value`` is not `Gaussians`; names the type found and a remedy.
+    """
+    if isinstance(value, Gaussians):
+        return
+    remedy = "make them with gsjax.make_gaussians, or read them with gsjax.load"
+    if isinstance(value, (list, tuple)):
+        remedy = "merge them with gsjax.concatenate, or call this for each of them"
+    elif isinstance(value, dict):
+        remedy = "call gsjax.make_gaussians(**fields)"
+    elif isinstance(value, GaussianParams):
+        remedy = "call gsjax.Gaussians(params=params, active=mask)"
+    elif isinstance(value, str) or hasattr(value, "__fspath__"):
+        remedy = "call gsjax.load(path)"
+    raise InputError(
+        f"{argument}: expected Gaussians, got {type(value).__name__}; {remedy}"
+    )
+
 
 # Contents of an unused slot: a unit quaternion, and an opacity of e^-20.
 _EMPTY = {"quats": (1.0, 0.0, 0.0, 0.0), "logit_opacities": -20.0}
@@ -70,7 +117,10 @@ _EMPTY = {"quats": (1.0, 0.0, 0.0, 0.0), "logit_opacities": -20.0}
 def make_gaussians(
     *, means, quats, log_scales, logit_opacities, sh, capacity: int | None = None
 ) -> Gaussians:
-    """Gaussians from arrays; traceable, so that `jax.grad` may go through it.
+    """Return Gaussians from arrays; traceable, so `jax.grad` may go through it.
+
+    Outside a transformation the arrays are placed on all local devices, where a render
+    places its results, unless ``jax.default_device`` names one device.
 
     Args:
       means: [N, 3] positions in the world.
@@ -79,10 +129,10 @@ def make_gaussians(
       logit_opacities: [N] or [N, 1].
       sh: [N, K, 3] coefficients with K = 1, 4, 9, 16 or 25.
       capacity: number of slots, at least N (and 1); default max(N, 1). See
-        `capacity_bucket` for sizes that make growing recompile rarely.
+        `capacity_bucket` for sizes that make recompilation rare.
 
     Raises:
-      InputError: if a shape is not as above or the capacity is below N or 1.
+      InputError: if a shape does not match, or the capacity is below N or 1.
     """
     arrays = {
         "means": means,
@@ -97,39 +147,42 @@ def make_gaussians(
         arrays["logit_opacities"] = opacities[:, 0]
     count = arrays["means"].shape[0] if arrays["means"].ndim else 0
     bases = arrays["sh"].shape[1] if arrays["sh"].ndim == 3 else "K"
-    wanted = {
+    expected = {
         "means": (count, 3),
         "quats": (count, 4),
         "log_scales": (count, 3),
         "logit_opacities": (count,),
         "sh": (count, bases, 3),
     }
-    for name, shape in wanted.items():
+    for name, shape in expected.items():
         if arrays[name].shape != shape:
             raise InputError(
-                f"{name} has shape {arrays[name].shape}; {shape} is wanted (the first "
-                "axis of means sets the number of Gaussians)"
+                f"{name}: expected shape {shape}, got {arrays[name].shape}; the first "
+                "axis of means sets the number of Gaussians"
             )
     sh_lib.degree_of(arrays["sh"].shape[1])
     slots = max(count, 1) if capacity is None else whole("capacity", capacity)
     if slots < max(count, 1):
         raise InputError(
-            f"capacity {capacity} cannot hold {count} Gaussians; pass at least "
-            f"{max(count, 1)}, or None"
+            f"capacity: expected at least {max(count, 1)} for {count} Gaussians, got "
+            f"{capacity}; pass a larger number, or None"
         )
     padded = {
         name: _padded(array, slots - count, _EMPTY.get(name, 0.0))
         for name, array in arrays.items()
     }
-    # Of what is traced by iota: a mask from the host would be part of the program.
+    # Under tracing an iota: a mask from the host would be a constant of the program.
     traced = any(isinstance(array, Tracer) for array in arrays.values())
     active = (jnp if traced else np).arange(slots) < count
     gaussians = Gaussians(params=GaussianParams(**padded), active=active)  # pyright: ignore
-    return to_device(gaussians)
+    gaussians = to_device(gaussians)
+    if traced or jax.config.jax_default_device is not None:  # pyright: ignore
+        return gaussians
+    return replicate(gaussians)
 
 
 def _padded(array: Array | np.ndarray, extra: int, value) -> Array | np.ndarray:
-    """With ``extra`` more rows of ``value``."""
+    """Append ``extra`` rows of ``value``."""
     if extra == 0:
         return array
     library = np if isinstance(array, np.ndarray) else jnp
@@ -139,27 +192,30 @@ def _padded(array: Array | np.ndarray, extra: int, value) -> Array | np.ndarray:
 
 
 def capacity_bucket(count: int, minimum: int = 1024) -> int:
-    """Smallest of the sizes 2^k and 1.5 · 2^k that holds ``count``.
+    """Return the smallest of the sizes 2^k and 1.5 · 2^k that holds ``count``.
 
     Growing through buckets recompiles once for every factor of 1.33 to 1.5.
 
     Args:
-      count: what is to be held.
+      count: number of items to hold.
       minimum: the smallest bucket, itself a 2^k or 1.5 · 2^k.
 
     Raises:
-      InputError: if ``minimum`` is none of them.
+      InputError: if ``minimum`` is not a bucket.
     """
     size = whole("minimum", minimum)
     if size < 1 or size // (size & -size) not in (1, 3):
-        raise InputError(f"minimum {minimum}: a bucket, 2^k or 1.5 · 2^k, is wanted")
+        raise InputError(
+            f"minimum: expected a bucket, 2^k or 1.5 · 2^k, got {minimum}; pass a "
+            "power of two"
+        )
     while size < count:
         size = size // 3 * 4 if size & (size - 1) else max(2, size * 3 // 2)
     return size
 
 
 def activate(params: GaussianParams) -> dict[str, Array]:
-    """Values as used: scales [N, 3], opacities [N], quats [N, 4] as stored."""
+    """Return the values as used: scales [N, 3], opacities [N], quats [N, 4]."""
     return {
         "scales": exp_log_scale(params.log_scales),
         "opacities": jax.nn.sigmoid(params.logit_opacities),
@@ -168,25 +224,27 @@ def activate(params: GaussianParams) -> dict[str, Array]:
 
 
 def num_active(gaussians: Gaussians) -> Array:
-    """Count of active slots, [] int32; traceable."""
+    """Return the number of active slots, [] int32; traceable."""
+    check_gaussians(gaussians)
     return jnp.sum(gaussians.active, dtype=jnp.int32)
 
 
 def grow(gaussians: Gaussians, capacity: int) -> Gaussians:
-    """The same Gaussians in more slots; the new ones are inactive.
+    """Return the same Gaussians in more slots; the new ones are inactive.
 
     Args:
       gaussians: N slots.
-      capacity: slots afterwards, N or more.
+      capacity: number of slots of the result, at least N.
 
     Raises:
-      InputError: if ``capacity`` is below the present one (see `compact`).
+      InputError: if ``capacity`` is below N (see `compact`).
     """
+    check_gaussians(gaussians)
     extra = whole("capacity", capacity) - gaussians.capacity
     if extra < 0:
         raise InputError(
-            f"capacity {capacity} is below the present {gaussians.capacity}; use "
-            "compact(gaussians, capacity) to shrink"
+            f"capacity: expected at least the present {gaussians.capacity}, got "
+            f"{capacity}; use compact(gaussians, capacity) to shrink"
         )
     if extra == 0:
         return gaussians
@@ -194,7 +252,7 @@ def grow(gaussians: Gaussians, capacity: int) -> Gaussians:
 
 
 def empty_like(gaussians: Gaussians, capacity: int) -> Gaussians:
-    """``capacity`` inactive slots with the SH degree and dtype of ``gaussians``."""
+    """Return inactive slots with the SH degree and dtype of ``gaussians``."""
     params = {
         name: jnp.broadcast_to(
             jnp.asarray(_EMPTY.get(name, 0.0), array.dtype),
@@ -207,75 +265,85 @@ def empty_like(gaussians: Gaussians, capacity: int) -> Gaussians:
 
 
 def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
-    """All slots of both, N and M, in order: N + M slots.
+    """Return the slots of both, N and M, in order: N + M slots.
 
     Raises:
       InputError: if the SH degrees differ.
     """
+    check_gaussians(first, "first")
+    check_gaussians(second, "second")
     if first.sh_degree != second.sh_degree:
         raise InputError(
-            f"SH degrees {first.sh_degree} and {second.sh_degree} differ; pad or cut "
-            "one with with_sh_degree"
+            f"concatenate: expected equal SH degrees, got {first.sh_degree} and "
+            f"{second.sh_degree}; change one with with_sh_degree"
         )
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
 
 
 def select(gaussians: Gaussians, keep: Array) -> Gaussians:
-    """The same slots with only those active that were and that ``keep`` marks.
+    """Return the same slots; only those that ``keep`` marks stay active.
 
     Args:
       gaussians: N slots.
       keep: [N] bool.
 
     Raises:
-      InputError: if ``keep`` is of another shape or type.
+      InputError: if ``keep`` has another shape or type.
     """
+    check_gaussians(gaussians)
     keep = jnp.asarray(keep)
     if keep.shape != gaussians.active.shape or keep.dtype != bool:
         raise InputError(
-            f"keep is {keep.dtype} {keep.shape}; bool {gaussians.active.shape} is "
-            "wanted (one for each slot)"
+            f"keep: expected bool {gaussians.active.shape}, got {keep.dtype} "
+            f"{keep.shape}; pass one flag for each slot"
         )
     return gaussians.replace(active=gaussians.active & keep)  # pyright: ignore
 
 
 def compact(gaussians: Gaussians, capacity: int | None = None) -> Gaussians:
-    """Active Gaussians first, in their order; ``capacity`` slots (default: same).
+    """Move the active Gaussians to the front, in their order.
 
-    Under jit an active Gaussian that does not fit would be lost: compare
-    `num_active` with ``capacity``. Outside jit that raises.
+    Under jit, active Gaussians that do not fit are lost: compare `num_active` with
+    ``capacity``. Outside jit they raise an error.
+
+    Args:
+      gaussians: N slots.
+      capacity: number of slots of the result; default N.
 
     Raises:
       InputError: if ``capacity`` is below 1, or outside jit if more are active.
     """
+    check_gaussians(gaussians)
     capacity = whole("capacity", gaussians.capacity if capacity is None else capacity)
-    if capacity < 1:
-        raise InputError(f"capacity {capacity}: at least 1 slot is wanted")
-    active = gaussians.active
+    active, least = gaussians.active, 1
     if not isinstance(active, Tracer):
-        count = int(np.sum(np.asarray(active)))
-        if count > capacity:
-            raise InputError(
-                f"{count} Gaussians are active, capacity {capacity} cannot hold them"
-            )
+        least = max(1, int(np.sum(np.asarray(active))))
+    if capacity < least:
+        raise InputError(
+            f"capacity: expected at least {least} for the active Gaussians, got "
+            f"{capacity}; pass a larger number, or deactivate some with select"
+        )
     order = jnp.argsort(~active, stable=True)[:capacity]
     packed = jax.tree.map(lambda a: a[order], gaussians)
     return packed if capacity <= gaussians.capacity else grow(packed, capacity)
 
 
 def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
-    """The same Gaussians at another degree: bands are cut, or added as zeros.
+    """Return the same Gaussians at another SH degree: bands are cut, or zeros added.
 
     Args:
       gaussians: ``sh`` [N, K, 3].
-      degree: 0 to 4; K is (degree + 1)² afterwards.
+      degree: 0 to 4; K is (degree + 1)² in the result.
 
     Raises:
-      InputError: if there is no such degree.
+      InputError: if ``degree`` is out of range.
     """
+    check_gaussians(gaussians)
     degree = whole("degree", degree)
     if not 0 <= degree <= sh_lib.MAX_DEGREE:
-        raise InputError(f"SH degree {degree}: 0 to {sh_lib.MAX_DEGREE} is wanted")
+        raise InputError(
+            f"degree: expected 0 to {sh_lib.MAX_DEGREE}, got {degree}; pass one of them"
+        )
     sh = gaussians.params.sh
     bases = sh_lib.num_bases(degree)
     extra = max(0, bases - sh.shape[1])

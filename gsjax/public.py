@@ -1,7 +1,7 @@
 """The public names, which are those of `gsjax` itself."""
 
 from gsjax.cameras.camera import Camera as Camera
-from gsjax.cameras.camera import Lens as Lens
+from gsjax.cameras.lenses import Lens as Lens
 from gsjax.cameras.camera import look_at as look_at
 from gsjax.cameras.camera import make_camera as make_camera
 from gsjax.cameras.camera import resize_camera as resize_camera
@@ -24,8 +24,8 @@ from gsjax.gaussians import num_active as num_active
 from gsjax.gaussians import select as select
 from gsjax.gaussians import with_sh_degree as with_sh_degree
 from gsjax.init.gaussians import init_gaussians as init_gaussians
-from gsjax.io import load as load
-from gsjax.io import save as save
+from gsjax.io.formats import load as load
+from gsjax.io.formats import save as save
 from gsjax.planning.plan import plan as plan
 from gsjax.planning.types import Plan as Plan
 from gsjax.raster.reference import reference_render as reference_render

@@ -34,7 +34,7 @@ class InfoCommand(HeavyCommand):
                 [self.plot], self.overwrite, "another name with --plot"
             )
         start_jax()
-        from gsjax.io import load
+        from gsjax.io.formats import load
         from gsjax.plots.histograms import histograms_png
         from gsjax.runs.folder import run_files
         from gsjax.runs.run_info import describe_run, run_text

@@ -1,15 +1,34 @@
-"""What the formats of Gaussians have in common."""
+"""The protocol of a file format, and functions that the formats share."""
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 
-MAX_SHIFT = 0.1  # of a Gaussian's size by rounding, before it is told
+# Rounding that moves a Gaussian by more than this part of its size is warned about.
+MAX_SHIFT = 0.1
 _TINY = np.finfo(np.float64).tiny
+
+
+class Format(NamedTuple):
+    """A file format of Gaussians, for `gsjax.io.formats.load` and `save`.
+
+    Attributes:
+      name: short name.
+      suffixes: of file names, in lower case with the dot: (".ply",).
+      load: ``load(path) -> Gaussians``, or None if the format is only written.
+      save: ``save(path, gaussians, *, overwrite) -> None``, or None if it is only read.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    load: Callable[[Path], Gaussians] | None
+    save: Callable[..., None] | None
 
 
 def warn(message: str) -> None:
@@ -18,14 +37,14 @@ def warn(message: str) -> None:
 
 
 def require_new(path: Path, overwrite: bool) -> None:
-    """See that a file may be written.
+    """Check that a file may be written.
 
     Raises:
-      InputError: if it exists and ``overwrite`` is not set, or is a folder, or its
-        folder is missing.
+      InputError: if it exists and ``overwrite`` is not set, if it is a folder, or if
+        its folder is missing.
     """
     if path.is_dir():
-        raise InputError(f"{path}: is a folder; pass the name of a file")
+        raise InputError(f"{path}: expected a file, got a folder; pass a file name")
     if path.exists() and not overwrite:
         raise InputError(f"{path}: exists; pass overwrite=True or another name")
     if not path.parent.is_dir():
@@ -33,27 +52,29 @@ def require_new(path: Path, overwrite: bool) -> None:
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:
-    """The nearest whole numbers from 0 to 255."""
+    """Round to the nearest whole numbers from 0 to 255."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 def opacity_bytes(logits: np.ndarray) -> np.ndarray:
-    """[N] logits as opacities, 255 for 1."""
+    """Return opacities of [N] logits in a byte each, 255 for 1."""
     with np.errstate(over="ignore"):
         return to_bytes(255 / (1 + np.exp(-logits.astype(np.float64))))
 
 
-def drawn_rows(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """The arrays of the active Gaussians, for a format that holds only what is drawn:
-    quaternions of norm 1, and no zero ones; of these it is warned.
+def visible_rows(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Return the active Gaussians for a format that stores only visible ones.
+
+    Quaternions are normalised. Gaussians whose quaternion is zero are never drawn;
+    they are left out with a warning.
 
     Raises:
-      InputError: if a value is NaN, or infinite and no logit, or none is drawn.
+      InputError: if a value is NaN, or infinite and not a logit, or if all quaternions
+        are zero.
     """
     params = gaussians.params.__dict__
-    arrays = {name: np.asarray(array) for name, array in params.items()}
     slots = np.flatnonzero(np.asarray(gaussians.active))
-    rows = {name: array[slots] for name, array in arrays.items()}
+    rows = {name: np.asarray(array)[slots] for name, array in params.items()}
     bad = np.zeros(len(slots), bool)
     for name, array in rows.items():
         wrong = np.isnan(array) if name == "logit_opacities" else ~np.isfinite(array)
@@ -61,23 +82,23 @@ def drawn_rows(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
     if bad.any():
         raise InputError(
             f"{path}: {bad.sum()} of {len(bad)} Gaussians are NaN or infinite, which "
-            f"{path.suffix} has no numbers for; write a .ply, or leave them out "
+            f"{path.suffix} cannot store; write a .ply, or leave them out "
             "(gsjax.select)"
         )
     quats = rows["quats"].astype(np.float64)
     quats /= np.maximum(np.abs(quats).max(1, initial=0), _TINY)[:, None]
     norms = np.linalg.norm(quats, axis=1)
-    drawn = norms > 0
-    rows["quats"] = quats / np.where(drawn, norms, 1)[:, None]
-    if drawn.all():
+    visible = norms > 0
+    rows["quats"] = quats / np.where(visible, norms, 1)[:, None]
+    if visible.all():
         return rows
-    if not drawn.any():
+    if not visible.any():
         raise InputError(
-            f"{path}: the quaternions of all {len(drawn)} Gaussians are zero, which "
-            "draws nothing; is the scene damaged?"
+            f"{path}: the quaternions of all {len(visible)} Gaussians are zero, so "
+            "nothing would be drawn; check the scene"
         )
     warn(
-        f"{path}: {(~drawn).sum()} of {len(drawn)} quaternions are zero; such "
-        "Gaussians are not drawn, and left out"
+        f"{path}: {(~visible).sum()} of {len(visible)} quaternions are zero; these "
+        "Gaussians are never drawn and are left out"
     )
-    return {name: array[drawn] for name, array in rows.items()}
+    return {name: array[visible] for name, array in rows.items()}

@@ -1,7 +1,4 @@
-"""Images as bytes of files: what a render returns, as PNG and .npy.
-
-OpenCV encodes and is loaded when first needed.
-"""
+"""Images as bytes of files: PNG and .npy. OpenCV encodes, and is loaded when needed."""
 
 import io
 from typing import NamedTuple
@@ -14,11 +11,11 @@ _MAX_16 = 65535
 
 
 class DepthPicture(NamedTuple):
-    """A depth map as a picture.
+    """A depth map as a 16-bit image.
 
     Attributes:
-      pixels: [H, W] uint16; 0 where nothing is, else 1 at ``near`` to 65535 at ``far``.
-      near, far: least and greatest depth in the view; both 0 if nothing is in it.
+      pixels: [H, W] uint16; 0 for no depth, else 1 at ``near`` to 65535 at ``far``.
+      near, far: least and greatest depth of the view; both 0 if there is none.
     """
 
     pixels: np.ndarray
@@ -27,7 +24,7 @@ class DepthPicture(NamedTuple):
 
 
 def opencv():
-    """The module cv2.
+    """Return the module cv2.
 
     Raises:
       MissingExtraError: if it is absent or does not load.
@@ -36,19 +33,19 @@ def opencv():
         import cv2
     except ImportError as error:
         raise MissingExtraError(
-            f"OpenCV, which writes images, does not load ({error}); install it: "
-            "pip install opencv-contrib-python-headless"
+            f"OpenCV, which reads and writes images, does not load ({error}); install "
+            "it: pip install opencv-contrib-python-headless"
         ) from error
     return cv2
 
 
 def to_8_bit(image: np.ndarray) -> np.ndarray:
-    """uint8 of values in [0, 1], clipped and rounded to nearest; no gamma."""
+    """Clip values to [0, 1] and round them to uint8; no gamma."""
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
 def depth_picture(depth: np.ndarray) -> DepthPicture:
-    """A picture of a depth map [H, W] in which 0 means that nothing is there."""
+    """Convert a depth map [H, W], in which 0 means no depth."""
     found = np.isfinite(depth) & (depth > 0)
     pixels = np.zeros(depth.shape, np.uint16)
     if not found.any():
@@ -61,17 +58,20 @@ def depth_picture(depth: np.ndarray) -> DepthPicture:
 
 
 def encode_png(pixels: np.ndarray) -> bytes:
-    """PNG of [H, W] grey or [H, W, 3] RGB, uint8 or uint16."""
+    """Encode [H, W] grey or [H, W, 3] RGB, uint8 or uint16, as PNG."""
     cv2 = opencv()
     stored = pixels[..., ::-1] if pixels.ndim == 3 else pixels  # OpenCV has BGR
     done, data = cv2.imencode(".png", np.ascontiguousarray(stored))
     if not done:
-        raise InputError(f"OpenCV cannot encode {pixels.shape} {pixels.dtype} as PNG")
+        raise InputError(
+            f"pixels: OpenCV cannot encode {pixels.dtype} {pixels.shape} as PNG; pass "
+            "uint8 or uint16 of [H, W] or [H, W, 3]"
+        )
     return data.tobytes()
 
 
 def encode_npy(image: np.ndarray) -> bytes:
-    """The .npy file of an array, as float32."""
+    """Encode an array as a .npy file of float32."""
     buffer = io.BytesIO()
     np.save(buffer, np.asarray(image, np.float32), allow_pickle=False)
     return buffer.getvalue()

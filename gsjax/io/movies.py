@@ -1,7 +1,7 @@
-"""Pictures in a row to files: .gif, .webp, .webm (VP9), or a folder of PNGs.
+"""Movies to files: .gif, .webp, .webm (VP9), or a folder of PNGs, encoded by OpenCV.
 
-OpenCV encodes all of them. A movie is written beside its name and then renamed: it
-appears complete or not at all.
+A movie is written under a temporary name and then renamed: it appears complete or not
+at all.
 """
 
 import os
@@ -24,15 +24,15 @@ MOVIE_KINDS = (".gif", ".webp", ".webm", ".png")
 
 
 def check_movie(path: Path, *, overwrite: bool = False) -> None:
-    """Whether `write_movie` would take the name: to ask before rendering for it.
+    """Check that `write_movie` accepts the name, before frames are rendered.
 
     Raises:
-      InputError: on an unknown suffix, or if the movie exists.
+      InputError: if the suffix is unknown, or the movie exists.
     """
     if path.suffix.lower() not in (*MOVIE_KINDS, ""):
         raise InputError(
-            f"{path}: {path.suffix} is no kind of movie; {', '.join(MOVIE_KINDS[:3])}, "
-            "or .png (or no suffix) for a folder of PNGs is wanted"
+            f"{path}: expected a suffix of {', '.join(MOVIE_KINDS[:3])}, or .png (or "
+            f"none) for a folder of PNGs, got {path.suffix}; pass another name"
         )
     folder = _png_folder(path)
     if folder is None:
@@ -48,31 +48,34 @@ def write_movie(
     fps: float = 24.0,
     overwrite: bool = False,
 ) -> int:
-    """Write frames, as the suffix says; returns how many there were.
+    """Write frames in the format of the suffix.
 
     Args:
       path: .gif, .webp or .webm; ``name.png``, or a name without suffix, is the
-        folder ``name`` with frame_0001.png and so on. Folders above are created.
-      frames: [H, W, 3] RGB uint8, all of one size, taken one by one. For .webm, whose
-        pixels come in twos, an odd last column or row is repeated.
-      fps: frames per second; folders have none. A GIF has times in 1/100 s, and at
-        most 50 per second, which is what browsers show.
-      overwrite: whether a movie that exists may be replaced; of a folder, only one
-        with nothing but such frames in it.
+        folder ``name`` with frame_0001.png and so on. Missing folders are created.
+      frames: [H, W, 3] RGB uint8, all of one size, read one by one. For .webm, whose
+        size is even, an odd last column or row is repeated.
+      fps: frames per second; ignored for folders. A GIF has times in 1/100 s, and at
+        most 50 frames per second, which is what browsers show.
+      overwrite: replace an existing movie; a folder only if it holds nothing but
+        frames.
+
+    Returns:
+      The number of frames.
 
     Raises:
-      InputError: on an unknown suffix, a movie that exists, no frames, frames of
-        another kind, or if the file cannot be written.
+      InputError: if the suffix is unknown, the movie exists, there are no frames or
+        frames of different sizes, or the file cannot be written.
       MissingExtraError: if OpenCV is absent.
     """
     check_movie(path, overwrite=overwrite)
     if not 0.1 <= fps <= 1000:
-        raise InputError(f"fps is {fps:g}; 0.1 to 1000 frames per second are wanted")
+        raise InputError(f"fps: expected 0.1 to 1000 frames per second, got {fps:g}")
     images.opencv()
     checked = _checked(frames)
     first = next(checked, None)
     if first is None:
-        raise InputError(f"{path}: there are no frames to write")
+        raise InputError(f"{path}: expected at least one frame, got none")
     checked = chain([first], checked)
     folder, suffix = _png_folder(path), path.suffix.lower()
     make_folder((folder or path).parent)
@@ -86,17 +89,16 @@ def write_movie(
 
 
 def played_rate(suffix: str, fps: float) -> float:
-    """Frames per second at which a movie of that suffix is played, if ``fps`` are
-    asked for: a GIF has no more than 50."""
+    """Return the frames per second of a movie: a GIF has at most 50."""
     return min(fps, 50.0) if suffix == ".gif" else fps
 
 
 def encode_animation(suffix: str, frames: Iterable[np.ndarray], fps: float) -> bytes:
-    """An animation that loops for ever, of RGB uint8 frames of one size.
+    """Encode an animation that loops forever.
 
     Args:
       suffix: ".gif" or ".webp".
-      frames: [H, W, 3] each.
+      frames: [H, W, 3] RGB uint8 each, of one size.
       fps: frames per second.
 
     Raises:
@@ -105,19 +107,18 @@ def encode_animation(suffix: str, frames: Iterable[np.ndarray], fps: float) -> b
     cv2 = images.opencv()
     animation = cv2.Animation()
     animation.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
-    # Rounded at the ends of frames, so that the whole takes as long as it should.
+    # Times of the frame ends are rounded, so the total duration is right.
     unit, rate = 10 if suffix == ".gif" else 1, played_rate(suffix, fps)
     ends = np.rint(np.arange(len(animation.frames) + 1) * 1000 / (rate * unit)) * unit
     animation.durations = np.diff(ends).astype(int).tolist()
     if suffix == ".gif":
-        # Of the settings tried on a turntable the one of the best PSNR: 34 dB, 25 by
-        # default (without dither, or of 6 bits of colour).
+        # These raise the PSNR of a turntable from 25 dB (the defaults) to 34 dB.
         settings = [cv2.IMWRITE_GIF_QUALITY, 8, cv2.IMWRITE_GIF_DITHER, 2]
     else:
         settings = [cv2.IMWRITE_WEBP_QUALITY, 90]
     done, data = cv2.imencodeanimation(suffix, animation, settings)
     if not done:
-        raise InputError(f"OpenCV cannot encode the animation as {suffix}")
+        raise InputError(f"frames: OpenCV cannot encode them as {suffix}; use .webp")
     return data.tobytes()
 
 
@@ -131,34 +132,34 @@ def _checked(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
         shape = frame.shape if shape is None else shape
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
             raise InputError(
-                f"frame {index} is {frame.shape} {frame.dtype}; [H, W, 3] uint8 is "
-                "wanted"
+                f"frame {index}: expected uint8 [H, W, 3], got {frame.dtype} "
+                f"{frame.shape}; convert it with gsjax.io.images.to_8_bit"
             )
         if frame.shape != shape or 0 in shape:
             raise InputError(
-                f"frame {index} is {frame.shape}, the first is {shape}; one size, and "
-                "not an empty one, is wanted"
+                f"frame {index}: expected the shape {shape} of the first, got "
+                f"{frame.shape}; render all frames at one size"
             )
         yield frame
 
 
 def _refuse_folder(folder: Path, overwrite: bool) -> None:
     if not folder.is_dir():
-        raise InputError(f"{folder}: is a file; a folder of frames is to be there")
+        raise InputError(f"{folder}: expected a folder, got a file; pass another name")
     names = [entry.name for entry in folder.iterdir()]
     other = [name for name in names if not re.fullmatch(r"frame_\d+\.png", name)]
     if other:
         raise InputError(
-            f"{folder}: has files that are no frames ({other[0]}); pass a new folder"
+            f"{folder}: holds files other than frames ({other[0]}); pass a new folder"
         )
     if names and not overwrite:
         raise InputError(
-            f"{folder}: has {len(names)} frames; pass --overwrite, or another name"
+            f"{folder}: holds {len(names)} frames; pass --overwrite, or another name"
         )
 
 
 def _write_folder(folder: Path, frames: Iterable[np.ndarray]) -> int:
-    """Into a folder beside it, which then takes its place."""
+    """Write into a temporary folder beside it, and rename that."""
     temporary = _temporary(folder)
     count = 0
     try:
@@ -167,7 +168,7 @@ def _write_folder(folder: Path, frames: Iterable[np.ndarray]) -> int:
             data = images.encode_png(frame)
             write_file(temporary / f"frame_{count:04d}.png", data)
         with writing(folder):
-            if folder.exists():  # nothing but frames, which may be replaced
+            if folder.exists():  # `check_movie`: it holds nothing but frames
                 shutil.rmtree(folder)
             os.replace(temporary, folder)
     finally:
@@ -188,12 +189,12 @@ def _write_vp9(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
             count += 1
         if writer is not None:
             writer.release()
-        # The encoder does not report a full disk; a file cut short has no duration.
+        # The encoder does not report a full disk; a truncated file has no duration.
         written = cv2.VideoCapture(str(temporary)).get(cv2.CAP_PROP_FRAME_COUNT)
         if abs(written - count) > 1:
             raise InputError(
-                f"{path}: {written:g} of {count} frames could be written; check the "
-                "space that is left"
+                f"{path}: only {written:g} of {count} frames could be written; free "
+                "some disk space"
             )
         with writing(path):
             os.replace(temporary, path)
@@ -207,19 +208,19 @@ def _write_vp9(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
 def _vp9_writer(path: Path, frame: np.ndarray, fps: float):
     cv2 = images.opencv()
     size, code = (frame.shape[1], frame.shape[0]), cv2.VideoWriter.fourcc(*"VP90")
-    with _muted_stderr():  # it complains of a code that WebM does without
+    with _muted_stderr():  # FFmpeg warns about a code that WebM does not use
         writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, fps, size)
     if not writer.isOpened():
         raise InputError(
-            f"{path.parent}: this OpenCV cannot write VP9 there; check permissions, or "
-            "use the suffix .webp"
+            f"{path.parent}: OpenCV cannot write VP9 there; check permissions, or use "
+            "the suffix .webp"
         )
     return writer
 
 
 def _temporary(path: Path) -> Path:
-    """A name beside ``path`` with its suffix, which tells OpenCV the container; from
-    the root, as FFmpeg takes a relative "10:30.webm" for an address.
+    """Return an absolute name beside ``path`` with its suffix, which selects the
+    container; FFmpeg takes a relative "10:30.webm" for a network address.
     """
     name = f".gsjax-{secrets.token_hex(6)}{path.suffix.lower()}"
     return path.absolute().with_name(name)
@@ -227,7 +228,7 @@ def _temporary(path: Path) -> Path:
 
 @contextmanager
 def _muted_stderr() -> Iterator[None]:
-    """Nothing that C code prints to the standard error meanwhile is seen."""
+    """Discard what C code prints to the standard error."""
     sys.stderr.flush()
     kept = os.dup(2)
     try:

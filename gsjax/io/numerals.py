@@ -1,7 +1,7 @@
-"""Numbers written as text, many at a time: plain ASCII numerals and white space.
+"""Numbers written as text, parsed in blocks: ASCII numerals and white space only.
 
-A list of Python's strings or numbers takes twenty times the text. So text is taken in
-blocks of bounded size, and a block as arrays. Axis legend: W words, L lines.
+Lists of Python strings or numbers take twenty times the memory of the text, so a block
+of bounded size is parsed into arrays at once. Axis legend: W words, L lines.
 """
 
 import warnings
@@ -9,24 +9,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Characters of a block, beyond the longest line that is wanted.
+# Characters of a block, without the longest line.
 BLOCK = 1 << 18
 _NEWLINE, _SPACE = 10, 32
 _WHITE = b" \t\n\r\v\f"
-# "nan" and "infinity" too; not the underscores and the digits of other scripts that
-# Python's float takes.
+# "nan" and "infinity" too, but not the underscores and digits of other scripts that
+# Python's float accepts.
 _PLAIN = np.isin(np.arange(256), [*b"0123456789+-.eEinfatyINFATY", *_WHITE])
 _DIGIT = np.isin(np.arange(256), [*b"0123456789"])
 
 
 class Words(NamedTuple):
-    """Where the words and lines of a block stand.
+    """Positions of the words and lines of a block.
 
     Attributes:
-      starts: [W] at which byte each word begins.
-      first: [L] which word is the first of each line, if it has any.
-      counts: [L] how many words it has.
-      ends: [L] at which byte it ends.
+      starts: [W] byte at which each word begins.
+      first: [L] index of the first word of each line, if it has any.
+      counts: [L] number of words.
+      ends: [L] byte at which the line ends.
     """
 
     starts: np.ndarray
@@ -36,10 +36,10 @@ class Words(NamedTuple):
 
 
 def find_words(block: np.ndarray) -> Words:
-    """Words and lines of a block.
+    """Find words and lines.
 
     Args:
-      block: uint8; a last line without an end counts as one.
+      block: uint8; a last line without a newline counts as one.
     """
     inked = block > _SPACE
     starts = np.flatnonzero(inked & ~np.append(False, inked)[:-1])
@@ -52,20 +52,20 @@ def find_words(block: np.ndarray) -> Words:
 
 
 def parse_numbers(block: np.ndarray, count: int) -> np.ndarray | None:
-    """[W] float64, of all words of a block, as Python's float reads them.
+    """Parse all words of a block as Python's float does.
 
     Args:
       block: uint8.
-      count: W, at least 1.
+      count: number of words W, at least 1.
 
     Returns:
-      The numbers; None if there are not as many, or a word is none.
+      [W] float64, or None if there are not ``count`` words or one is not a number.
     """
     if not _PLAIN[block].all():
         return None
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # as old NumPy tells what it cannot read
+            warnings.simplefilter("error")  # older NumPy warns of invalid text
             values = np.fromstring(block.tobytes(), np.float64, sep=" ")
     except (ValueError, DeprecationWarning):
         return None
@@ -73,16 +73,16 @@ def parse_numbers(block: np.ndarray, count: int) -> np.ndarray | None:
 
 
 def other_than_digits(block: np.ndarray) -> np.ndarray:
-    """[len(block) + 1] how many bytes before each are neither digits nor white."""
+    """Count the bytes before each that are no digit or space, [len(block) + 1]."""
     other = (block > _SPACE) & ~_DIGIT[block]
     return np.concatenate([[0], np.cumsum(other, dtype=np.int32)])
 
 
 def parse_number(word: str) -> float:
-    """One number.
+    """Parse one number.
 
     Raises:
-      ValueError: if it is none, or is not written in ASCII.
+      ValueError: if it is not a number in ASCII.
     """
     if "_" in word or not word.isascii():
         raise ValueError(f"could not convert {word[:40]!r} to a number")

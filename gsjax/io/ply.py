@@ -1,12 +1,10 @@
-"""Gaussians in the PLY files of the field: read by property name, written in order.
+"""Gaussians in standard 3DGS PLY files: read by property name, written in order.
 
 Axis legend: N Gaussians, K spherical-harmonic bases.
 
-Values stand in the file as in `GaussianParams` (log scales, logit opacities, wxyz);
-only f_rest is laid out otherwise: all of red, then all of green, then all of blue.
-Nothing is allocated before the sizes that the header declares are checked against
-the size of the file, and the body is read in pieces, so that reading holds no more
-than the arrays it returns (and once more on the way to the device).
+Values are stored as in `GaussianParams` (log scales, logit opacities, wxyz), except
+f_rest: all of red, then all of green, then all of blue. The body is read in pieces, so
+reading holds the returned arrays and one copy on the way to the device.
 """
 
 import math
@@ -20,26 +18,26 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, make_gaussians
-from gsjax.io.common import MAX_SHIFT, require_new, warn
+from gsjax.io.common import MAX_SHIFT, Format, require_new, warn
 from gsjax.io.ply_header import Header, check_properties, check_size, read_header
 from gsjax.io.ply_rows import CHUNK_ROWS, read_rows
 from gsjax.runtime.files import opened, replacing
 from gsjax.runtime.memory import Estimate, require
 
 _NORMALS = ("nx", "ny", "nz")
-_FILTER = "filter_3D"  # of Mip-Splatting: σ by which a Gaussian is to be smoothed
+_FILTER = "filter_3D"  # of Mip-Splatting: σ of the filter of each Gaussian
 # Exporters write ±inf for opacities of exactly 0 and 1; the range of `logit`.
 _MAX_LOGIT = math.log((1 - 2.0**-23) / 2.0**-23)
 
 
 def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaussians:
-    """Gaussians of a 3DGS PLY file, binary or ascii, of any SH degree up to 4.
+    """Read a 3DGS PLY file, binary or ascii, of any SH degree up to 4.
 
-    Properties are found by name, in any order and of any scalar type; those that
-    are not needed (normals too) are skipped. Where there is Mip-Splatting's
-    ``filter_3D``, scales and opacities are those that it makes of them, see `_smooth`.
-    Opacities of ±inf are clamped to the logit of [2^-23, 1 - 2^-23] with a warning.
-    Zero quaternions, values that look activated and trailing bytes are warned of.
+    Properties are found by name, in any order and of any scalar type; others, such as
+    normals, are ignored. Mip-Splatting's ``filter_3D`` is applied to scales and
+    opacities (Yu et al., "Mip-Splatting", CVPR 2024, equation 9). Opacities of ±inf are
+    clamped to the logit of [2^-23, 1 - 2^-23] with a warning. Zero quaternions, values
+    that look activated and trailing bytes are warned about.
 
     Args:
       path: the file.
@@ -50,15 +48,14 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
       Gaussians with capacity max(N, 1), in the order of the file.
 
     Raises:
-      InputError: if the file cannot be read, is no PLY, is truncated, lacks
-        properties, has an f_rest of no SH degree, or has values that are not
-        finite; the message names what was found and what was wanted.
-      CapacityError: if the memory would not hold it, before it is read.
+      InputError: if the file cannot be read, is not a PLY, is truncated, lacks
+        properties, has an incomplete f_rest, or has values that are not finite.
+      CapacityError: if memory is too small; raised before the body is read.
     """
     path = Path(path)
     with opened(path, "a .ply file") as file:
         header = read_header(file, path)
-        bases = check_properties(header, _views(_allocate(0, 1, np.float32)))
+        bases = check_properties(header, _columns(_allocate(0, 1, np.float32)))
         check_size(header)
         fields = _read_body(file, header, bases)
     _check_values(path, fields, drop_nonfinite)
@@ -66,7 +63,7 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
 
 
 def _allocate(count: int, bases: int, dtype) -> dict[str, np.ndarray]:
-    """Uninitialised arrays by their names in `GaussianParams`."""
+    """Return uninitialised arrays by their names in `GaussianParams`."""
     return {
         "means": np.empty((count, 3), dtype),
         "quats": np.empty((count, 4), dtype),
@@ -76,8 +73,8 @@ def _allocate(count: int, bases: int, dtype) -> dict[str, np.ndarray]:
     }
 
 
-def _views(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Each property of the file, in the standard order, as a view [N] of ``fields``."""
+def _columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return each property of the file, in the standard order, as a view [N]."""
     sh = fields["sh"]
     rest = sh.shape[1] - 1
     views = dict(zip("xyz", fields["means"].T))
@@ -93,19 +90,20 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
     # float64 only if the file holds more than float32 can and jax would keep it.
     wide = not {"f8", "i4", "u4"}.isdisjoint(header.vertex.types.values())
     dtype = np.dtype(jnp.result_type(float)) if wide else np.dtype(np.float32)
-    held = header.vertex.rows * (11 + 3 * bases) * dtype.itemsize
+    count = header.vertex.rows
+    held = count * (11 + 3 * bases) * dtype.itemsize
     require(
         Estimate({"values as read": held, "values on the device": held}),
-        f"{header.path}: {header.vertex.rows:,} Gaussians",
-        "make the file smaller where it was made",
+        f"{header.path}: {count:,} Gaussians",
+        "reduce the file with the tool that made it",
     )
-    fields = _allocate(header.vertex.rows, bases, dtype)
-    views = _views(fields)
-    smoothed = _FILTER in header.vertex.types
-    if smoothed:
-        views[_FILTER] = np.empty(header.vertex.rows, dtype)
-    start, displaced, furthest = 0, 0, 0.0
+    fields = _allocate(count, bases, dtype)
+    views = _columns(fields)
+    if _FILTER in header.vertex.types:
+        views[_FILTER] = np.empty(count, dtype)
+    moved = np.zeros(count)  # by rounding to float32, where it is much of the size
     with np.errstate(over="ignore", invalid="ignore"):  # _check_values finds them
+        start = 0
         for size, columns in read_rows(file, header):
             rows = slice(start, start + size)
             for name, view in views.items():
@@ -113,18 +111,16 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
             if wide and dtype == np.float32:
                 shift = np.max([abs(columns[a] - views[a][rows]) for a in "xyz"], 0)
                 sizes = np.exp(np.max([views[f"scale_{i}"][rows] for i in range(3)], 0))
-                moved = np.isfinite(shift) & (shift > MAX_SHIFT * sizes)
-                displaced += int(moved.sum())
-                furthest = max(furthest, shift[moved].max(initial=0.0))
+                far = np.isfinite(shift) & (shift > MAX_SHIFT * sizes)
+                moved[rows] = np.where(far, shift, 0)
             start += size
-        if smoothed:
+        if _FILTER in views:
             _smooth(fields, views[_FILTER])
-    if displaced:
+    if moved.any():
         warn(
-            f"{header.path}: {displaced} of {start} Gaussians lie so far from the "
-            f"origin that float32 moves them, by up to {furthest:.3g}, more than "
-            f"{MAX_SHIFT:g} of their size; read the file with jax_enable_x64, or move "
-            "the scene to the origin"
+            f"{header.path}: float32 moves {np.count_nonzero(moved)} of {count} "
+            f"Gaussians, by up to {moved.max():.3g}, more than {MAX_SHIFT:g} of their "
+            "size; read the file with jax_enable_x64, or move the scene to the origin"
         )
     return fields
 
@@ -132,15 +128,14 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
 def _smooth(fields: dict[str, np.ndarray], sigmas: np.ndarray) -> None:
     """Convolve Gaussians with isotropic ones of ``sigmas`` [N], in place.
 
-    Scales s become √(s² + σ²), and opacities less by √(Π s² / Π (s² + σ²)), so that
-    as much is seen of each (Yu et al., "Mip-Splatting", CVPR 2024, equation 9).
+    Scales s become √(s² + σ²), and opacities are multiplied by √(Π s² / Π (s² + σ²)).
     """
     scales = fields["log_scales"].astype(np.float64)
     with np.errstate(divide="ignore"):
         logs = np.log(np.abs(sigmas[:, None].astype(np.float64)))
         wide = np.logaddexp(2 * scales, 2 * logs) / 2
-        loss = np.sum(scales - wide, axis=1)  # log of what is left of an opacity
-        # logit(e^loss / (1 + e^-l)), without a difference of what is nearly 1.
+        loss = np.sum(scales - wide, axis=1)  # log of the factor of the opacity
+        # logit(e^loss / (1 + e^-l)) without cancellation near 1.
         left = np.logaddexp(np.log(-np.expm1(loss)), -fields["logit_opacities"])
     fields["log_scales"][:] = wide
     fields["logit_opacities"][:] = loss - left
@@ -149,7 +144,7 @@ def _smooth(fields: dict[str, np.ndarray], sigmas: np.ndarray) -> None:
 def _check_values(
     path: Path, fields: dict[str, np.ndarray], drop_nonfinite: bool
 ) -> None:
-    """Mend, drop, refuse or warn of values, in place."""
+    """Clamp, drop, reject or warn about values, in place."""
     opacities = fields["logit_opacities"]
     infinite = np.isinf(opacities)
     if infinite.any():
@@ -163,13 +158,14 @@ def _check_values(
     if rows.any():
         which = ", ".join(f"{k}: {v.sum()}" for k, v in bad.items() if v.any())
         message = (
-            f"{path}: {rows.sum()} of {len(rows)} Gaussians have NaN or infinite "
-            f"values ({which}); the first: {np.flatnonzero(rows)[:5].tolist()}"
+            f"{path}: expected finite values, got NaN or infinite ones in {rows.sum()} "
+            f"of {len(rows)} Gaussians ({which}), the first: "
+            f"{np.flatnonzero(rows)[:5].tolist()}"
         )
         if not drop_nonfinite:
             raise InputError(
-                f"{message}; finite values are wanted: repair the file, or "
-                "gsjax.io.ply.read_ply(path, drop_nonfinite=True) drops them"
+                f"{message}; repair the file, or drop them with "
+                "gsjax.io.ply.read_ply(path, drop_nonfinite=True)"
             )
         warn(f"{message}; dropped")
         for name in fields:
@@ -200,16 +196,14 @@ def write_ply(
 ) -> None:
     """Write the active Gaussians, in their order, as a standard 3DGS PLY.
 
-    Binary, little-endian, float32; x y z nx ny nz f_dc f_rest opacity scale rot,
-    normals zero. Only x y z are float64, where means are given in it that float32
-    would round: those of a scene far from the origin come back bit by bit. Written
-    beside ``path`` and then renamed: it appears complete or not at all. Values that
-    are not finite are written, with a warning.
+    The file is binary, little-endian float32: x y z nx ny nz f_dc f_rest opacity scale
+    rot, with normals of zero. Means are written as float64 if float32 would round them.
+    Values that are not finite are written with a warning.
 
     Args:
-      path: the file to write.
+      path: the file to write; it appears complete or not at all.
       gaussians: the scene; inactive slots are left out.
-      overwrite: whether an existing file may be replaced.
+      overwrite: replace an existing file.
 
     Raises:
       InputError: if the file exists and ``overwrite`` is not set, if its folder is
@@ -224,15 +218,14 @@ def write_ply(
 
 
 def _write_body(file: BinaryIO, gaussians: Gaussians) -> int:
-    """Write header and rows; the number of rows with values that are not finite."""
-    params = gaussians.params
-    views = _views({k: np.asarray(v) for k, v in params.__dict__.items()})
+    """Write header and rows; return the number of rows that are not finite."""
+    params = gaussians.params.__dict__
+    views = _columns({name: np.asarray(array) for name, array in params.items()})
     names = [*"xyz", *_NORMALS, *(name for name in views if name not in "xyz")]
     slots = np.flatnonzero(np.asarray(gaussians.active))
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(slots)}"]
-    means = [views[axis] for axis in "xyz"]
-    wide = "xyz" if any(_is_rounded(mean, slots) for mean in means) else ""
+    wide = "xyz" if any(_is_rounded(views[axis][slots]) for axis in "xyz") else ""
     kinds = {name: "double" if name in wide else "float" for name in names}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(slots)}"]
     lines += [f"property {kind} {name}" for name, kind in kinds.items()]
     file.write("\n".join([*lines, "end_header", ""]).encode())
     codes = {"float": "<f4", "double": "<f8"}
@@ -251,14 +244,10 @@ def _write_body(file: BinaryIO, gaussians: Gaussians) -> int:
     return nonfinite
 
 
-def _is_rounded(values: np.ndarray, slots: np.ndarray) -> bool:
-    """Whether float32 does not hold all ``values`` in ``slots``."""
-    if values.dtype != np.float64:
-        return False
-    for start in range(0, len(slots), CHUNK_ROWS):
-        chosen = values[slots[start : start + CHUNK_ROWS]]
-        with np.errstate(over="ignore"):
-            narrow = chosen.astype(np.float32)
-        if not np.array_equal(narrow, chosen, equal_nan=True):
-            return True
-    return False
+def _is_rounded(values: np.ndarray) -> bool:
+    """Return True if float32 does not represent all values."""
+    with np.errstate(over="ignore"):
+        return not np.array_equal(values.astype(np.float32), values, equal_nan=True)
+
+
+FORMAT = Format("ply", (".ply",), read_ply, write_ply)

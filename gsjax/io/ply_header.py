@@ -1,7 +1,4 @@
-"""The header of a PLY file: parsed, and held against the size of the file.
-
-The sizes that a header declares are checked here before anything is allocated.
-"""
+"""The header of a PLY file: parsed, and checked against the size of the file."""
 
 import os
 import re
@@ -26,7 +23,7 @@ _MAX_HEADER = 1 << 20
 
 
 class Element(NamedTuple):
-    """One element of the header; a list property has the type None."""
+    """An element of the header; a list property has the type None."""
 
     name: str
     rows: int
@@ -36,15 +33,15 @@ class Element(NamedTuple):
     def has_list(self) -> bool:
         return None in self.types.values()
 
-    def least_bytes(self, order: str) -> int:
-        """Size of a row: exact if binary, at least this in ascii ("0 0 0\\n")."""
+    def min_bytes(self, order: str) -> int:
+        """Return the size of a row: exact if binary, a lower bound in ascii."""
         if not order:
-            return max(1, 2 * len(self.types))
+            return max(1, 2 * len(self.types))  # "0 0 0\n"
         return sum(int(kind[1]) for kind in self.types.values() if kind)
 
 
 class Header(NamedTuple):
-    """What a header says.
+    """Contents of a header.
 
     Attributes:
       path: the file, for messages.
@@ -64,15 +61,14 @@ class Header(NamedTuple):
 
 
 def read_header(file: BinaryIO, path: Path) -> Header:
-    """Parse the header of a file that stands at its start."""
+    """Parse the header of a file that is positioned at its start."""
     head = file.read(_MAX_HEADER)
     size = os.fstat(file.fileno()).st_size
     magic = re.match(rb"ply[ \t]*(\r\n|\n|\r)", head)
     if magic is None:
         raise InputError(
-            f"{path}: byte 0: found {head[:16]!r} where a PLY file has the line "
-            "'ply'; the file is empty, damaged or of another format: export it "
-            "again"
+            f"{path}: byte 0: expected a PLY file, which starts with the line 'ply', "
+            f"got {head[:16]!r}; export the file again"
         )
     eol = magic[1]
     pattern = re.compile(re.escape(eol) + rb"end_header[ \t]*" + re.escape(eol))
@@ -112,7 +108,7 @@ def _parse_header(
             case ["format", kind, "1.0"] if kind in _FORMATS and order is None:
                 order = _FORMATS[kind]
             case ["format", *_]:
-                raise InputError(f"{where}: one format, 1.0, of {[*_FORMATS]} is known")
+                raise InputError(f"{where}: expected one format 1.0 of {[*_FORMATS]}")
             case ["element", name, count] if re.fullmatch("[0-9]{1,20}", count):
                 if name in elements:
                     raise InputError(f"{where}: this element is declared twice")
@@ -123,11 +119,13 @@ def _parse_header(
                 last.types[name] = _property_type(where, kinds)
             case _:
                 raise InputError(
-                    f"{where}: 'element NAME COUNT', or after one 'property TYPE "
-                    "NAME', is wanted; the header is damaged: export the file again"
+                    f"{where}: expected 'element NAME COUNT', or after one 'property "
+                    "TYPE NAME'; the header is damaged: export the file again"
                 )
     if order is None:
-        raise InputError(f"{path}: the header has no 'format'; wanted: {[*_FORMATS]}")
+        raise InputError(
+            f"{path}: the header has no 'format'; expected one of {[*_FORMATS]}"
+        )
     return order, list(elements.values())
 
 
@@ -135,23 +133,29 @@ def _property_type(where: str, kinds: list[str]) -> str | None:
     is_list = len(kinds) == 3 and kinds[0] == "list"
     scalars = kinds[1:] if is_list else kinds
     if (len(kinds) == 3 and not is_list) or not all(k in _TYPES for k in scalars):
-        raise InputError(f"{where}: unknown type; known: {', '.join(_TYPES)}")
+        raise InputError(f"{where}: unknown type; expected one of {', '.join(_TYPES)}")
     return None if is_list else _TYPES[scalars[0]]
 
 
 def check_properties(header: Header, required: Collection[str]) -> int:
-    """Number K of SH bases; raises unless all that a Gaussian needs is there.
+    """Check that the vertices are Gaussians.
 
     Args:
       header: of the file.
-      required: properties of a Gaussian of degree 0, that is without f_rest.
+      required: properties of a Gaussian of degree 0, without f_rest.
+
+    Returns:
+      The number K of SH bases.
+
+    Raises:
+      InputError: if a property is missing, or f_rest is not a whole degree.
     """
     path, found = header.path, header.vertex.types
     lists = [name for name, kind in found.items() if kind is None]
     if lists:
         raise InputError(
-            f"{path}: element vertex has the list properties {lists[:8]}; Gaussians "
-            "have scalar properties only: export the scene as a 3DGS PLY"
+            f"{path}: expected scalar properties of element vertex, got the list "
+            f"properties {lists[:8]}; export the scene as a 3DGS PLY"
         )
     rest = sum(re.fullmatch("f_rest_[0-9]+", name) is not None for name in found)
     missing = [name for name in required if name not in found]
@@ -162,8 +166,8 @@ def check_properties(header: Header, required: Collection[str]) -> int:
         )
     if "packed_position" in found:
         raise InputError(
-            f"{path}: this is a compressed (packed) Gaussian PLY, which is not read; "
-            "convert it to the standard, uncompressed PLY"
+            f"{path}: this is a compressed (packed) Gaussian PLY, which is not "
+            "supported; convert it to the standard, uncompressed PLY"
         )
     if rest in _F_REST_COUNTS:
         missing += [f"f_rest_{i}" for i in range(rest) if f"f_rest_{i}" not in found]
@@ -174,40 +178,44 @@ def check_properties(header: Header, required: Collection[str]) -> int:
         )
     if rest not in _F_REST_COUNTS:
         raise InputError(
-            f"{path}: {rest} properties f_rest_* are no whole SH degree; degrees 0 to "
-            f"{MAX_DEGREE} have {_F_REST_COUNTS}"
+            f"{path}: expected {_F_REST_COUNTS} properties f_rest_* (SH degree 0 to "
+            f"{MAX_DEGREE}), got {rest}; export the scene again"
         )
     return 1 + rest // 3
 
 
 def check_size(header: Header) -> None:
-    """Compare the bytes that the header promises with those that are there."""
+    """Compare the size that the header declares with the size of the file.
+
+    Raises:
+      InputError: if the file is smaller, or the place of the vertices is unknown.
+    """
     path, order = header.path, header.order
     for element in header.before:
         if element.has_list:
             raise InputError(
                 f"{path}: element {element.name} has a list property and stands before "
-                "vertex, so that its size is unknown; put vertex first"
+                "vertex, so its size is unknown; put vertex first"
             )
     elements = [*header.before, header.vertex]
     open_end = not order or any(element.has_list for element in header.after)
     if not open_end:
         elements += header.after
-    wanted = sum(e.rows * e.least_bytes(order) for e in elements)
+    expected = sum(e.rows * e.min_bytes(order) for e in elements)
     if not order:
-        wanted = max(0, wanted - 1)  # the last line may lack its end
+        expected = max(0, expected - 1)  # the last line may lack its newline
     actual = header.size - header.body
-    if actual < wanted:
+    if actual < expected:
         sizes = ", ".join(
-            f"{e.rows} {e.name} × {e.least_bytes(order)} bytes" for e in elements
+            f"{e.rows} {e.name} × {e.min_bytes(order)} bytes" for e in elements
         )
         raise InputError(
-            f"{path}: the body (from byte {header.body}) is truncated: the header "
-            f"declares {'' if order else 'at least '}{wanted} bytes ({sizes}), "
-            f"{actual} are there; export or download the file again"
+            f"{path}: the body (from byte {header.body}) is truncated: expected "
+            f"{'' if order else 'at least '}{expected} bytes ({sizes}), got {actual}; "
+            "export or download the file again"
         )
-    if actual > wanted and not open_end:
+    if actual > expected and not open_end:
         warn(
-            f"{path}: {actual - wanted} bytes after the last element (from byte "
-            f"{header.body + wanted}) are ignored; the header may be wrong"
+            f"{path}: {actual - expected} bytes after the last element (from byte "
+            f"{header.body + expected}) are ignored; the header may be wrong"
         )

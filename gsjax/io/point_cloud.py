@@ -1,12 +1,13 @@
-"""Coloured points of a PLY file: the clouds that datasets come with."""
+"""Coloured points of a PLY file, as datasets bring them."""
 
 from os import PathLike
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.io.ply_header import check_size, read_header
+from gsjax.io.ply_header import Header, check_size, read_header
 from gsjax.io.ply_rows import read_rows
 from gsjax.runtime.files import opened
 from gsjax.runtime.memory import Estimate, require
@@ -20,19 +21,19 @@ _COLORS = (  # names of red, green and blue
 
 
 def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Points [M, 3] float64 and colours [M, 3] uint8, in the order of the file.
+    """Read points [M, 3] float64 and colours [M, 3] uint8, in the order of the file.
 
-    Properties are found by name: x y z, and red green blue, which are 0 to 255, of 16
-    bits 0 to 65535 where any is beyond 255, or 0 to 1 where they are floating-point;
-    grey where there are none.
+    Properties are found by name: x y z, and red green blue. Integer colours are 0 to
+    255, or 0 to 65535 if any is above 255; floating-point ones are 0 to 1. Points
+    without colours are grey.
 
     Args:
       path: the file, binary or ascii.
 
     Raises:
-      InputError: if the file cannot be read, is no PLY, is truncated, has no x y z,
-        or values that are not finite, or colours beyond what there can be.
-      CapacityError: if the memory would not hold it, before it is read.
+      InputError: if the file cannot be read, is not a PLY, is truncated, has no x y z,
+        values that are not finite, or colours out of range.
+      CapacityError: if memory is too small; raised before the body is read.
     """
     path = Path(path)
     with opened(path, "a .ply file") as file:
@@ -40,12 +41,11 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
         types = header.vertex.types
         if not all(types.get(name) for name in "xyz") or None in types.values():
             raise InputError(
-                f"{path}: element vertex has {', '.join([*types][:20])}; scalar x, "
-                "y, z are wanted: export the points as a PLY"
+                f"{path}: expected scalar properties x, y, z of element vertex, got "
+                f"{', '.join([*types][:20])}; export the points as a PLY"
             )
         check_size(header)
-        known = (names for names in _COLORS if types.keys() >= {*names})
-        names = next(known, ())
+        names = next((names for names in _COLORS if types.keys() >= {*names}), ())
         kinds = {types[name] or "" for name in names}
         unit = bool(names) and all(kind.startswith("f") for kind in kinds)
         narrow = unit or kinds <= {"u1"}
@@ -56,43 +56,44 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
             f"{path}: {header.vertex.rows:,} points",
             "leave out some of them where the file was made",
         )
-        points = np.empty((header.vertex.rows, 3))
-        kind = np.uint8 if narrow else np.uint16
-        colors = np.full((header.vertex.rows, 3), _GREY, kind)
-        wild = np.zeros(header.vertex.rows, bool)
-        start, darkest, brightest = 0, 0.0, 0.0
-        for size, columns in read_rows(file, header):
-            rows = slice(start, start + size)
-            for axis, name in enumerate("xyz"):
-                points[rows, axis] = columns[name]
-                wild[rows] |= ~(np.abs(points[rows, axis]) < 1e30)
-            for axis, name in enumerate(names):
-                values = columns[name].astype(np.float64)
-                wild[rows] |= ~np.isfinite(values)
-                values = np.nan_to_num(values)
-                brightest = max(brightest, values.max(initial=0.0))
-                darkest = min(darkest, values.min(initial=0.0))
-                values = np.clip(values, 0, 1) * 255 if unit else values
-                colors[rows, axis] = np.rint(
-                    np.clip(values, 0, 255 if narrow else 65535)
-                )
-            start += size
-    if wild.any():
+        points, colors, (darkest, brightest) = _read(file, header, names, unit, narrow)
+    bad = ~(np.abs(points) < 1e30).all(axis=1)
+    if bad.any():
         raise InputError(
-            f"{path}: {wild.sum()} of {len(points)} points have values that are no "
-            f"finite numbers, the first: {np.flatnonzero(wild)[:5].tolist()}; remove "
-            "them"
+            f"{path}: expected finite coordinates and colours, got others in "
+            f"{bad.sum()} of {len(points)} points, the first: "
+            f"{np.flatnonzero(bad)[:5].tolist()}; remove them"
         )
-    if unit and brightest > 1.01:
+    most = 1.01 if unit else 65535
+    if brightest > most or (darkest < 0 and not unit):
         raise InputError(
-            f"{path}: colours are floating-point, and up to {brightest:g}; 0 to 1 is "
-            "wanted of such, or whole numbers of type uchar"
-        )
-    if not unit and not 0 <= darkest <= brightest <= 65535:
-        raise InputError(
-            f"{path}: colours are from {darkest:g} to {brightest:g}; 0 to 255 is "
-            "wanted, of type uchar, or 0 to 65535, of type ushort"
+            f"{path}: expected colours of 0 to 255 (uchar), 0 to 65535 (ushort) or 0 "
+            f"to 1 (float), got {darkest:g} to {brightest:g}; export the points again"
         )
     if brightest > 255:
         colors = (colors.astype(np.uint32) + 128) // 257
     return points, colors.astype(np.uint8, copy=False)
+
+
+def _read(
+    file: BinaryIO, header: Header, names: tuple[str, ...], unit: bool, narrow: bool
+) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+    """Return points, colours, and the range of the colours as stored."""
+    points = np.empty((header.vertex.rows, 3))
+    kind = np.uint8 if narrow else np.uint16
+    colors = np.full((header.vertex.rows, 3), _GREY, kind)
+    start, darkest, brightest = 0, 0.0, 0.0
+    for size, columns in read_rows(file, header):
+        rows = slice(start, start + size)
+        for axis, name in enumerate("xyz"):
+            points[rows, axis] = columns[name]
+        for axis, name in enumerate(names):
+            values = columns[name].astype(np.float64)
+            points[rows][~np.isfinite(values)] = np.nan  # reported with the points
+            values = np.nan_to_num(values)
+            brightest = max(brightest, values.max(initial=0.0))
+            darkest = min(darkest, values.min(initial=0.0))
+            values = np.clip(values, 0, 1) * 255 if unit else values
+            colors[rows, axis] = np.rint(np.clip(values, 0, np.iinfo(kind).max))
+        start += size
+    return points, colors, (darkest, brightest)

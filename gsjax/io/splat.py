@@ -1,10 +1,9 @@
-"""Gaussians in `.splat` files, the 32 bytes a Gaussian of the first web viewers.
+"""Gaussians in `.splat` files, the format of the first web viewers (Kwok 2023,
+https://github.com/antimatter15/splat): 32 bytes a Gaussian and no header.
 
-Three float32 of mean, three of σ, red, green, blue and opacity in a byte each, and the
-quaternion, wxyz, in a byte each: 128 (1 + q). No header, no harmonics, axes as they
-are; those come first that cover most, as viewers draw while they load (Kwok 2023,
-https://github.com/antimatter15/splat). They are written and not read: nothing in such a
-file tells whether it is whole.
+Each holds float32 of mean [3] and σ [3], then a byte each of red, green, blue, opacity
+and the quaternion wxyz, 128 (1 + q). The largest come first, as viewers draw while they
+load. Files are written only: nothing in them tells whether they are complete.
 """
 
 from os import PathLike
@@ -16,10 +15,11 @@ from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.io.common import (
     MAX_SHIFT,
-    drawn_rows,
+    Format,
     opacity_bytes,
     require_new,
     to_bytes,
+    visible_rows,
     warn,
 )
 from gsjax.math.sh import C0
@@ -33,58 +33,67 @@ _ROW = np.dtype(
 def write_splat(
     path: str | PathLike[str], gaussians: Gaussians, *, overwrite: bool = False
 ) -> None:
-    """Write the active Gaussians as a `.splat` file, those that cover most first.
+    """Write the active Gaussians as a `.splat` file, largest first.
 
-    Colours are rounded to 8 bits and clipped to what they hold; harmonics above degree
-    0 have no place and are left out. Of both it is warned.
+    Colours are clipped and rounded to 8 bits, and harmonics above degree 0 are left
+    out, each with a warning.
 
     Args:
       path: the file to write; it appears complete or not at all.
       gaussians: the scene; inactive slots are left out.
-      overwrite: whether an existing file may be replaced.
+      overwrite: replace an existing file.
 
     Raises:
-      InputError: as `write_ply`; if a value is NaN, or infinite and no opacity, or a
-        mean is beyond float32, or none of the Gaussians is drawn.
+      InputError: as `write_ply`; if a value is NaN, or infinite and not a logit, if a
+        mean exceeds float32, or if nothing would be drawn.
     """
     path = Path(path)
     require_new(path, overwrite)
-    rows = drawn_rows(path, gaussians)
-    if gaussians.sh_degree:
-        warn(
-            f"{path}: .splat has one colour for all directions; harmonics of degree 1 "
-            f"to {gaussians.sh_degree} are left out"
-        )
-    colors = 0.5 + C0 * rows["sh"][:, 0].astype(np.float64)
-    beyond = np.any(np.abs(colors - 0.5) > 0.5 + 0.5 / 255, axis=1)
-    if beyond.any():
-        warn(
-            f"{path}: {beyond.sum()} of {len(beyond)} colours are darker than black or "
-            "brighter than white, and clipped"
-        )
-    table = np.zeros(len(colors), _ROW)
-    sizes = np.exp(np.clip(rows["log_scales"].astype(np.float64), -80, 80))
-    table["scales"] = sizes
+    rows = visible_rows(path, gaussians)
+    table = np.zeros(len(rows["means"]), _ROW)
+    logs = rows["log_scales"].astype(np.float64)
+    table["scales"] = np.exp(np.clip(logs, -80, 80))
     with np.errstate(over="ignore"):
         table["means"] = rows["means"]
     far = np.any(~np.isfinite(table["means"]), axis=1)
     if far.any():
         raise InputError(
-            f"{path}: {far.sum()} of {len(far)} means are beyond float32, which .splat "
+            f"{path}: {far.sum()} of {len(far)} means exceed float32, which .splat "
             "stores; move the scene nearer to the origin, or write a .ply"
         )
-    shift = np.abs(table["means"] - rows["means"].astype(np.float64)).max(1, initial=0)
-    moved = shift > MAX_SHIFT * sizes.max(1, initial=0)
-    if moved.any():
-        warn(
-            f"{path}: {moved.sum():,} of {len(moved):,} Gaussians have "
-            "means rounded by a tenth of their size; move the scene nearer to the "
-            "origin, or write a .ply"
-        )
+    colors = 0.5 + C0 * rows["sh"][:, 0].astype(np.float64)
+    _warn_of_losses(path, gaussians.sh_degree, colors, rows["means"], table)
     table["rgba"][:, :3] = to_bytes(255 * colors)
     table["rgba"][:, 3] = opacity_bytes(rows["logit_opacities"])
     table["quats"] = to_bytes(128 + 128 * rows["quats"])
-    logs = rows["log_scales"].astype(np.float64).sum(1)
-    covered = logs - np.logaddexp(0, -rows["logit_opacities"].astype(np.float64))
+    logits = rows["logit_opacities"].astype(np.float64)
+    covered = logs.sum(1) - np.logaddexp(0, -logits)
     with replacing(path, durable=True) as file:
         file.write(table[np.argsort(-covered, kind="stable")].tobytes())
+
+
+def _warn_of_losses(
+    path: Path, degree: int, colors: np.ndarray, means: np.ndarray, table: np.ndarray
+) -> None:
+    if degree:
+        warn(
+            f"{path}: .splat stores one colour for all directions; harmonics of degree "
+            f"1 to {degree} are left out"
+        )
+    clipped = np.any(np.abs(colors - 0.5) > 0.5 + 0.5 / 255, axis=1)
+    if clipped.any():
+        warn(
+            f"{path}: {clipped.sum()} of {len(clipped)} colours are out of [0, 1] and "
+            "clipped"
+        )
+    shift = np.abs(table["means"] - means.astype(np.float64)).max(1, initial=0)
+    moved = shift > MAX_SHIFT * table["scales"].max(1, initial=0)
+    if moved.any():
+        warn(
+            f"{path}: {moved.sum():,} of {len(moved):,} Gaussians have means rounded "
+            "by a tenth of their size or more; move the scene nearer to the origin, or "
+            "write a .ply"
+        )
+
+
+FORMAT = Format("splat", (".splat",), None, write_splat)

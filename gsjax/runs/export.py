@@ -1,4 +1,4 @@
-"""A scene to a file for others: thinned out, of another degree."""
+"""Export of a scene to another file, optionally pruned or with another SH degree."""
 
 from pathlib import Path
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, num_active, select, with_sh_degree
-from gsjax.io import load, save
+from gsjax.io.formats import load, save
 from gsjax.io.spz import write_spz
 from gsjax.runs.folder import load_settings
 from gsjax.runs.scene_source import is_run, splat_file
-from gsjax.runtime.files import make_folder
+from gsjax.runtime.files import make_folder, refuse_existing
 
 
 def export_scene(
@@ -23,32 +23,31 @@ def export_scene(
     min_opacity: float = 0.0,
     overwrite: bool = False,
 ) -> tuple[int, int]:
-    """Write the Gaussians of a file or run to ``out``, in the coordinates they have.
+    """Write the Gaussians of a file or run to ``out``, in their own coordinates.
 
     Args:
       source: a .ply or .spz file, or the folder of a run.
       out: the file; its folder is created if missing.
-      sh_degree: of what is written; bands are cut, or added as zeros.
-      min_opacity: what is less opaque is left out.
-      overwrite: whether a file that exists may be replaced.
+      sh_degree: SH degree to write: higher bands are dropped, missing ones zero.
+      min_opacity: Gaussians below this opacity are left out.
+      overwrite: replace an existing file.
 
     Returns:
-      How many were written, and how many there were.
+      The numbers of Gaussians written and read.
 
     Raises:
-      InputError: if a file cannot be read or written, exists and ``overwrite`` is not
-        set, or nothing would be left.
+      InputError: if a file cannot be read or written, or exists without ``overwrite``,
+        or no Gaussian reaches ``min_opacity``.
     """
-    if out.exists() and not overwrite:
-        raise InputError(f"{out}: exists; pass --overwrite, or another name")
+    refuse_existing([out], overwrite)
     path = splat_file(source)
-    with jax.enable_x64(True):  # what is stored in float64 stays so
-        gaussians, found = _thinned(path, min_opacity)
+    with jax.enable_x64(True):  # keeps float64 files exact
+        gaussians, found = _load_opaque(path, min_opacity)
         if sh_degree is not None:
             gaussians = with_sh_degree(gaussians, sh_degree)
-        if out.suffix.lower() != ".ply":  # which others do not hold
-            turned = np.any(np.asarray(gaussians.params.quats) != 0, axis=1)
-            gaussians = select(gaussians, jnp.asarray(turned))
+        if out.suffix.lower() != ".ply":  # other formats cannot hold zero quaternions
+            rotated = np.any(np.asarray(gaussians.params.quats) != 0, axis=1)
+            gaussians = select(gaussians, jnp.asarray(rotated))
         make_folder(out.parent)
         if out.suffix.lower() == ".spz":
             antialias = is_run(source) and load_settings(source).config.raster.antialias
@@ -58,18 +57,17 @@ def export_scene(
         return int(num_active(gaussians)), found
 
 
-def _thinned(path: Path, min_opacity: float) -> tuple[Gaussians, int]:
-    """Those of a file that are so opaque, and how many there were."""
+def _load_opaque(path: Path, min_opacity: float) -> tuple[Gaussians, int]:
+    """Return the Gaussians of at least this opacity, and the number in the file."""
     gaussians = load(path)
     found = int(num_active(gaussians))
     logits = np.asarray(gaussians.params.logit_opacities, np.float64)
     with np.errstate(over="ignore"):
         opacities = 1 / (1 + np.exp(-logits))
     gaussians = select(gaussians, jnp.asarray(opacities >= min_opacity))
-    written = int(num_active(gaussians))
-    if found and not written:
+    if found and not int(num_active(gaussians)):
         raise InputError(
             f"{path}: none of {found:,} Gaussians has an opacity of {min_opacity:g}; "
-            f"the greatest is {opacities.max():.3g}"
+            f"the greatest is {opacities.max():.3g}; lower --min-opacity"
         )
     return gaussians, found

@@ -333,7 +333,7 @@ def test_other_errors(error, code, scene, capsys, monkeypatch):
     def fail(*_):
         raise error
 
-    monkeypatch.setattr("gsjax.io.load", fail)
+    monkeypatch.setattr("gsjax.io.formats.load", fail)
     assert cli_main.main(["info", str(scene / "scene.ply")]) == code
     assert len(error_of(capsys)) < 400
 

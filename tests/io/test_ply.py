@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, grow, make_gaussians, select
-from gsjax.io import load, save
+from gsjax.io.formats import load, save
 from gsjax.io.numerals import BLOCK
 from gsjax.io.ply import read_ply, write_ply
 from gsjax.runs.export import export_scene
