@@ -1,7 +1,7 @@
-"""Tables of the command line's options, for cli.md: a hook of mkdocs.
+"""Generate the option tables of docs/reference/cli.md; a hook of mkdocs.
 
-Read from the source of gsjax/commands, where an option is a field with its help below,
-so that building the pages imports neither gsjax nor JAX.
+The tables are read from the source of gsjax/cli, where an option is a field followed by
+its help text, so that building the pages imports neither gsjax nor JAX.
 """
 
 import ast
@@ -9,43 +9,49 @@ import re
 from itertools import pairwise
 from pathlib import Path
 
-SOURCE = Path(__file__).parents[1] / "gsjax"
+SOURCE = Path(__file__).parents[1] / "gsjax" / "cli"
 _MARK = re.compile(r"<!-- options: (\w+) -->")
-_WORDS = {"int": "N", "float": "X", "str": "TEXT", "Path": "PATH", "bool": ""}
+_METAVARS = {"int": "N", "float": "X", "str": "TEXT", "Path": "PATH", "bool": ""}
+
+
+def _sources() -> list[str]:
+    return [path.read_text(encoding="utf-8") for path in sorted(SOURCE.glob("*.py"))]
 
 
 def command_classes() -> dict[str, str]:
-    """Names of the commands, and of the classes that they are."""
-    text = (SOURCE / "cli.py").read_text(encoding="utf-8")
-    return dict(re.findall(r'^        "(\w+)": (\w+Command),$', text, re.M))
+    """Return the class of each command by its name."""
+    pattern = re.compile(r'^ +"(\w+)": (\w+Command),$', re.MULTILINE)
+    return dict(pair for text in _sources() for pair in pattern.findall(text))
 
 
 def fields(command: str) -> list[tuple[ast.AnnAssign, str]]:
-    """The fields of a command, each with its help; those that it inherits last, but
-    for those that all have."""
+    """Return the fields of a command with their help, inherited ones last.
+
+    Options that all commands share are left out.
+    """
     classes = {
         node.name: node
-        for path in sorted((SOURCE / "commands").glob("*.py"))
-        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        for text in _sources()
+        for node in ast.parse(text).body
         if isinstance(node, ast.ClassDef)
     }
     found, names = [], [command_classes()[command]]
     while names:
         node = classes[names.pop(0)]
-        found += _told(node.body)
+        found += _documented_fields(node.body)
         bases = {ast.unparse(base) for base in node.bases}
-        names += sorted(bases - {"Command"})
+        names += sorted(bases & set(classes) - {"Command"})
     return found
 
 
-def _told(body: list[ast.stmt]):
+def _documented_fields(body: list[ast.stmt]):
     for field, text in pairwise(body):
         if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
             yield field, " ".join(ast.literal_eval(text.value).split())
 
 
-def row(field: ast.AnnAssign, told: str) -> str:
-    """A row of the table: what to write, its default, what it does."""
+def row(field: ast.AnnAssign, help_text: str) -> str:
+    """Return a table row: the option, its default, its help."""
     kind, name = ast.unparse(field.annotation), ast.unparse(field.target)
     choices = re.search(r"Literal\[(.*?)\]", kind)
     metavar = re.search(r"metavar='(.*?)'", kind)
@@ -55,7 +61,7 @@ def row(field: ast.AnnAssign, told: str) -> str:
     elif choices:
         value = ", ".join(str(v) for v in ast.literal_eval(f"[{choices[1]}]"))
     else:
-        value = _WORDS[plain[1]] if plain else ""
+        value = _METAVARS[plain[1]] if plain else ""
     if kind.startswith("tuple"):
         value += " …"
     value = f"*{value}*" if value else ""
@@ -64,12 +70,12 @@ def row(field: ast.AnnAssign, told: str) -> str:
         option = f"`-o`, {option}"
     written = value if "Positional" in kind else f"{option} {value}".strip()
     default = "" if field.value is None else _literal(field.value)
-    cells = (written, f"`{default}`" if default else "", told)
+    cells = (written, f"`{default}`" if default else "", help_text)
     return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
 
 
 def _literal(value: ast.expr) -> str:
-    """A default as it would be typed; nothing for what is off or left open."""
+    """Return a default as it is typed; "" for one that is off or None."""
     if isinstance(value, ast.Call):  # Path("…")
         value = value.args[0]
     plain = ast.literal_eval(value)
@@ -77,7 +83,7 @@ def _literal(value: ast.expr) -> str:
 
 
 def table(command: str) -> str:
-    """The options of a command as a Markdown table, or that there is none."""
+    """Return the options of a command as a Markdown table."""
     rows = [row(*field) for field in fields(command)]
     if not rows:
         return "No options."
@@ -85,5 +91,5 @@ def table(command: str) -> str:
 
 
 def on_page_markdown(markdown: str, **_) -> str:
-    """Called by mkdocs for each page."""
+    """Replace the markers of a page; mkdocs calls this for each page."""
     return _MARK.sub(lambda mark: table(mark[1]), markdown)
