@@ -10,7 +10,6 @@ held-out views was passed: compiling counts, measuring and loading do not.
 from __future__ import annotations
 
 import argparse
-import subprocess
 import tempfile
 from pathlib import Path
 
@@ -19,7 +18,6 @@ import measure
 from gsjax.runs.folder import run_files
 from gsjax.runs.history import read_metrics
 
-ROOT = Path(__file__).parents[1]
 # As `gsjax demo`, but for measuring on the way.
 DEMO = """
 import sys
@@ -31,16 +29,6 @@ usual = demo.demo_config
 demo.demo_config = lambda *given: usual(*given).replace(every_eval=20)
 demo.run_demo(Path(sys.argv[1]), demo.DemoSettings(), overwrite=False)
 """
-
-
-def code_of(commit: str, folder: Path) -> Path:
-    """The package as it was then, in the folder."""
-    packed = subprocess.run(
-        ["git", "archive", commit, "gsjax"], cwd=ROOT, check=True, capture_output=True
-    )
-    folder.mkdir()
-    subprocess.run(["tar", "-x", "-C", folder], input=packed.stdout, check=True)
-    return folder
 
 
 def trained(code: Path, arguments: list[str], run: Path) -> list[dict]:
@@ -74,7 +62,10 @@ def main(commit: str, dataset: Path, held_out: list[str]) -> None:
     rows, curves = [], {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        codes = {"before": code_of(commit, folder / "code"), "now": ROOT}
+        codes = {
+            "before": measure.code_of(commit, folder / "code"),
+            "now": measure.ROOT,
+        }
         for state, code in codes.items():
             demo, run = folder / f"demo_{state}", folder / f"run_{state}"
             turned = ["-c", DEMO, str(demo)]

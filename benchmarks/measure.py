@@ -15,7 +15,18 @@ from gsjax.runtime.timing import interleaved as interleaved
 from gsjax.runtime.timing import machine as machine
 from gsjax.runtime.timing import time_ms as time_ms
 
+ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).with_name("results")
+
+
+def code_of(commit: str, folder: Path) -> Path:
+    """Unpack the package as of a commit into the folder, and return the folder."""
+    packed = subprocess.run(
+        ["git", "archive", commit, "gsjax"], cwd=ROOT, check=True, capture_output=True
+    )
+    folder.mkdir(parents=True)
+    subprocess.run(["tar", "-x", "-C", folder], input=packed.stdout, check=True)
+    return folder
 
 
 def run_cold(arguments: list[str], code: Path | None = None) -> None:
