@@ -1,11 +1,12 @@
 """The public names, which are those of `gsjax` itself."""
 
 from gsjax.cameras.camera import Camera as Camera
-from gsjax.cameras.lenses import Lens as Lens
 from gsjax.cameras.camera import look_at as look_at
 from gsjax.cameras.camera import make_camera as make_camera
 from gsjax.cameras.camera import resize_camera as resize_camera
 from gsjax.cameras.camera import stack_cameras as stack_cameras
+from gsjax.cameras.lenses import Lens as Lens
+from gsjax.data.arrays import make_dataset as make_dataset
 from gsjax.data.dataset import load_dataset as load_dataset
 from gsjax.data.photos import load_photos as load_photos
 from gsjax.data.splits import split_views as split_views
@@ -28,10 +29,10 @@ from gsjax.io.formats import load as load
 from gsjax.io.formats import save as save
 from gsjax.planning.plan import plan as plan
 from gsjax.planning.types import Plan as Plan
+from gsjax.raster.exact import exact_config as exact_config
+from gsjax.raster.exact import render_exact as render_exact
 from gsjax.raster.reference import reference_render as reference_render
-from gsjax.raster.render import exact_config as exact_config
 from gsjax.raster.render import render as render
-from gsjax.raster.render import render_exact as render_exact
 from gsjax.raster.types import RasterConfig as RasterConfig
 from gsjax.raster.types import Render as Render
 from gsjax.runtime.devices import use_all_cores as use_all_cores
@@ -44,3 +45,4 @@ from gsjax.train.loop import subset as subset
 from gsjax.train.state import init_state as init_state
 from gsjax.train.step import make_train_step as make_train_step
 from gsjax.viewer import notebook as notebook
+from gsjax.viewer.notebook import save_png as save_png

@@ -14,9 +14,9 @@
 # %% [markdown]
 # # Exporting and viewing
 #
-# A scene goes to a file and comes back, becomes smaller, and what that costs is
-# measured; it turns around in a movie, and becomes a page that opens offline. On the
-# command line: `gsjax export`, `gsjax render`, `gsjax view`, `gsjax info`.
+# Save a scene to a file and load it, make it smaller and measure the loss, render an
+# orbit, and write a page that opens offline. On the command line: `gsjax export`,
+# `gsjax render`, `gsjax view`, `gsjax info`.
 
 # %%
 import importlib.util
@@ -33,21 +33,20 @@ from gsjax.plots.histograms import histograms
 from gsjax.synthetic.torus_knot import torus_knot_scene
 from gsjax.viewer.notebook import Picture, movie, show
 
-WIDTH, HEIGHT, FRAMES = 160, 120, 30
+WIDTH, HEIGHT, FRAMES = 128, 96, 24
 CONFIG = gsjax.RasterConfig(
     outputs=("rgb",), occlusion=False, num_size_buckets=1, devices=1
 )
-kept = tempfile.TemporaryDirectory(prefix="gsjax-")
-folder = Path(kept.name)
+temporary = tempfile.TemporaryDirectory(prefix="gsjax-")
+folder = Path(temporary.name)
 
 made = torus_knot_scene(4000, frames=FRAMES, width=WIDTH, height=HEIGHT)
 cameras, background = made.cameras, jnp.asarray(made.background)
 
 # %% [markdown]
-# The scene is a torus knot over a floor. To it comes what every trained scene has:
-# faint Gaussians, 3000 of them, that drift about and hardly show. And its SH degree is
-# 3, as in most files, though all bands above the first are zero, for nothing needed
-# them.
+# The scene is a torus knot over a floor, plus what every trained scene has: 3000 faint
+# Gaussians that float about and hardly show. Its SH degree is 3, as in most files,
+# although all bands above the first are zero.
 
 # %%
 rng = np.random.default_rng(0)
@@ -63,10 +62,10 @@ scene = gsjax.with_sh_degree(gsjax.concatenate(made.gaussians, dust), 3)
 scene
 
 # %% [markdown]
-# ## To a file and back
+# ## Save and load
 #
-# PLY, with the names of properties that every viewer of Gaussians knows, 32 bits a
-# number. What is float32 comes back bit for bit.
+# PLY uses the property names that every viewer of Gaussians knows, 32 bits per number.
+# A float32 scene is restored bit for bit.
 
 # %%
 path = folder / "scene.ply"
@@ -77,48 +76,48 @@ for before, after in zip(jax.tree.leaves(scene), jax.tree.leaves(again)):
 size = path.stat().st_size
 header = path.read_bytes().split(b"end_header")[0].decode().split("\n")
 print("\n".join([*header[:5], "…", *header[-6:]]))
-print(f"{size:,} bytes, {size / gsjax.num_active(scene):.0f} a Gaussian")
+print(f"{size:,} bytes, {size / gsjax.num_active(scene):.0f} per Gaussian")
 
 # %% [markdown]
-# ## What it consists of
+# ## What the scene consists of
 #
-# The picture that `gsjax info SCENE.ply --plot OUT.png` draws. Two hills of opacity:
-# the knot, near 1, and the dust, near 0. The surfaces are of flat Gaussians, all 1 to
-# 6.7; the dust has any shape.
+# This is the figure of `gsjax info SCENE.ply --plot OUT.png`. Opacity has two modes:
+# the knot, near 1, and the dust, near 0. Surfaces consist of flat Gaussians; the dust
+# has any shape.
 
 # %%
 Picture(histograms(scene, title="knot and dust"))
 
 # %% [markdown]
-# ## Smaller, and the same
+# ## Smaller without loss
 #
-# `plan` without a budget leaves out what cannot change a picture: bands that are zero,
-# and Gaussians that are fainter than the cut of 1/255 everywhere. It says what it did,
-# and also chooses settings to render with.
+# Without a budget, `plan` removes what cannot change an image: bands that are zero, and
+# Gaussians below the cut of 1/255 everywhere. It reports what it did, and chooses
+# settings for rendering.
 
 # %%
 planned = gsjax.plan(
-    scene, cameras[:: FRAMES // 3], config=CONFIG, background=made.background
+    scene, cameras[:: FRAMES // 2], config=CONFIG, background=made.background
 )
 print("\n".join(planned.lines()))
 
 # %% [markdown]
-# Held against the whole scene, over six views around it: as exact as rounding allows.
+# Compared with the whole scene over four views, the difference is rounding.
 
 
 # %%
 def views_of(gaussians):
-    """[6, H, W, 3]: pictures from around."""
+    """Return images [4, H, W, 3] from around."""
     return np.stack(
         [
             gsjax.render_exact(gaussians, camera, CONFIG, background).rgb
-            for camera in cameras[:: FRAMES // 6]
+            for camera in cameras[:: FRAMES // 4]
         ]
     )
 
 
 def bytes_of(gaussians):
-    """Size of the file."""
+    """Return the size of the PLY file."""
     file = folder / "measured.ply"
     gsjax.save(file, gaussians, overwrite=True)
     return file.stat().st_size
@@ -132,10 +131,10 @@ assert np.abs(exact - full).max() < 1e-5
 assert bytes_of(planned.gaussians) < 0.5 * size
 
 # %% [markdown]
-# ## Smaller, at a price
+# ## Smaller with loss
 #
-# From there on it costs something: Gaussians that are seen, though hardly, and the band
-# that holds the highlights.
+# Further reduction changes the image: it removes Gaussians that are visible, if hardly,
+# and the band with the highlights.
 
 
 # %%
@@ -178,10 +177,10 @@ plt.show()
 show(*[row[2] for row in rows.values()], captions=list(rows), columns=3)
 
 # %% [markdown]
-# Throwing out by opacity does well here, for the dust is faint and there is little of
-# it before anything. At 0.5 the rim of the floor goes too, which fades out with faint
-# Gaussians, and that one sees. Degree 0 takes the highlights off the knot, and saves
-# the nine of 26 numbers that they are made of.
+# Selecting by opacity works well here, because the dust is faint and little of it is in
+# front of anything. At 0.5 the rim of the floor, which fades out with faint Gaussians,
+# disappears too. Degree 0 removes the highlights of the knot, and the nine of 26
+# numbers that encode them.
 
 # %%
 quality = {name: psnr for name, (_, psnr, _) in rows.items()}
@@ -191,12 +190,12 @@ assert rows["opacity > 0.05"][0] < 0.95 * rows["plan"][0]
 assert rows["SH degree 0"][0] < 0.75 * rows["plan"][0]
 
 # %% [markdown]
-# ## The same in fewer bits
+# ## Fewer bits
 #
-# `.spz` holds the same Gaussians with every number rounded, and packs them: means in 24
-# bits, rotations in 32 together, all others in 8 or fewer. Most viewers for the web
-# read it. (`save` also writes `.splat`, which the first of them read: 32 bytes each, of
-# SH degree 0.) `gsjax export RUN scene.spz` does it on the command line.
+# `.spz` holds the same Gaussians with every number rounded: means in 24 bits, rotations
+# in 32 together, all others in 8 or fewer. Most web viewers read it. (`save` also
+# writes `.splat`, the format of the first of them: 32 bytes per Gaussian, SH degree 0.)
+# On the command line: `gsjax export RUN scene.spz`.
 
 # %%
 packed = folder / "scene.spz"
@@ -204,16 +203,15 @@ gsjax.save(packed, base)
 views = views_of(gsjax.load(packed))
 psnr = -10 * np.log10(np.mean((views - full) ** 2))
 times = bytes_of(base) / packed.stat().st_size
-print(f"{packed.stat().st_size:,} bytes, {times:.1f} times less; {psnr:.1f} dB")
+print(f"{packed.stat().st_size:,} bytes, {times:.1f} times smaller; {psnr:.1f} dB")
 assert times > 4
 assert psnr > 45
 
 # %% [markdown]
-# ## Around it
+# ## An orbit
 #
-# The orbit as a movie within the notebook, in the colours of the settings above, and
-# the same for a file: `gsjax render SCENE.ply --cameras DATASET --path orbit -o
-# orbit.webm`, or from Python `gsjax.io.movies.write_movie`.
+# The orbit as a movie within the notebook. To a file: `gsjax render SCENE.ply --cameras
+# DATASET --path orbit -o orbit.webm`, or `gsjax.io.movies.write_movie` from Python.
 
 # %%
 light = smaller["opacity > 0.05"]
@@ -229,33 +227,33 @@ assert len(turntable.data) < 500_000
 # %% [markdown]
 # ## In a browser, offline
 #
-# `gsjax view SCENE.ply` serves an interactive viewer, `gsjax view SCENE.ply --html
-# scene.html` writes it as one page, Gaussians and all, that needs no network and no
-# Python. The page is drawn by viser, an extra: `pip install viser`. It shows
-# one colour from all sides (SH degree 0); that is why the highlights stand still there.
+# `gsjax view SCENE.ply` starts an interactive viewer. `gsjax view SCENE.ply --html
+# scene.html` writes it as one page, Gaussians included, that needs neither network nor
+# Python. The page is drawn by viser, an extra: `pip install viser`. It shows one colour
+# from all sides (SH degree 0), so the highlights do not move.
 
 # %%
 if importlib.util.find_spec("viser") is None:
     print("viser is not installed, so there is no page: pip install viser")
 else:
-    from gsjax.viewer.opening import open_exhibit
+    from gsjax.viewer.opening import load_content
     from gsjax.viewer.page import write_page
 
     gsjax.save(folder / "light.ply", light)
-    shown = open_exhibit(folder / "light.ply", up="+z")
-    page = write_page(shown.exhibit, folder / "scene.html", title="a knot")
+    shown = load_content(folder / "light.ply", up="+z")
+    page = write_page(shown.content, folder / "scene.html", title="a knot")
     print(f"scene.html: {page.drawn:,} Gaussians, {page.size / 2**20:.2f} MiB")
     assert page.drawn == gsjax.num_active(light)
     text = (folder / "scene.html").read_text(encoding="utf-8")
     assert "<title>a knot</title>" in text
     assert "https://cdn" not in text
-kept.cleanup()
+temporary.cleanup()
 
 # %% [markdown]
-# ## What to take away
+# ## Summary
 #
-# - `save` and `load` lose nothing of a PLY. What is lost, is lost by choosing: `select`
-#   by any mask, `with_sh_degree`, `plan` within an error that you name, `.spz`.
-# - Look before cutting: a histogram shows whether there are two kinds of Gaussians to
-#   tell apart, and pictures show what a threshold takes along.
-# - Movies and pages are files without anything beside them, to be handed on.
+# - `save` and `load` lose nothing in a PLY. You choose what to lose: `select` by any
+#   mask, `with_sh_degree`, `plan` within a given error, `.spz`.
+# - Look before you cut: a histogram shows whether there are two kinds of Gaussians, and
+#   images show what a threshold removes.
+# - Movies and pages are single files that can be passed on.

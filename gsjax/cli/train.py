@@ -1,4 +1,4 @@
-"""`gsjax train`: from photographs with known cameras to a scene."""
+"""`gsjax train`: a scene from photographs with known cameras."""
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -13,148 +13,125 @@ from gsjax.cli.common import (
     start_jax,
     view_hint,
 )
+from gsjax.cli.options import integer
 from gsjax.runtime.console import decibels, note, say
 
-# What does not change the run itself.
-_OF_A_SITTING = {
+# Options that do not change the settings of a run.
+_NOT_SETTINGS = {
     "dataset", "out", "resume", "overwrite", "viewer", "viewer_port", "debug",
     "ignore_memory",
 }  # fmt: skip
-# The least that options may be.
-_LEAST = {
-    "steps": 1, "max_size": 8, "max_gaussians": 1, "seed": 0, "factor": 1,
-    "test_every": 0, "checkpoint_every": 0, "eval_every": 0,
-}  # fmt: skip
+_POINTS = ("points", "dense", "random")
 
 
 @dataclass(kw_only=True)
 class TrainCommand(HeavyCommand):
-    """Train a scene on a dataset: COLMAP, nerfstudio, NeRF or LLFF."""
+    """Train a scene on a COLMAP, nerfstudio, NeRF or LLFF dataset."""
 
     dataset: Positional[Path]
-    """Folder of the dataset, as `gsjax sfm` makes it, or its .json or .npy file."""
+    """Folder of the dataset, e.g. from `gsjax sfm`, or its .json or .npy file."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="RUN")]
     """Folder for the run; created if missing."""
     preset: Literal["fast", "default", "quality"] = "default"
-    """fast: about two minutes on two cores; default: twenty and more; quality: 30 000
+    """fast: about two minutes on two cores; default: twenty and more; quality: 30,000
     steps as in the papers."""
     strategy: Literal["adaptive", "mcmc"] | None = None
-    """How Gaussians are added and removed; default: the preset's."""
-    steps: int | None = None
-    """How many, default: the preset's; its schedules are stretched to them."""
-    max_size: int | None = None
-    """Longest side of the photographs in px, to which larger ones are scaled down;
-    default: the preset's."""
-    max_gaussians: int | None = None
-    """Never more than that; default: the preset's."""
+    """Strategy that adds and removes Gaussians; default: that of the preset."""
+    steps: Annotated[int | None, integer(1)] = None
+    """Number of steps, to which all schedules are scaled; default: that of the
+    preset."""
+    max_size: Annotated[int | None, integer(8)] = None
+    """Longest side in px, to which larger photographs are scaled down; default: that of
+    the preset."""
+    max_gaussians: Annotated[int | None, integer(1)] = None
+    """Maximum number of Gaussians; default: that of the preset."""
     sh_degree: Literal[0, 1, 2, 3, 4] | None = None
-    """Degree of the spherical harmonics; 0 is one colour from all sides; default: the
-    preset's."""
+    """Degree of the spherical harmonics; 0 for view-independent colours; default: that
+    of the preset."""
     background: Literal["auto", "black", "white", "random"] | None = None
-    """Behind the scene; default: auto, which is random where photographs are
-    transparent, else black."""
+    """Background colour. Default: auto, which is random if photographs are transparent,
+    else black."""
     initial: Annotated[str | None, arg(metavar="points|dense|random|SCENE")] = None
-    """Start from the dataset's points; from those and many more on which the
-    photographs agree (the default); from anywhere in view; or from a scene of this
-    dataset, by the folder of its run or its .ply or .spz."""
+    """Initialise from the points of the dataset (points), from those and points matched
+    between photographs (dense, the default), from random points in view (random), or
+    from a scene of this dataset: the folder of a run, or a .ply or .spz file."""
     antialias: bool = False
-    """Compensate thin splats for the blur of a pixel, to look right at other sizes."""
+    """Compensate the opacity of splats smaller than a pixel, for renders at other
+    sizes."""
     absgrad: bool = False
-    """Adaptive strategy: split by absolute gradients; sharper, with more Gaussians."""
+    """Split by absolute gradients in the adaptive strategy: sharper, with more
+    Gaussians."""
     refine_poses: bool = False
-    """Correct the cameras' poses along with the scene."""
+    """Optimise the camera poses together with the scene."""
     refine_intrinsics: bool = False
-    """Correct focal length and principal point along with the scene."""
+    """Optimise focal length and principal point together with the scene."""
     exposure: bool = False
-    """Learn an exposure for each photograph."""
+    """Optimise an exposure for each photograph."""
     keep_unseen: bool = False
-    """Keep the Gaussians that, in the end, no photograph trained on shows."""
-    seed: int = 0
-    """The same seed gives the same bits on a CPU, with as many cores."""
+    """Keep Gaussians that no training photograph shows at the end."""
+    seed: Annotated[int, integer(0)] = 0
+    """Seed of the random numbers. On CPUs, a seed reproduces the result bit by bit with
+    the same number of cores."""
     images: str | None = None
-    """Folder of the photographs, if not as usual."""
-    factor: int | None = None
-    """2, 4, 8: use the smaller copies in images_2, images_4, images_8."""
+    """Folder of the photographs; default: that of the dataset's format."""
+    factor: Annotated[int | None, integer(1)] = None
+    """Use photographs scaled down by 2, 4 or 8, in images_2, images_4 or images_8."""
     skip_missing: bool = False
-    """Leave out photographs that are listed but not there."""
-    test_every: int | None = None
-    """Hold out every so many-th view to measure with, 0 for none; default: the test
-    views that the dataset names, or every 8th where it names none."""
+    """Skip photographs that the dataset lists but that do not exist."""
+    test_every: Annotated[int | None, integer(0)] = None
+    """Hold out every Nth view for evaluation, 0 for none; default: the test views that
+    the dataset declares, or else every 8th."""
     test_images: tuple[str, ...] | None = None
     """Hold out these views instead."""
-    checkpoint_every: int | None = None
-    """Steps between checkpoints, 0 only at the end; default: the preset's."""
-    eval_every: int | None = None
-    """Steps between measurements on the held-out views; default: 0, only at the end."""
+    checkpoint_every: Annotated[int | None, integer(0)] = None
+    """Steps between checkpoints, 0 for one at the end; default: that of the preset."""
+    eval_every: Annotated[int | None, integer(0)] = None
+    """Steps between evaluations of the held-out views; default: 0, only at the end."""
     viewer: bool = False
-    """Show the scene in the browser as it grows; needs the extra gsjax[viewer]."""
-    viewer_port: int | None = None
-    """Where, default: 8080; the next free port if it is taken."""
+    """Show the scene in the browser while it trains. Requires gsjax[viewer]."""
+    viewer_port: Annotated[int | None, integer(1, 65535)] = None
+    """Port of the viewer, or the next free one; default: 8080."""
     resume: bool = False
-    """Go on where the run in RUN stopped, with the settings that it has; to the same
-    bits, with as many cores. Where there is none yet, start one."""
+    """Resume the run in RUN with its settings, or start it if there is none. The result
+    is bit-equal to an uninterrupted run with the same number of cores."""
     overwrite: bool = False
-    """Replace a run that exists."""
+    """Replace an existing run."""
 
     def run(self) -> int:
         if self.resume and self.overwrite:
             raise UsageError("--resume and --overwrite exclude each other")
         if self.test_images is not None and not self.test_images:
-            raise UsageError("--test-images wants the name of one view at least")
+            raise UsageError("--test-images: expected the name of at least one view")
         if self.test_images and self.test_every is not None:
             raise UsageError("--test-every and --test-images exclude each other")
         if self.viewer_port is not None and not self.viewer:
             raise UsageError("--viewer-port goes with --viewer")
-        if self.viewer_port is not None and not 1 <= self.viewer_port < 2**16:
-            raise UsageError(f"--viewer-port {self.viewer_port}: from 1 to 65535")
         start_jax()
         try:
-            return self._watched() if self.viewer else self._train(None)
+            return self._train_with_viewer() if self.viewer else self._train(None)
         except KeyboardInterrupt:
             from gsjax.runs.folder import run_files
-            from gsjax.runs.session import saved_text
+            from gsjax.runs.session import resume_hint
 
-            note(saved_text(run_files(self.out)))
+            note(resume_hint(run_files(self.out)))
             raise
 
-    def _watched(self) -> int:
+    def _train_with_viewer(self) -> int:
         from gsjax.viewer.live import LiveViewer
 
         viewer = LiveViewer(port=self.viewer_port or 8080)
         try:
             code = self._train(viewer.begin)
             if code == 0:
-                viewer.stay()
+                viewer.wait_for_browsers()
             return code
         finally:
             viewer.close()
 
     def _train(self, watch) -> int:
-        from gsjax.runs.folder import load_settings, run_files
-        from gsjax.runs.run import resume_run, start_run
-
-        if self.resume and run_files(self.out).config.exists():
-            settings = load_settings(self.out)
-            self._refuse_other(settings)
-            moved = settings.dataset != self.dataset.resolve()
-            if moved and settings.dataset.exists():
-                raise UsageError(
-                    f"{self.out} was trained on {settings.dataset}; --resume goes on "
-                    "with that"
-                )
-            dataset = self.dataset.resolve() if moved else None
-            result = resume_run(self.out, dataset=dataset, watch=watch)
-        else:
-            if self.resume:  # after a kill before there was anything, too
-                note(f"{self.out} is no run yet; one is started there")
-            result = start_run(
-                self._settings(self._start()),
-                self.out,
-                overwrite=self.overwrite,
-                watch=watch,
-            )
+        result = self._start_or_resume(watch)
         if not result.finished:
-            note(f"stopped after step {result.step}; go on with --resume")
+            note(f"stopped after step {result.step}; resume with --resume")
             return 130
         say(str(result.files.splat))
         line = f"{result.gaussians:,} Gaussians, {result.seconds:.0f} s"
@@ -165,77 +142,98 @@ class TrainCommand(HeavyCommand):
             )
         say(line)
         say(str(result.files.preview))
-        note("next: look at it, fly through it, see how it went")
+        movie = ("--path", "interpolate", "-o", self.out / "flight.webm")
+        note("next: view it, render a movie, see its statistics")
         note(f"  {view_hint(self.out)}")
-        flight = ("--path", "interpolate", "-o", self.out / "flight.webm")
-        note(f"  {command_line('render', self.out, *flight)}")
+        note(f"  {command_line('render', self.out, *movie)}")
         note(f"  {command_line('info', self.out)}")
         return 0
 
-    def _refuse_other(self, settings) -> None:
-        """Refuse options of a run that is gone on with where they differ from its."""
+    def _start_or_resume(self, watch):
+        from gsjax.runs.folder import load_settings, run_files
+        from gsjax.runs.run import resume_run, start_run
+
+        if self.resume and run_files(self.out).config.exists():
+            settings = load_settings(self.out)
+            self._check_same_settings(settings)
+            moved = settings.dataset != self.dataset.resolve()
+            if moved and settings.dataset.exists():
+                raise UsageError(
+                    f"{self.out} was trained on {settings.dataset}; pass that dataset "
+                    "to --resume it"
+                )
+            dataset = self.dataset.resolve() if moved else None
+            return resume_run(self.out, dataset=dataset, watch=watch)
+        if self.resume:
+            note(f"{self.out} is not a run yet; starting one")
+        return start_run(
+            self._settings(self._initial_scene()),
+            self.out,
+            overwrite=self.overwrite,
+            watch=watch,
+        )
+
+    def _check_same_settings(self, settings) -> None:
+        """Raise if options contradict the settings of the run to resume."""
         given = [
             f"--{field.name.replace('_', '-')}"
             for field in fields(self)
-            if field.name not in _OF_A_SITTING
+            if field.name not in _NOT_SETTINGS
             and getattr(self, field.name) != field.default
         ]
-        # What is left open was decided when the run began.
-        if self.initial is None or self._is_start(settings.start):
+        # Defaults were resolved when the run started.
+        if self.initial is None or self._is_initial_scene(settings.start):
             mine = self._settings(settings.start)
             config = mine.config.replace(initial=settings.config.initial)
             mine = replace(mine, config=config)
         else:
-            mine = self._settings(self._start())
+            mine = self._settings(self._initial_scene())
         if self.test_every is None:
             mine = replace(mine, every=settings.every)
         same = {"dataset": None, "trained": (), "held_out": ()}
         if given and replace(mine, **same) != replace(settings, **same):
             raise UsageError(
-                f"--resume goes on with the settings that {self.out} has, and they are "
-                f"others; leave out {', '.join(given)}"
+                f"--resume uses the settings of {self.out}, which differ; leave out "
+                f"{', '.join(given)}"
             )
 
-    def _check_ranges(self) -> None:
-        for name, least in _LEAST.items():
-            value = getattr(self, name)
-            if value is not None and not least <= value < 2**31 - 1:
-                raise UsageError(
-                    f"--{name.replace('_', '-')} {value}: {least} to {2**31 - 2:,}"
-                )
-
-    def _is_start(self, start: Path | None) -> bool:
-        """Whether ``--initial`` names that file or its run, be they there or not."""
+    def _is_initial_scene(self, start: Path | None) -> bool:
+        """Return whether --initial names that file or its run, existing or not."""
         from gsjax.runs.folder import run_files
 
         given = Path(self.initial or "")
         return start in (given.resolve(), run_files(given).splat.resolve())
 
-    def _start(self) -> Path | None:
-        """The file of the scene to start from, if that is what is wanted."""
+    def _initial_scene(self) -> Path | None:
+        """Return the file of the scene that --initial names, if it names one.
+
+        Raises:
+          UsageError: if it cannot initialise this run.
+        """
         from gsjax.runs.folder import load_settings, run_files
         from gsjax.runs.scene_source import is_run, splat_file
 
-        if self.initial in (None, "points", "dense", "random"):
+        if self.initial is None or self.initial in _POINTS:
             return None
         given = Path(self.initial)
         if not given.suffix and not given.exists():
             raise UsageError(
-                f"--initial {given}: points, dense, random, the folder of a run, or a "
-                ".ply or .spz is wanted"
+                f"--initial: expected {', '.join(_POINTS)}, the folder of a run, or a "
+                f".ply or .spz file, got {self.initial!r}"
             )
         splat = splat_file(given).resolve()
         if splat == run_files(self.out).splat.resolve():
             raise UsageError(
-                f"--initial {given}: is what the run in {self.out} makes; give the new "
-                "one another folder with -o"
+                f"--initial {given}: is the scene of the run in {self.out}; pass "
+                "another folder with -o"
             )
         if not is_run(given):
             return splat
         if load_settings(given).config.raster.antialias != self.antialias:
-            told = "without" if self.antialias else "with"
+            change = "leave out" if self.antialias else "pass"
             raise UsageError(
-                f"{given} was trained {told} --antialias, as a run from it must be"
+                f"--initial {given}: --antialias differs from that run; {change} "
+                "--antialias"
             )
         if run_files(given).cameras.exists():
             note(
@@ -246,20 +244,33 @@ class TrainCommand(HeavyCommand):
 
     def _settings(self, start: Path | None):
         from gsjax.runs.folder import RunSettings
+
+        return RunSettings(
+            dataset=self.dataset,
+            config=self._config(continued=start is not None),
+            images=self.images,
+            factor=self.factor,
+            skip_missing=self.skip_missing,
+            every=self.test_every,
+            test_images=self.test_images or (),
+            start=start,
+        )
+
+    def _config(self, *, continued: bool):
+        """Return the preset changed by the options."""
         from gsjax.train.config import continuation_config, preset, scaled
 
-        self._check_ranges()
         config = preset(self.preset)
         if self.steps is not None:
             config = scaled(config, self.steps)
-        if start is not None:
+        if continued:
             config = continuation_config(config)
         changes = {
             "strategy": self.strategy,
             "max_size": self.max_size,
             "sh_degree": self.sh_degree,
             "background": self.background,
-            "initial": self.initial if start is None else None,
+            "initial": None if continued else self.initial,
             "every_checkpoint": self.checkpoint_every,
             "every_eval": self.eval_every,
         }
@@ -285,13 +296,4 @@ class TrainCommand(HeavyCommand):
             if config.adaptive.threshold == 2e-4:
                 adaptive = replace(adaptive, threshold=8e-4)
             config = config.replace(adaptive=adaptive)
-        return RunSettings(
-            dataset=self.dataset,
-            config=config,
-            images=self.images,
-            factor=self.factor,
-            skip_missing=self.skip_missing,
-            every=self.test_every,
-            test_images=self.test_images or (),
-            start=start,
-        )
+        return config

@@ -1,4 +1,4 @@
-"""`gsjax view`: a scene in the browser, or as a page."""
+"""`gsjax view`: a scene in the browser, or as an HTML page."""
 
 import time
 from dataclasses import dataclass
@@ -7,107 +7,105 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.cli.common import HeavyCommand, UsageError, start_jax
+from gsjax.cli.common import HeavyCommand, check_suffix, start_jax
+from gsjax.cli.options import integer, real
 from gsjax.runtime.console import note, say
 
 _LARGE_PAGE = 32 * 2**20
-_PHOTO_OF_PAGE = 160  # px, longest side
+_THUMBNAIL = 160  # px, longest side of a photograph in a page
 
 
 @dataclass(kw_only=True)
 class ViewCommand(HeavyCommand):
-    """Look at a scene in the browser; needs the extra gsjax[viewer]."""
+    """View a scene in the browser. Requires gsjax[viewer]."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
-    """The Gaussians: a .ply or .spz file, or the folder of a run."""
+    """Folder of a run, or a .ply or .spz file."""
     html: Annotated[Path | None, arg(metavar="OUT.html")] = None
-    """Write one page that opens offline instead of serving."""
-    min_opacity: float = 0.0
-    """Leave out fainter Gaussians; those below 0.01 the browser never draws anyway."""
-    max_gaussians: int | None = None
-    """At most that many in the browser, the largest and most opaque first."""
+    """Write a page that opens offline, instead of serving."""
+    min_opacity: Annotated[float, real(0, 1)] = 0.0
+    """Leave out Gaussians below this opacity; the browser never draws those below
+    0.01."""
+    max_gaussians: Annotated[int | None, integer(1)] = None
+    """Maximum number of Gaussians in the browser; the largest and most opaque are
+    kept."""
     no_photos: bool = False
-    """Of a run: the cameras without their photographs."""
+    """Show the cameras of a run without their photographs."""
     up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
-    """Which way is up; default: as the cameras of a run are held, of a .ply -y."""
+    """Up direction; default: that of the cameras of a run, or -y for a file."""
     preset: Literal["compat", "accurate", "fast"] | None = None
-    """Constants of the exact picture, see RasterConfig; default: those of the run, of
-    a .ply compat."""
+    """Settings of the exact render, see RasterConfig; default: those of the run, or
+    compat for a file."""
     host: str = "127.0.0.1"
-    """Where to serve; 0.0.0.0 lets other machines look."""
-    port: int = 8080
-    """The next free one if it is taken."""
+    """Address to serve at; 0.0.0.0 for access from other machines."""
+    port: Annotated[int, integer(1, 65535)] = 8080
+    """Port to serve at, or the next free one."""
     overwrite: bool = False
-    """Replace a page that exists."""
+    """Replace an existing page."""
 
     def run(self) -> int:
-        if not 0 <= self.min_opacity < 1:
-            raise UsageError(f"--min-opacity {self.min_opacity:g}: from 0 to below 1")
-        if self.max_gaussians is not None and self.max_gaussians < 1:
-            raise UsageError("--max-gaussians from 1")
-        if not 1 <= self.port < 2**16:
-            raise UsageError(f"--port {self.port}: from 1 to 65535 is wanted")
         from gsjax.runtime import files
-        from gsjax.viewer.stage import require_viser
+        from gsjax.viewer.viser_server import require_viser
 
         require_viser()
         if self.html is not None:
-            if self.html.suffix.lower() not in (".html", ".htm"):
-                raise UsageError(f"--html {self.html}: a name in .html is wanted")
+            check_suffix("--html", self.html, ".html", ".htm")
             files.refuse_existing(
                 [self.html], self.overwrite, "another name with --html"
             )
         start_jax()
-        from gsjax.viewer.opening import open_exhibit
+        from gsjax.runs.scene_source import RASTER_PRESETS
+        from gsjax.viewer.opening import load_content
 
-        shown = open_exhibit(
+        shown = load_content(
             self.scene,
             up=self.up,
-            preset=self.preset,
+            raster=RASTER_PRESETS[self.preset]() if self.preset else None,
             min_opacity=self.min_opacity,
             max_gaussians=self.max_gaussians,
         )
         views = () if self.no_photos else shown.views
         if self.html is not None:
-            return self._write(self.html, shown.exhibit, views)
-        return self._serve(shown.exhibit, views)
+            return self._write(self.html, shown.content, views)
+        return self._serve(shown.content, views)
 
-    def _write(self, path: Path, exhibit, views) -> int:
-        from gsjax.viewer.opening import photographed
+    def _write(self, path: Path, content, views) -> int:
+        from gsjax.viewer.opening import frusta_with_photos
         from gsjax.viewer.page import write_page
-        from gsjax.viewer.splats import LEAST_OPACITY
+        from gsjax.viewer.splats import MIN_DRAWN_OPACITY
 
         if views:
-            exhibit.frusta = photographed(views, _PHOTO_OF_PAGE)
-        page = write_page(exhibit, path, title=self.scene.stem)
-        less = f" of {page.found:,}" if page.drawn < page.found else ""
-        faint = max(self.min_opacity, LEAST_OPACITY)
-        if less and self.max_gaussians is None:
-            gone = f"{page.found - page.drawn:,} of {page.found:,} Gaussians left out"
-            note(f"{gone}: too faint (opacity below {faint:g}), or not finite")
-        count = len(exhibit.frusta)
+            content.frusta = frusta_with_photos(views, _THUMBNAIL)
+        page = write_page(content, path, title=self.scene.stem)
+        missing = page.found - page.drawn
+        if missing and self.max_gaussians is None:
+            least = max(self.min_opacity, MIN_DRAWN_OPACITY)
+            note(
+                f"{missing:,} of {page.found:,} Gaussians left out: opacity below "
+                f"{least:g}, or not finite"
+            )
+        of_all = f" of {page.found:,}" if missing else ""
+        count = len(content.frusta)
         cameras = f", {count} camera{'s' * (count != 1)}" if count else ""
-        say(
-            f"{path}  {page.drawn:,}{less} Gaussians{cameras}, "
-            f"{page.size / 2**20:.2f} MiB"
-        )
+        size = f"{page.size / 2**20:.2f} MiB"
+        say(f"{path}  {page.drawn:,}{of_all} Gaussians{cameras}, {size}")
         if page.size > _LARGE_PAGE:
-            note("a page this large opens slowly; --max-gaussians N makes it smaller")
+            note("a page this large opens slowly; reduce it with --max-gaussians")
         return 0
 
-    def _serve(self, exhibit, views) -> int:
-        from gsjax.viewer.opening import photographed
-        from gsjax.viewer.window import Window
+    def _serve(self, content, views) -> int:
+        from gsjax.viewer.opening import frusta_with_photos
+        from gsjax.viewer.server import ViewerServer
 
-        window = Window(exhibit, host=self.host, port=self.port)
+        server = ViewerServer(content, host=self.host, port=self.port)
         try:
-            say(window.url)
-            note("open it in a browser; Ctrl-C ends")
+            say(server.url)
+            note("open it in a browser; Ctrl-C stops serving")
             if views:
-                window.show_cameras(photographed(views))
+                server.show_cameras(frusta_with_photos(views))
             while True:
                 time.sleep(1)
         except KeyboardInterrupt:
-            return 0  # how a server is meant to end
+            return 0  # the usual way to stop a server
         finally:
-            window.close()
+            server.close()

@@ -1,1 +1,8 @@
-"""Scenes in the browser, by viser: interactive, while training, or as one page."""
+"""Scenes in the browser with viser, and pictures in notebooks.
+
+`opening` loads a file or run into `ViewerContent` (`session`), which `server` shows to
+every browser and `page` writes as one HTML file; `live` shows a training. `splats`
+converts Gaussians to what viser draws, `exact` renders with gsjax for the camera of a
+browser, `cameras` holds frusta and viewpoints, `viser_server` starts and stops viser.
+`notebook` draws renders, scenes and movies in Jupyter, and saves pictures.
+"""

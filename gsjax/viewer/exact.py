@@ -1,4 +1,4 @@
-"""Our own renderer's picture for the camera of a browser."""
+"""Images that gsjax renders for the camera of a browser."""
 
 import threading
 from collections.abc import Sequence
@@ -12,24 +12,24 @@ from gsjax.cameras.camera import NEAR, Camera, make_camera
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.io import images
 from gsjax.plots.contact_sheets import depth_colors
-from gsjax.raster.render import render_exact
+from gsjax.raster.exact import render_exact
 from gsjax.raster.types import RasterConfig, Render
 
 KINDS = ("rgb", "depth", "alpha")
-_PAIRS, _MARGIN = 2**20, 1.5  # room at first, and for the views to come
+_PAIRS, _MARGIN = 2**20, 1.5  # initial capacity, and spare room when it grows
 
 
 def camera_of(
     wxyz, position, fov: float, width: int, height: int, near: float = NEAR
 ) -> Camera:
-    """The pinhole camera of a browser.
+    """Return the pinhole camera of a browser.
 
     Args:
       wxyz: [4] rotation camera → world, OpenCV axes.
       position: [3] in the world.
       fov: vertical field of view, radians.
-      width, height: px of the picture that is wanted.
-      near: what is nearer than that is not drawn.
+      width, height: size of the image, px.
+      near: depth below which nothing is drawn.
     """
     world_from_camera = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix()
     viewmat = np.eye(4)
@@ -41,13 +41,13 @@ def camera_of(
 
 
 class ExactRenderer:
-    """Renders one picture at a time, and remembers what capacity that took.
+    """Renders one image at a time, with a capacity that grows as needed.
 
-    Rgb, depth and alpha are one program: one compilation for each size.
+    One program returns rgb, depth and alpha, so each image size is compiled once.
     """
 
     def __init__(self, config: RasterConfig, background: Sequence[float]):
-        # One rung, and no capacity measured first: less to compile.
+        # One size bucket and a fixed capacity: less to compile.
         self.config = config.replace(
             outputs=("rgb", "alpha", "depth"), num_size_buckets=1, pair_capacity=_PAIRS
         )
@@ -55,23 +55,23 @@ class ExactRenderer:
         self._lock = threading.Lock()
 
     def __call__(self, gaussians: Gaussians, camera: Camera) -> Render:
-        """The images, on the host.
+        """Return the images on the host.
 
         Raises:
-          CapacityError: if the view wants more memory than can be addressed.
+          CapacityError: if the view needs more memory than can be addressed.
         """
         behind = jnp.asarray(self.background, jnp.result_type(float))
         with self._lock:
             view = render_exact(gaussians, camera, self.config, behind)
-            wanted = int(view.demand.capacity)
-            if wanted > (self.config.pair_capacity or 0):
-                roomy = min(capacity_bucket(int(_MARGIN * wanted)), 2**30 - 1)
+            needed = int(view.demand.capacity)
+            if needed > (self.config.pair_capacity or 0):
+                roomy = min(capacity_bucket(int(_MARGIN * needed)), 2**30 - 1)
                 self.config = self.config.replace(pair_capacity=roomy)
             return jax.device_get(view)
 
 
 def picture(view: Render, kind: str) -> tuple[np.ndarray, str]:
-    """([H, W, 3] uint8, what it shows) of a kind of `KINDS`."""
+    """Return ([H, W, 3] uint8, description) of one of `KINDS`."""
     if kind == "depth":
         pixels, near, far = depth_colors(np.asarray(view.depth))
         return pixels, f"depth {near:.3g} (red) to {far:.3g} (blue)"

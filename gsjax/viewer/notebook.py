@@ -1,18 +1,16 @@
-"""Pictures in a notebook: `show`, `movie`, and `live` for watching a training.
+"""Pictures of renders and scenes, in notebooks and files.
 
-Renders, scenes and cameras display themselves where they are the last line of a cell.
-Their methods for that are put in place here and not where the classes are: what draws
-lies above them. Everything is drawn on the host from arrays that are there; of a value
-under tracing nothing is drawn, and nothing is compiled for a display.
+Renders, scenes and cameras display themselves as the last line of a cell; the methods
+are attached here, because drawing depends on everything below. Drawing is done on the
+host: nothing is compiled, and nothing is drawn of a traced value.
 
 Axis legend: B batch, H W picture, N Gaussians.
 """
 
-import base64
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from html import escape
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -24,71 +22,18 @@ from jax.core import Tracer
 from gsjax.cameras.camera import Camera
 from gsjax.errors import InputError, MissingExtraError
 from gsjax.gaussians import Gaussians
-from gsjax.io import images
 from gsjax.io.movies import write_movie
 from gsjax.plots import previews
-from gsjax.plots.contact_sheets import SheetRow, comparison
+from gsjax.plots.contact_sheets import Cell, SheetRow, comparison, display_pixels
 from gsjax.plots.curves import Series, curves
-from gsjax.plots.previews import Cell
-from gsjax.raster.render import render_exact
+from gsjax.raster.exact import render_exact
 from gsjax.raster.types import RasterConfig, Render
+from gsjax.runtime.settings import whole
 from gsjax.train.loop import Progress
 from gsjax.train.state import TrainState
+from gsjax.viewer.pictures import MIME_TYPES, MIN_SIZE, Movie, Picture
 
-_LEAST, _MOST = 240, 1200  # px: shown enlarged below, made smaller above
-_MIME = {"webp": "image/webp", "gif": "image/gif", "webm": "video/webm"}
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """``pixels`` [H, W, 3] uint8 that a notebook shows; a small one enlarged."""
-
-    pixels: np.ndarray
-
-    @property
-    def png(self) -> bytes:
-        """The file."""
-        return images.encode_png(self.pixels)
-
-    def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
-        height, width = self.pixels.shape[:2]
-        zoom = max(1, _LEAST // max(height, width))
-        return self.png, {"width": zoom * width, "height": zoom * height}
-
-    def __repr__(self) -> str:
-        height, width = self.pixels.shape[:2]
-        return f"Picture({width} × {height} px)"
-
-
-@dataclass(frozen=True)
-class Movie:
-    """A movie in a file of its ``kind``, which a notebook plays, over and over.
-
-    Attributes:
-      data: the file.
-      kind: "webp", "gif" or "webm".
-      frames: how many there are.
-      size: (width, height) in px at which it is shown.
-    """
-
-    data: bytes
-    kind: str
-    frames: int
-    size: tuple[int, int]
-
-    def _repr_html_(self) -> str:
-        source = base64.b64encode(self.data).decode()
-        width, height = self.size
-        shape = f'width="{width}" height="{height}"'
-        url = f'src="data:{_MIME[self.kind]};base64,{source}"'
-        if self.kind == "webm":
-            switches = "autoplay loop muted playsinline controls"
-            return f"<video {shape} {switches} {url}></video>"
-        return f"<img {shape} {url}>"
-
-    def __repr__(self) -> str:
-        kilobytes = len(self.data) / 1000
-        return f"Movie({self.frames} frames, {self.kind}, {kilobytes:.0f} kB)"
+_MAX_WIDTH = 1200  # px
 
 
 def picture(
@@ -97,40 +42,39 @@ def picture(
     columns: int | None = None,
     zoom: int = 1,
 ) -> Picture:
-    """One picture of several, beside and below each other.
+    """Return one picture of several, arranged in a grid.
 
-    A single picture without a caption is that picture, pixel by pixel. A sheet is at
-    most 1200 px wide.
+    A single picture without a caption keeps its pixels. A grid is at most 1200 px wide.
 
     Args:
       *values: pictures [H, W] or [H, W, 3], uint8, or floats in [0, 1] (clipped);
-        batches of them [B, H, W] or [B, H, W, 3]; a `Render`, each of its images; or
-        `Gaussians`, of which a sketch is drawn. What is not finite is magenta.
-      captions: below each; as many as there are pictures.
-      columns: how many side by side; default as many as there is room for.
-      zoom: a pixel becomes so many by so many.
+        batches of them [B, H, W] or [B, H, W, 3], or lists; a `Render`, for each of its
+        images; or `Gaussians`, for a sketch. Pixels that are not finite are magenta.
+      captions: one below each picture.
+      columns: number of pictures side by side; default as many as fit.
+      zoom: integer magnification of the pixels.
 
     Raises:
-      InputError: on another shape, no picture, another number of captions, or a zoom
-        below 1.
+      InputError: if a value is not a picture, there is none, the number of captions
+        differs, or the zoom is below 1.
     """
-    if zoom < 1:
-        raise InputError(f"zoom is {zoom}; a whole number from 1 is wanted")
+    if whole("zoom", zoom) < 1:
+        raise InputError(f"zoom: expected an integer of at least 1, got {zoom}")
     cells = [cell for value in values for cell in _cells(value)]
     if captions is not None:
         if len(captions) != len(cells):
             raise InputError(
-                f"{len(captions)} captions for {len(cells)} pictures; one for each "
-                "is wanted"
+                f"captions: expected {len(cells)}, one for each picture, got "
+                f"{len(captions)}; pass None for none"
             )
         cells = [cell._replace(caption=text) for cell, text in zip(cells, captions)]
     if not cells:
-        raise InputError("no pictures; one is wanted at least")
+        raise InputError("picture: expected at least one picture, got none")
     if zoom > 1:
-        cells = [c._replace(pixels=previews.enlarged(c.pixels, zoom)) for c in cells]
+        cells = [c._replace(pixels=previews.enlarge(c.pixels, zoom)) for c in cells]
     if len(cells) == 1 and not cells[0].caption:
         return Picture(cells[0].pixels)
-    return Picture(previews.sheet(cells, columns, _MOST))
+    return Picture(previews.cell_sheet(cells, columns, _MAX_WIDTH))
 
 
 def show(
@@ -139,8 +83,16 @@ def show(
     columns: int | None = None,
     zoom: int = 1,
 ) -> None:
-    """Display `picture` of the same arguments, now."""
+    """Display the `picture` of the same arguments."""
     _display(picture(*values, captions=captions, columns=columns, zoom=zoom))
+
+
+def save_png(path: str | PathLike[str], *values, **options) -> None:
+    """Write the `picture` of the same arguments to a PNG file.
+
+    ``gsjax.save_png("a.png", gsjax.render(gaussians, camera))``
+    """
+    picture(*values, **options).save(path)
 
 
 def movie(
@@ -150,20 +102,21 @@ def movie(
     kind: str = "webp",
     width: int | None = None,
 ) -> Movie:
-    """Frames as a movie within the notebook, which needs no file beside it.
+    """Return a movie embedded in the notebook.
 
     Args:
       frames: pictures of one size, as `picture` takes them.
       fps: frames per second.
-      kind: "webp", which every browser shows; "gif" for what knows nothing else; or
-        "webm" (VP9), the smallest of many frames, with a bar to move along.
-      width: at which it is shown, px; None as it is, a small one enlarged.
+      kind: "webp", which every browser shows; "gif", which every program shows; or
+        "webm" (VP9), the smallest for many frames, with a control bar.
+      width: at which it is shown, px; None for its own, or enlarged if it is small.
 
     Raises:
-      InputError: as `picture`, on another kind, or as `gsjax.io.movies.write_movie`.
+      InputError: as `picture` and `gsjax.io.movies.write_movie`, or if the kind is
+        unknown.
     """
-    if kind not in _MIME:
-        raise InputError(f"no movie of kind {kind!r}; known: {', '.join(_MIME)}")
+    if kind not in MIME_TYPES:
+        raise InputError(f"kind: expected one of {', '.join(MIME_TYPES)}, got {kind!r}")
     size = (0, 0)
 
     def pictures():
@@ -177,7 +130,7 @@ def movie(
         path = Path(folder) / f"movie.{kind}"
         count = write_movie(path, pictures(), fps=fps)
         data = path.read_bytes()
-    zoom = width / size[0] if width else max(1, _LEAST // max(size))
+    zoom = width / size[0] if width else max(1, MIN_SIZE // max(size))
     return Movie(data, kind, count, (round(zoom * size[0]), round(zoom * size[1])))
 
 
@@ -189,16 +142,16 @@ def live(
     config: RasterConfig | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Callable[[TrainState, Progress], None]:
-    """A hook that draws a preview of a training, again and again in one place.
+    """Return a hook that updates a preview of a training in one place.
 
-    ``fit(…, hooks=Hooks(state=live(camera, photo)))``. Below the preview is the PSNR of
-    the views that the steps saw. The first drawing compiles a program of its own.
+    ``fit(…, hooks=Hooks(state=live(camera, photo)))`` shows the render above the PSNR
+    of the views of each step. The first drawing compiles its own program.
 
     Args:
-      camera: a single one.
-      photo: [H, W, 3] what it should see, to be shown beside, with the error.
+      camera: a single camera.
+      photo: [H, W, 3] photograph of the same view, shown with the error.
       every: steps between two drawings; the first step is drawn too.
-      config: how to render.
+      config: render settings.
       background: RGB behind the scene.
 
     Returns:
@@ -207,8 +160,8 @@ def live(
     Raises:
       InputError: if ``every`` is below 1.
     """
-    if every < 1:
-        raise InputError(f"every is {every}; a number of steps from 1 is wanted")
+    if whole("every", every) < 1:
+        raise InputError(f"every: expected at least 1 step, got {every}")
     fixed = config or RasterConfig(num_size_buckets=1)
     fixed = fixed.replace(outputs=("rgb", "depth"), absgrad=False)
     behind = jnp.asarray(background, jnp.result_type(float))
@@ -222,14 +175,14 @@ def live(
         steps.append((step, float(metrics.psnr)))
         if step % every and len(steps) > 1:
             return
-        # One program, however many Gaussians there are by now.
+        # One program for any number of Gaussians.
         config = fixed.replace(visible_capacity=state.gaussians.capacity)
         view = render_exact(state.gaussians, camera, config, behind)
         preview = _preview(view, photo, f"step {step}")
         title = f"PSNR, dB; {int(metrics.gaussians):,} Gaussians"
         size = (max(preview.shape[1], 400), 300)
         plot = curves(_lines(steps), title=title, size=size)
-        drawn = Picture(previews.stacked([preview, plot]))
+        drawn = Picture(previews.stack_pictures([preview, plot]))
         if handle is None:
             handle = _display(drawn, display_id=True)
         else:
@@ -239,7 +192,7 @@ def live(
 
 
 def _lines(steps: Sequence[tuple[int, float]]) -> list[Series]:
-    """PSNR by step, pale, and its mean over a tenth of the steps so far."""
+    """Return the PSNR of each step, and its mean over a tenth of the steps so far."""
     at, psnr = np.transpose(steps)
     width = max(1, len(at) // 10)
     mean = np.convolve(psnr, np.ones(width) / width, mode="valid")
@@ -249,19 +202,19 @@ def _lines(steps: Sequence[tuple[int, float]]) -> list[Series]:
 
 
 def _preview(view: Render, photo: np.ndarray | None, name: str) -> np.ndarray:
-    """[H, W, 3]: render and depth; with a photograph, that and the error too."""
+    """Draw render and depth [H, W, 3]; with a photograph, that and the error too."""
     rgb, depth = np.asarray(view.rgb), np.asarray(view.depth)
     if photo is not None:
         width = min(max(photo.shape[1], 120), 240)
         rgb = np.clip(rgb, 0, 1)
         row = SheetRow("photograph", photo, rgb, depth, rendered=f"{name},")
         return comparison([row], width=width)
-    found = previews.of_depth(depth)
-    return previews.sheet([Cell(previews.visible(rgb), name), found], None, _MOST)
+    found = previews.depth_cell(depth)
+    return previews.cell_sheet([Cell(display_pixels(rgb), name), found], None, _MAX_WIDTH)
 
 
 def _display(value, **options):
-    """IPython's display, which elsewhere prints."""
+    """Call IPython's display, which prints outside notebooks."""
     try:
         from IPython.display import display
     except ImportError as error:
@@ -272,38 +225,48 @@ def _display(value, **options):
     return display(value, **options)
 
 
-# --- what displays itself ---
+# --- display methods ---
 
 
 def _cells(value) -> list[Cell]:
     if isinstance(value, Picture):
         return [Cell(value.pixels)]
     if isinstance(value, Render):
-        return previews.of_render(value)
+        return previews.render_cells(value)
     if isinstance(value, Gaussians):
-        return previews.of_gaussians(value)
+        return previews.gaussian_cells(value)
+    if isinstance(value, (list, tuple)) and any(
+        isinstance(one, (Picture, Render, Gaussians)) or getattr(one, "ndim", 0) > 1
+        for one in value
+    ):
+        return [cell for one in value for cell in _cells(one)]
     array = np.asarray(value)
+    if array.dtype.kind not in "buif":
+        raise InputError(
+            "picture: expected arrays, a Render or Gaussians, got "
+            f"{type(value).__name__}; pass the image itself"
+        )
     if array.ndim == 4 or (array.ndim == 3 and array.shape[-1] != 3):
-        return [Cell(previews.visible(one)) for one in array]
-    return [Cell(previews.visible(array))]
+        return [Cell(display_pixels(one)) for one in array]
+    return [Cell(display_pixels(array))]
 
 
 def _concrete(value) -> bool:
-    """Whether the leaves of a pytree, if any, are arrays with values, now."""
+    """Return True if the leaves of a pytree are arrays whose values can be read now."""
     leaves = jax.tree.leaves(value)
     return bool(leaves) and all(
         isinstance(leaf, np.ndarray)
         or (
             isinstance(leaf, jax.Array)
             and not isinstance(leaf, Tracer)
-            and not leaf.is_deleted()  # given away to a step
+            and not leaf.is_deleted()  # donated to a step
         )
         for leaf in leaves
     )
 
 
 def _png(value) -> tuple[bytes, dict[str, int]] | None:
-    """What Jupyter asks of a `Render` or of `Gaussians`; None where it is to print."""
+    """Return the PNG of a `Render` or `Gaussians`; None lets Jupyter print it."""
     if not _concrete(value):
         return None
     try:
@@ -313,26 +276,26 @@ def _png(value) -> tuple[bytes, dict[str, int]] | None:
 
 
 def _html(camera: Camera) -> str | None:
-    """What Jupyter asks of a `Camera`."""
+    """Describe a `Camera` in HTML; None lets Jupyter print it."""
     if not _concrete(camera):
         return None
     count = camera.viewmat.shape[0] if camera.batched else 1
-    told = [f"{camera.width} × {camera.height} px, {camera.model.name}"]
+    facts = [f"{camera.width} × {camera.height} px, {camera.lens.name}"]
     first = jax.tree.map(lambda a: np.asarray(a)[0] if camera.batched else a, camera)
     viewmat, K = np.asarray(first.viewmat), np.asarray(first.K)
-    if camera.model.name == "pinhole":
+    if camera.lens.name == "pinhole":
         angles = [
             np.degrees(
                 np.arctan((side - K[i, 2]) / K[i, i]) + np.arctan(K[i, 2] / K[i, i])
             )
             for i, side in enumerate((camera.width, camera.height))
         ]
-        told.append(f"{angles[0]:.1f}° × {angles[1]:.1f}°")
+        facts.append(f"{angles[0]:.1f}° × {angles[1]:.1f}°")
     place = ", ".join(f"{x:.3g}" for x in -viewmat[:3, :3].T @ viewmat[:3, 3] + 0.0)
     ahead = ", ".join(f"{x + 0:.2f}" for x in viewmat[2, :3])
-    told += [f"at ({place})", f"looking along ({ahead})"]
+    facts += [f"at ({place})", f"looking along ({ahead})"]
     name = f"{count} cameras, the first" if camera.batched else "Camera"
-    return f"<div><b>{name}</b>: {escape('; '.join(told))}</div>"
+    return f"<div><b>{name}</b>: {escape('; '.join(facts))}</div>"
 
 
 setattr(Render, "_repr_png_", _png)  # noqa: B010

@@ -1,4 +1,4 @@
-"""What is to be shown: a file, a run, or a training that is about to begin."""
+"""Viewer content from a file, a run, or a training that starts."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,80 +8,83 @@ from gsjax.data.photos import load_photos
 from gsjax.data.types import Dataset, Photo, View
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
+from gsjax.raster.types import RasterConfig
 from gsjax.runs.folder import (
-    background_of,
-    load_data,
+    background_color,
     load_settings,
-    refined_data,
+    load_split,
     run_files,
+    with_refined_cameras,
 )
 from gsjax.runs.run_info import describe_run
-from gsjax.runs.scene_source import from_anywhere, is_run, open_scene_source
+from gsjax.runs.scene_source import free_view_config, is_run, open_scene_source
 from gsjax.runtime.console import note, one_line
 from gsjax.train.config import TrainConfig
-from gsjax.viewer.exact import ExactRenderer
-from gsjax.viewer.session import Exhibit
-from gsjax.viewer.stage import (
+from gsjax.viewer.cameras import (
     THUMBNAIL,
     UPS,
     Frustum,
-    eye_of_cameras,
-    eye_of_gaussians,
     frusta_of,
+    viewpoint_of_cameras,
+    viewpoint_of_gaussians,
 )
+from gsjax.viewer.exact import ExactRenderer
+from gsjax.viewer.session import ViewerContent
 
 
-class Shown(NamedTuple):
-    """An exhibit, and the views whose photographs are still to be loaded."""
+class LoadedContent(NamedTuple):
+    """Content, and the views whose photographs are not loaded yet."""
 
-    exhibit: Exhibit
+    content: ViewerContent
     views: tuple[View, ...] = ()
 
 
-def open_exhibit(
+def load_content(
     path: Path,
     *,
     up: str | None = None,
-    preset: str | None = None,
+    raster: RasterConfig | None = None,
     min_opacity: float = 0.0,
     max_gaussians: int | None = None,
-) -> Shown:
-    """A scene by its file or run; of a run with the cameras of its dataset.
+) -> LoadedContent:
+    """Load a scene by its file or run; a run brings the cameras of its dataset.
 
-    A dataset that is not there any more costs the cameras, and a warning.
+    If the dataset is missing, the cameras are left out with a warning.
 
     Args:
       path: a .ply or .spz file, or the folder of a run.
-      up: of the world, of `UPS`; None takes it from the cameras, or else −y, which is
-        up in most scenes from COLMAP.
-      preset: as `open_scene_source`.
-      min_opacity, max_gaussians: see `Exhibit`.
+      up: up direction of the world, a key of `UPS`; None takes it from the cameras, or
+        −y without cameras, as in most scenes from COLMAP.
+      raster: as `open_scene_source`.
+      min_opacity, max_gaussians: see `ViewerContent`.
 
     Raises:
       InputError: as `open_scene_source`, or if the file cannot be read.
     """
-    scene, status = None, ""
+    dataset, status = None, ""
     if is_run(path):
         settings = load_settings(path)
         run = describe_run(path)
         status = f"step {run['steps_done']:,} of {run['steps']:,}"
         try:
-            scene = refined_data(load_data(settings), run_files(path)).scene
+            dataset = with_refined_cameras(
+                load_split(settings), run_files(path)
+            ).dataset
         except InputError as error:
             note(f"warning: without cameras: {one_line(error)}")
-    origin = None if scene is None else scene.origin
-    subject = open_scene_source(path, origin=origin, preset=preset)
-    gaussians = subject.load()
-    frusta = [] if scene is None else frusta_of(scene.views)
-    renderer = ExactRenderer(subject.config, subject.background)
-    exhibit = _exhibit(gaussians, renderer, frusta, up)
-    exhibit.status = status
-    exhibit.min_opacity, exhibit.max_gaussians = min_opacity, max_gaussians
-    return Shown(exhibit, () if scene is None else scene.views)
+    origin = None if dataset is None else dataset.origin
+    source = open_scene_source(path, origin=origin, raster=raster)
+    gaussians = source.load()
+    frusta = [] if dataset is None else frusta_of(dataset.views)
+    renderer = ExactRenderer(source.config, source.background)
+    content = make_content(gaussians, renderer, frusta, up)
+    content.status = status
+    content.min_opacity, content.max_gaussians = min_opacity, max_gaussians
+    return LoadedContent(content, () if dataset is None else dataset.views)
 
 
-def photographed(views: Sequence[View], size: int = THUMBNAIL) -> list[Frustum]:
-    """Cameras with their photographs; without, and a warning, where one is missing."""
+def frusta_with_photos(views: Sequence[View], size: int = THUMBNAIL) -> list[Frustum]:
+    """Return cameras with photographs; without and with a warning if one is missing."""
     drawn = {frustum.name for frustum in frusta_of(views)}
     few = [view for view in views if view.name in drawn]
     try:
@@ -91,29 +94,30 @@ def photographed(views: Sequence[View], size: int = THUMBNAIL) -> list[Frustum]:
         return frusta_of(few)
 
 
-def exhibit_of_training(
-    gaussians: Gaussians, scene: Dataset, photos: Sequence[Photo], config: TrainConfig
-) -> Exhibit:
-    """What a training begins with.
+def training_content(
+    gaussians: Gaussians, dataset: Dataset, photos: Sequence[Photo], config: TrainConfig
+) -> ViewerContent:
+    """Return the content for the start of a training.
 
-    Its exact pictures are rendered by one device: the step runs on all of them at the
-    same time, and two programs that wait for one another's devices would for ever. So
-    ``gaussians``, and what is shown in their place, must be on one.
+    Exact images are rendered on one device, and ``gaussians`` must be on one: the step
+    runs on all devices at the same time, and two programs that wait for each other's
+    devices would deadlock.
     """
-    raster = from_anywhere(config.raster).replace(devices=1)
-    renderer = ExactRenderer(raster, background_of(config))
-    return _exhibit(gaussians, renderer, frusta_of(scene.views, photos), None)
+    raster = free_view_config(config.raster).replace(devices=1)
+    renderer = ExactRenderer(raster, background_color(config))
+    return make_content(gaussians, renderer, frusta_of(dataset.views, photos))
 
 
-def _exhibit(
+def make_content(
     gaussians: Gaussians,
     renderer: ExactRenderer,
     frusta: list[Frustum],
-    up: str | None,
-) -> Exhibit:
+    up: str | None = None,
+) -> ViewerContent:
+    """Return content with a viewpoint for it; ``up`` as in `load_content`."""
     if frusta:
-        eye = eye_of_cameras(frusta)
-        eye = eye if up is None else eye._replace(up=UPS[up])
+        viewpoint = viewpoint_of_cameras(frusta)
+        viewpoint = viewpoint if up is None else viewpoint._replace(up=UPS[up])
     else:
-        eye = eye_of_gaussians(gaussians, UPS[up or "-y"])
-    return Exhibit(gaussians, renderer, eye, frusta)
+        viewpoint = viewpoint_of_gaussians(gaussians, UPS[up or "-y"])
+    return ViewerContent(gaussians, renderer, viewpoint, frusta)

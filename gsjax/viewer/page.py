@@ -1,4 +1,4 @@
-"""A scene as one page, that opens offline."""
+"""A scene as one HTML page that opens offline."""
 
 import html
 from pathlib import Path
@@ -7,24 +7,18 @@ from typing import NamedTuple
 from gsjax.errors import InputError
 from gsjax.gaussians import num_active
 from gsjax.runtime import files
-from gsjax.viewer.session import Exhibit
+from gsjax.viewer.cameras import add_cameras, frustum_size, set_viewpoint
+from gsjax.viewer.session import ViewerContent
 from gsjax.viewer.splats import Cut, most_important, pack, within
-from gsjax.viewer.stage import (
-    add_cameras,
-    open_server,
-    paint_background,
-    set_eye,
-    size_of_frusta,
-    stop_server,
-)
+from gsjax.viewer.viser_server import open_server, set_background, stop_server
 
 _CAPTION = """<div style="position:fixed;left:12px;bottom:10px;z-index:9;color:#ddd;
 font:13px sans-serif;background:rgba(0,0,0,.7);padding:3px 7px;border-radius:4px;
 pointer-events:none">{}</div>"""
 
-# viser sorts its splats in a module worker, which it starts from a blob. A page opened
-# from a disk has no origin; Chromium then starts none from there, and says nothing.
-# From a data URL with the same text it does.
+# viser sorts its splats in a module worker that it starts from a blob. A page opened
+# from a disk has no origin, and Chromium then silently starts no worker from a blob; it
+# does from a data URL of the same text.
 _WORKERS = """<script>
 (() => {
   const texts = new Map(), toURL = URL.createObjectURL.bind(URL);
@@ -36,7 +30,7 @@ _WORKERS = """<script>
     line.style = "position:fixed;left:12px;top:10px;z-index:9;color:#f66;" +
       "font:13px sans-serif";
     line.textContent = "This browser does not sort the splats of a page from a disk: " +
-      "what is behind shows through. Try another, or gsjax view without --html.";
+      "hidden splats show through. Try another, or gsjax view without --html.";
     document.body.append(line);
   };
   window.Blob = class extends NativeBlob {
@@ -64,29 +58,29 @@ _WORKERS = """<script>
 
 
 class Page(NamedTuple):
-    """What was written: Gaussians drawn, of how many, and bytes."""
+    """Counts of a page: Gaussians drawn, Gaussians of the scene, and bytes."""
 
     drawn: int
     found: int
     size: int
 
 
-def write_page(exhibit: Exhibit, path: Path, *, title: str) -> Page:
-    """Write what `Exhibit` says, with its cameras, into one HTML file.
+def write_page(content: ViewerContent, path: Path, *, title: str) -> Page:
+    """Write a scene and its cameras into one HTML file.
 
     Args:
-      exhibit: the scene; cut and thinned out as it says.
+      content: the scene, reduced by its ``min_opacity`` and ``max_gaussians``.
       path: of the file, replaced if it exists; its folder is created if missing.
       title: of the page.
 
     Raises:
-      MissingExtraError: without viser.
-      InputError: if nothing would be left of the scene, or the file cannot be written.
+      MissingExtraError: if viser is absent.
+      InputError: if no Gaussian would be drawn, or the file cannot be written.
     """
-    gaussians = exhibit.gaussians
-    shown = within(gaussians, Cut(exhibit.min_opacity))
-    if exhibit.max_gaussians is not None:
-        shown = most_important(gaussians, shown, exhibit.max_gaussians)
+    gaussians = content.gaussians
+    shown = within(gaussians, Cut(content.min_opacity))
+    if content.max_gaussians is not None:
+        shown = most_important(gaussians, shown, content.max_gaussians)
     splats = pack(gaussians, shown)
     drawn, found = len(splats.centers), int(num_active(gaussians))
     if found and not drawn:
@@ -96,20 +90,20 @@ def write_page(exhibit: Exhibit, path: Path, *, title: str) -> Page:
         )
     server = open_server("127.0.0.1", 0)
     try:
-        set_eye(server, exhibit.eye)
-        paint_background(server.scene, exhibit.renderer.background)
+        set_viewpoint(server, content.viewpoint)
+        set_background(server.scene, content.renderer.background)
         if drawn:
             server.scene.add_gaussian_splats("/splats", **splats._asdict())
-        if exhibit.frusta:
-            size = size_of_frusta(exhibit.frusta, exhibit.eye.distance)
-            add_cameras(server.scene, exhibit.frusta, size)
+        if content.frusta:
+            size = frustum_size(content.frusta, content.viewpoint.distance)
+            add_cameras(server.scene, content.frusta, size)
         text = server.scene.as_html(dark_mode=True)
     finally:
         stop_server(server)
     caption = (
-        f"{html.escape(title)} · {drawn:,} of {found:,} Gaussians, each of one colour "
-        "from all sides (SH degree 0), drawn by viser; gsjax<br>"
-        "Drag to turn, with the right button to shift; the wheel goes nearer."
+        f"{html.escape(title)} · {drawn:,} of {found:,} Gaussians in view-independent "
+        "colours (SH degree 0), drawn by viser; gsjax<br>"
+        "Drag to rotate, drag with the right button to pan, scroll to zoom."
     )
     head, tail = text.rsplit("</body>", 1)
     head = head.replace("<head>", f"<head>{_WORKERS}", 1)

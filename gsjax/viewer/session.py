@@ -1,6 +1,6 @@
-"""The panel of one browser: cuts, counts, cameras, and pictures by our own renderer.
+"""The panel of one browser: cuts, counts, cameras, and images rendered by gsjax.
 
-Each browser has its own; what it shows is shared. viser calls from its threads.
+Each browser has its own session; the content is shared. viser calls from its threads.
 """
 
 import threading
@@ -14,9 +14,17 @@ import numpy as np
 from gsjax.cameras.camera import NEAR
 from gsjax.gaussians import Gaussians, select
 from gsjax.runtime.console import note, one_line
+from gsjax.viewer.cameras import (
+    Frustum,
+    Viewpoint,
+    add_cameras,
+    frustum_size,
+    photo_distances,
+    wxyz_of,
+)
 from gsjax.viewer.exact import KINDS, ExactRenderer, camera_of, picture
 from gsjax.viewer.splats import (
-    LEAST_OPACITY,
+    MIN_DRAWN_OPACITY,
     Cut,
     longest_axes,
     most_important,
@@ -24,15 +32,7 @@ from gsjax.viewer.splats import (
     pack,
     within,
 )
-from gsjax.viewer.stage import (
-    Eye,
-    Frustum,
-    add_cameras,
-    paint_background,
-    photo_distances,
-    size_of_frusta,
-    wxyz_of,
-)
+from gsjax.viewer.viser_server import set_background
 
 _HEIGHTS = ("270", "360", "540", "720", "1080")
 _REST = 0.3  # seconds without motion after which "follow" renders
@@ -40,22 +40,22 @@ _NOWHERE = "–"
 
 
 @dataclass
-class Exhibit:
-    """What all browsers are shown; replaced bit by bit as it changes.
+class ViewerContent:
+    """Content that all browsers show; attributes are replaced as they change.
 
     Attributes:
       gaussians: the scene.
-      renderer: for exact pictures.
-      eye: where one looks from at first.
+      renderer: renders exact images.
+      viewpoint: initial camera.
       frusta: cameras of the dataset.
       status: a line about training, or "".
-      max_gaussians: never more than that in the browser, the most important ones.
-      min_opacity: where the slider stands at first.
+      max_gaussians: largest number in the browser; the most important ones are kept.
+      min_opacity: initial value of the slider.
     """
 
     gaussians: Gaussians
     renderer: ExactRenderer
-    eye: Eye
+    viewpoint: Viewpoint
     frusta: list[Frustum] = field(default_factory=list)
     status: str = ""
     max_gaussians: int | None = None
@@ -63,7 +63,7 @@ class Exhibit:
 
 
 class Latest:
-    """``work``, called so that of calls that pile up only the last is carried out."""
+    """A function without arguments; of calls that pile up only the last runs."""
 
     def __init__(self, work: Callable[[], None]):
         self.work = work
@@ -71,7 +71,7 @@ class Latest:
         self.busy = threading.Lock()
 
     def __call__(self) -> None:
-        """Do the work, unless a later call waits already."""
+        """Do the work, unless a later call is waiting."""
         self.count += 1
         mine = self.count
         with self.busy:
@@ -82,22 +82,23 @@ class Latest:
 class Session:
     """One browser and its panel."""
 
-    def __init__(self, client: Any, exhibit: Exhibit):
-        self.client, self.exhibit = client, exhibit
+    def __init__(self, client: Any, content: ViewerContent):
+        self.client, self.content = client, content
         self.splats: Any = None
-        # With what is shown of it: another thread takes both, of one time.
+        # The scene and its mask in one tuple: another thread reads both.
         self.scene_shown: tuple[Gaussians, np.ndarray] | None = None
         self.closed = False
-        self.covered = False  # by an exact picture, over the view
+        self.covered = False  # an exact image lies over the view
         self.cameras: list[Any] = []
-        self.places = np.zeros((0, 4))  # of cameras, and how far photographs are drawn
-        self.stood_at = _NOWHERE  # the camera that the view is in
+        # Positions of the cameras, and the distances of their photographs.
+        self.places = np.zeros((0, 4))
+        self.camera_name = _NOWHERE  # of the camera that the view is in
         self.result: Any = None
         self.photo: Any = None
         self.rest: threading.Timer | None = None
         self.refresh = Latest(self._draw)
         self.render = Latest(self._render)
-        self.look_around = Latest(self._show_what_is_not_in_the_way)
+        self.update_cameras = Latest(self._update_cameras)
         self._add_controls()
         self.show_cameras()
         client.camera.on_update(lambda _: self._moved())
@@ -106,66 +107,67 @@ class Session:
     # --- the panel ---
 
     def _add_controls(self) -> None:
-        gui, begin = self.client.gui, self.exhibit.min_opacity
+        gui, begin = self.client.gui, self.content.min_opacity
         self.counts = gui.add_markdown("")
         self.opacity = gui.add_slider(
             "Opacity from", min=0.0, max=max(0.99, begin), step=0.01,
-            initial_value=begin, hint="hide those of less",
+            initial_value=begin, hint="hide Gaussians of lower opacity",
         )  # fmt: skip
         self.scale = gui.add_slider(
             "Scale up to, %", min=0.0, max=100.0, step=0.5, initial_value=100.0,
-            hint="by the longest axis: of all Gaussians, the smallest so many percent",
+            hint="show this percentage of Gaussians, the smallest by longest axis",
         )  # fmt: skip
         for slider in (self.opacity, self.scale):
             slider.on_update(lambda _: self._cut())
-        with gui.add_folder("Exact picture"):
+        with gui.add_folder("Exact image"):
             self.kind = gui.add_dropdown("Shows", KINDS)
             self.height = gui.add_dropdown("Height, px", _HEIGHTS, initial_value="540")
             self.place = gui.add_dropdown("Where", ("over the view", "in the panel"))
             self.follow = gui.add_checkbox(
-                "Follow", False, hint="render again whenever the camera rests"
+                "Follow", False, hint="render again when the camera rests"
             )
-            self.button = gui.add_button("Render", hint="by gsjax, as seen from here")
-            self.told = gui.add_markdown("")
-            self.pictures = gui.add_folder("Picture", expand_by_default=True)
+            self.button = gui.add_button("Render", hint="render this view with gsjax")
+            self.message = gui.add_markdown("")
+            self.pictures = gui.add_folder("Image", expand_by_default=True)
             self.pictures.visible = False
         self.button.on_click(lambda _: self.render())
         for choice in (self.kind, self.height, self.place):
             choice.on_update(lambda _: self._again())
         self.follow.on_update(lambda _: self._again())
-        self.album = gui.add_folder("Cameras")
+        self.camera_folder = gui.add_folder("Cameras")
         self.go_to: Any = None
 
     def _again(self) -> None:
-        """Render anew if an exact picture is to be seen."""
+        """Render again if an exact image is visible."""
         if self.covered or self.pictures.visible or self.follow.value:
             self.render()
 
     def show_cameras(self) -> None:
-        """Draw the exhibit's cameras, in place of those that were."""
-        frusta, eye = self.exhibit.frusta, self.exhibit.eye
-        self.album.visible = bool(frusta)
+        """Draw the cameras of the content, in place of earlier ones."""
+        frusta = self.content.frusta
+        self.camera_folder.visible = bool(frusta)
         if not frusta or self.closed:
             return
         if self.go_to is None:
-            with self.album:
+            with self.camera_folder:
                 self.drawn = self.client.gui.add_checkbox("Show", True)
                 names = (_NOWHERE, *(frustum.name for frustum in frusta))
                 self.go_to = self.client.gui.add_dropdown("Go to", names)
-            self.drawn.on_update(lambda _: self.look_around())
+            self.drawn.on_update(lambda _: self.update_cameras())
             self.go_to.on_update(lambda _: self._go_to_chosen())
-        size = size_of_frusta(frusta, eye.distance)
+        size = frustum_size(frusta, self.content.viewpoint.distance)
         self.places = np.column_stack(
             [[frustum.centre for frustum in frusta], photo_distances(frusta, size)]
         )
         self.cameras = add_cameras(self.client.scene, frusta, size)
         for handle, frustum in zip(self.cameras[1:], frusta):
             handle.on_click(lambda _, chosen=frustum: self._go(chosen))
-        self.look_around()
+        self.update_cameras()
 
-    def _show_what_is_not_in_the_way(self) -> None:
-        """The cameras that are wanted: none over an exact picture, and none that the
-        view stands in, whose photograph would hide what is seen from there.
+    def _update_cameras(self) -> None:
+        """Show the cameras, except over an exact image.
+
+        A camera that the view is in is hidden too: its photograph would cover the view.
         """
         if not self.cameras or self.closed:
             return
@@ -174,30 +176,30 @@ class Session:
         self.cameras[0].visible = self.drawn.value and not self.covered
         for handle, hidden in zip(self.cameras[1:], hides.tolist()):
             handle.visible = not hidden
-        frusta = self.exhibit.frusta
+        frusta = self.content.frusta
         near = [frusta[i].name for i in np.argsort(away)[: hides.sum()]]
-        if self.stood_at not in near:  # said, and free to be chosen again
-            self.stood_at = near[0] if near else _NOWHERE
-            self.go_to.value = self.stood_at
+        if self.camera_name not in near:  # shown, and free to be chosen again
+            self.camera_name = near[0] if near else _NOWHERE
+            self.go_to.value = self.camera_name
 
     def _go_to_chosen(self) -> None:
-        names = [frustum.name for frustum in self.exhibit.frusta]
-        if self.go_to.value in names and self.go_to.value != self.stood_at:
-            self._go(self.exhibit.frusta[names.index(self.go_to.value)])
+        names = [frustum.name for frustum in self.content.frusta]
+        if self.go_to.value in names and self.go_to.value != self.camera_name:
+            self._go(self.content.frusta[names.index(self.go_to.value)])
 
     def _go(self, frustum: Frustum) -> None:
-        """Stand where a photograph was taken, and put it into the panel."""
+        """Move to where a photograph was taken, and show it in the panel."""
         camera = self.client.camera
         with self.client.atomic():
             camera.position = frustum.centre
             camera.wxyz = wxyz_of(frustum.viewmat[:3, :3].T)
             camera.fov = frustum.fov
-        self.stood_at = self.go_to.value = frustum.name
-        self.look_around()
+        self.camera_name = self.go_to.value = frustum.name
+        self.update_cameras()
         if frustum.photo is None:
             return
         if self.photo is None:
-            with self.album:
+            with self.camera_folder:
                 self.photo = self.client.gui.add_image(frustum.photo, format="jpeg")
         self.photo.image = frustum.photo
         self.photo.label = frustum.name
@@ -211,7 +213,7 @@ class Session:
     def _draw(self) -> None:
         if self.closed:
             return
-        exhibit, gaussians = self.exhibit, self.exhibit.gaussians
+        content, gaussians = self.content, self.content.gaussians
         longest = longest_axes(gaussians)[np.asarray(gaussians.active)]
         longest = longest[np.isfinite(longest)]
         limit = float("inf")
@@ -220,8 +222,8 @@ class Session:
         shown = within(gaussians, Cut(self.opacity.value, limit))
         self.scene_shown = gaussians, shown
         sent = shown
-        if exhibit.max_gaussians is not None:
-            sent = most_important(gaussians, shown, exhibit.max_gaussians)
+        if content.max_gaussians is not None:
+            sent = most_important(gaussians, shown, content.max_gaussians)
         splats = pack(gaussians, sent)
         if len(splats.centers):
             self.splats = self.client.scene.add_gaussian_splats(
@@ -231,32 +233,33 @@ class Session:
             self.splats.remove()
             self.splats = None
         found = np.count_nonzero(np.asarray(gaussians.active))
-        faint = np.count_nonzero(opacities_of(gaussians)[shown] < LEAST_OPACITY)
+        faint = np.count_nonzero(opacities_of(gaussians)[shown] < MIN_DRAWN_OPACITY)
         lines = [f"**{len(splats.centers):,}** of {found:,} Gaussians"]
         if faint:
-            told = f"{faint:,} of opacity below {LEAST_OPACITY} in exact pictures only"
-            lines.append(told)
+            lines.append(
+                f"{faint:,} of opacity below {MIN_DRAWN_OPACITY} in exact images only"
+            )
         if limit < float("inf"):
             lines.append(f"scales up to {limit:.3g}")
-        if exhibit.status:
-            lines.append(exhibit.status)
+        if content.status:
+            lines.append(content.status)
         self.counts.content = "<br/>".join(lines)
         if self.follow.value:
             self.render()
 
-    # --- exact pictures ---
+    # --- exact images ---
 
     def _render(self) -> None:
-        """The picture for where the camera is now; what goes wrong is told there."""
+        """Render for the present camera, and show the image or the error."""
         if self.scene_shown is None or self.closed:
             return
         gaussians, shown = self.scene_shown
-        self.told.content = "rendering; the first of a size compiles for some seconds"
+        self.message.content = "rendering; a new image size takes seconds to compile"
         camera, height = self.client.camera, int(self.height.value)
         width = max(1, round(height * camera.aspect))
         begun, seen_from = time.perf_counter(), camera.update_timestamp
         try:
-            view = self.exhibit.renderer(
+            view = self.content.renderer(
                 select(gaussians, shown),  # pyright: ignore
                 camera_of(
                     camera.wxyz,
@@ -264,25 +267,25 @@ class Session:
                     camera.fov,
                     width,
                     height,
-                    near=min(NEAR, self.exhibit.eye.near),
+                    near=min(NEAR, self.content.viewpoint.near),
                 ),
             )
-        except Exception as error:  # of XLA too, as where memory is short
-            self.told.content = f"not rendered: {one_line(error)}"
+        except Exception as error:  # also of XLA, when memory is short
+            self.message.content = f"not rendered: {one_line(error)}"
             note(f"warning: {one_line(error)}")
             return
         if self.closed:
             return
         pixels, what = picture(view, self.kind.value)
         seconds = time.perf_counter() - begun
-        self.told.content = f"{what}, {width} × {height} px, {seconds:.2f} s"
+        self.message.content = f"{what}, {width} × {height} px, {seconds:.2f} s"
         if camera.update_timestamp == seen_from:
             self._put(pixels)
         else:
             self._moved()
 
     def _put(self, pixels: np.ndarray) -> None:
-        """Show a picture where it is wanted, and nowhere else."""
+        """Show an image at the chosen place only."""
         over = self.place.value == "over the view"
         self.pictures.visible = not over
         if not over:
@@ -297,24 +300,23 @@ class Session:
             self.client.scene.set_background_image(pixels, format="png")
             if self.splats is not None:
                 self.splats.visible = False
-        self.look_around()
+        self.update_cameras()
 
     def _uncover(self) -> None:
-        """The browser's own splats again."""
+        """Show the splats of the browser again."""
         if not self.covered:
             return
         with self.client.atomic():
             self.covered = False
-            background = self.exhibit.renderer.background
-            paint_background(self.client.scene, background)
+            set_background(self.client.scene, self.content.renderer.background)
             if self.splats is not None:
                 self.splats.visible = True
-        self.look_around()
+        self.update_cameras()
 
     def _moved(self) -> None:
-        """A picture is only right for where it was taken from."""
+        """Remove the image, which is right for its own camera only."""
         self._uncover()
-        self.look_around()
+        self.update_cameras()
         if self.rest is not None:
             self.rest.cancel()
         if self.follow.value:
@@ -323,7 +325,7 @@ class Session:
             self.rest.start()
 
     def close(self) -> None:
-        """Nothing more is drawn."""
+        """Stop drawing."""
         self.closed = True
         if self.rest is not None:
             self.rest.cancel()

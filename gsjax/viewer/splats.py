@@ -1,11 +1,10 @@
-"""Gaussians as the browser draws them: what is left of them, and in which numbers.
+"""Gaussians as viser draws them.
 
 Axis legend: N slots, M Gaussians that are shown.
 
-viser holds a covariance in half precision and a colour in 8 bits, the same from all
-sides: that of the spherical harmonics' degree 0. It draws nothing below an opacity of
-`LEAST_OPACITY`. All of this is NumPy: nothing is compiled for a new M, and nothing
-waits for what a device is busy with.
+viser stores covariances in half precision and one colour of 8 bits for all directions
+(SH degree 0), and draws nothing below an opacity of `MIN_DRAWN_OPACITY`. This is all
+NumPy: nothing is compiled for a new M, and nothing waits for a busy device.
 """
 
 from typing import NamedTuple
@@ -16,13 +15,13 @@ from scipy.spatial.transform import Rotation
 from gsjax.gaussians import Gaussians
 from gsjax.math.sh import dc_to_rgb
 
-LEAST_OPACITY = 0.01
-# Half precision has 11 bits from 6e-5 to 65504: of scales, from 0.008 to 255.
+MIN_DRAWN_OPACITY = 0.01
+# Half precision has 11 bits from 6e-5 to 65504, which are scales of 0.008 to 255.
 _LARGEST, _TYPICAL = 250.0, 0.1
 
 
 class Cut(NamedTuple):
-    """Which Gaussians are shown: both ends included.
+    """Limits of the Gaussians that are shown, both included.
 
     Attributes:
       min_opacity: in [0, 1).
@@ -34,7 +33,7 @@ class Cut(NamedTuple):
 
 
 class Splats(NamedTuple):
-    """What `viser.SceneApi.add_gaussian_splats` takes.
+    """Arguments of `viser.SceneApi.add_gaussian_splats`.
 
     Lengths are in units of ``scale``, so that covariances fit half precision.
 
@@ -54,21 +53,21 @@ class Splats(NamedTuple):
 
 
 def opacities_of(gaussians: Gaussians) -> np.ndarray:
-    """[N] float64."""
+    """Return opacities [N] float64."""
     logits = np.asarray(gaussians.params.logit_opacities, np.float64)
     with np.errstate(over="ignore"):
         return 1 / (1 + np.exp(-logits))
 
 
 def longest_axes(gaussians: Gaussians) -> np.ndarray:
-    """[N] float64, the largest of the three scales, in world units."""
+    """Return the largest of the three scales [N] float64, in world units."""
     logs = np.asarray(gaussians.params.log_scales, np.float64)
     with np.errstate(over="ignore"):
         return np.exp(logs.max(axis=1))
 
 
 def within(gaussians: Gaussians, cut: Cut) -> np.ndarray:
-    """[N] bool: active, finite, and within the cut."""
+    """Return a mask [N] of Gaussians that are active, finite, and within the cut."""
     params = gaussians.params
     leaves = [
         params.means,
@@ -83,10 +82,10 @@ def within(gaussians: Gaussians, cut: Cut) -> np.ndarray:
 
 
 def most_important(gaussians: Gaussians, shown: np.ndarray, count: int) -> np.ndarray:
-    """[N] bool: of those ``shown`` the ``count`` that matter most.
+    """Return a mask [N] of the ``count`` most important of those ``shown``.
 
-    That is opacity times the area of the two longest axes: what a Gaussian covers
-    from its best side. A heuristic: it knows no cameras, and not what is hidden.
+    Importance is opacity times the area of the two longest axes, a heuristic that
+    ignores cameras and occlusion.
     """
     if shown.sum() <= count:
         return shown
@@ -100,9 +99,9 @@ def most_important(gaussians: Gaussians, shown: np.ndarray, count: int) -> np.nd
 
 
 def pack(gaussians: Gaussians, shown: np.ndarray) -> Splats:
-    """Those that ``shown`` [N] marks, without those that the browser never draws."""
+    """Convert the Gaussians that ``shown`` [N] marks and viser draws."""
     opacities = opacities_of(gaussians)
-    shown = shown & (opacities >= LEAST_OPACITY)
+    shown = shown & (opacities >= MIN_DRAWN_OPACITY)
     params = gaussians.params
     logs = np.asarray(params.log_scales, np.float64)[shown]
     scale = _unit(logs.max(axis=1))
@@ -119,10 +118,10 @@ def pack(gaussians: Gaussians, shown: np.ndarray) -> Splats:
 
 
 def _unit(longest: np.ndarray) -> float:
-    """World units in which half precision holds these log scales [M].
+    """Return the world units in which half precision holds these log scales [M].
 
-    The largest fits, unless those in the middle would get too small by that; then the
-    largest are cut.
+    The largest fits, unless the median would then be too small; the largest are
+    clipped in that case.
     """
     if not len(longest):
         return 1.0
@@ -133,8 +132,8 @@ def _unit(longest: np.ndarray) -> float:
 
 
 def _rotations(quats: np.ndarray) -> np.ndarray:
-    """[M, 3, 3] float32."""
-    if not len(quats):  # of which scipy 1.14 makes an error
+    """Return matrices [M, 3, 3] float32; zero quaternions become the identity."""
+    if not len(quats):  # scipy 1.14 rejects an empty array
         return np.zeros((0, 3, 3), np.float32)
     some = np.any(quats != 0, axis=1, keepdims=True)
     xyzw = np.roll(np.where(some, quats, (1.0, 0, 0, 0)), -1, axis=1)

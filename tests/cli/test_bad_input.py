@@ -59,9 +59,9 @@ def test_other_errors_of_gaussians():
         gsjax.make_gaussians(**{**GOOD, "sh": np.zeros((4, 5, 3))})
     with pytest.raises(InputError, match="means is complex"):
         gsjax.make_gaussians(**{**GOOD, "means": np.zeros((4, 3), complex)})
-    with pytest.raises(InputError, match="capacity 3 cannot hold 4"):
+    with pytest.raises(InputError, match="capacity: expected at least 4"):
         gsjax.make_gaussians(**GOOD, capacity=3)
-    with pytest.raises(InputError, match="capacity 3 is below the present 4"):
+    with pytest.raises(InputError, match="capacity: expected at least the present 4"):
         gsjax.grow(gsjax.make_gaussians(**GOOD), 3)
 
 
@@ -102,7 +102,7 @@ def put(matrix, place, value):
         ({"width": np.nan}, "width"),
         ({"height": np.inf}, "height"),
         ({"height": None}, "height"),
-        ({"model": 3}, "model is 3; a name or a Lens"),
+        ({"lens": 3}, "expected a gsjax.cameras.lenses.Lens"),
         ({"viewmat": 1j * EYE}, "viewmat is complex"),
         ({"K": K + 0j}, "K is complex"),
         ({"model": "fisheye"}, "unknown camera model 'fisheye'"),

@@ -1,4 +1,4 @@
-"""Pictures and camera files that programs write."""
+"""Images and camera files that commands write."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from gsjax.data.transforms_writer import transforms_json
 from gsjax.io import images
 
 
-def test_depth_picture_of_nothing_and_of_a_plane():
+def test_depth_pictures_of_no_depth_and_of_a_plane():
     nothing = images.depth_picture(np.zeros((2, 3), np.float32))
     assert not nothing.pixels.any()
     flat = images.depth_picture(np.full((2, 3), 2.0, np.float32))
@@ -17,7 +17,7 @@ def test_depth_picture_of_nothing_and_of_a_plane():
     assert (flat.near, flat.far) == (2, 2)
 
 
-def test_camera_file_round_trip(tmp_path):
+def test_camera_files_round_trip(tmp_path):
     viewmat = gsjax.look_at((1, 2, 3), (0.5, 0, 0))
     cameras = [
         gsjax.make_camera(
@@ -35,7 +35,7 @@ def test_camera_file_round_trip(tmp_path):
     back = load_transforms(path)
     assert [entry.name for entry in back] == ["c0", "c1"]
     for entry, camera in zip(back, cameras):
-        assert (entry.camera.width, entry.camera.model) == (camera.width, camera.model)
+        assert (entry.camera.width, entry.camera.lens) == (camera.width, camera.lens)
         np.testing.assert_array_equal(entry.camera.K, camera.K)
         np.testing.assert_allclose(entry.camera.viewmat, camera.viewmat, atol=1e-6)
     with pytest.raises(gsjax.InputError, match="is a batch"):

@@ -1,4 +1,4 @@
-"""Numbers written as text, many at a time: those that Python reads, and no others."""
+"""Numbers written as text are parsed in bulk exactly as Python's float reads them."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def one_by_one(words: list[str]) -> list[float] | None:
 @example(["1 2", "", " 3"], "\n", True)
 @example(["1-2"], "\n", True)
 @example(["1e", "nan(1)", "inf"], "\n", False)
-def test_all_at_once_as_one_by_one(lines, end, ended):
+def test_bulk_parsing_agrees_with_python(lines, end, ended):
     text = end.join(lines) + end * ended
     words = find_words(as_bytes(text))
     found = text.split("\n")
@@ -48,20 +48,19 @@ def test_all_at_once_as_one_by_one(lines, end, ended):
     if not text.split():
         return
     numbers = parse_numbers(as_bytes(text), len(text.split()))
-    wanted = one_by_one(text.split())
-    if wanted is None:
+    expected = one_by_one(text.split())
+    if expected is None:
         assert numbers is None
     else:
-        np.testing.assert_array_equal(numbers, wanted)
+        np.testing.assert_array_equal(numbers, expected)
 
 
 @pytest.mark.parametrize("word", ["1_0", "\uff11", "", "x", "1e", "0x1", "nan(1)"])
-def test_what_is_no_number(word):
+def test_other_words_are_rejected(word):
     with pytest.raises(ValueError, match="could not convert"):
         parse_number(word)
 
 
-def test_digits_alone():
-    text = "12 3.5\n7a"
-    other = other_than_digits(as_bytes(text))
+def test_other_than_digits_counts_bytes():
+    other = other_than_digits(as_bytes("12 3.5\n7a"))
     assert other.tolist() == [0, 0, 0, 0, 0, 1, 1, 1, 1, 2]

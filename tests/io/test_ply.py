@@ -1,4 +1,4 @@
-"""PLY files: what is written comes back, what is damaged is refused by name."""
+"""PLY files round-trip bit by bit, and damaged ones are rejected by name."""
 
 import os
 import time
@@ -32,7 +32,7 @@ def random_fields(count: int, degree: int, seed: int = 0) -> dict[str, np.ndarra
 
 
 def table_of(fields: dict[str, np.ndarray], *, normals=True) -> dict[str, np.ndarray]:
-    """Columns in the standard order, written out apart from the library's own."""
+    """Columns in the standard order, independent of the library's own."""
     count, bases = fields["sh"].shape[:2]
     table = {name: fields["means"][:, i] for i, name in enumerate("xyz")}
     if normals:
@@ -82,6 +82,11 @@ def encode(
     return header + before[1] + body.tobytes() + after[1]
 
 
+def standard(fields: dict[str, np.ndarray]) -> bytes:
+    """The file that the library writes."""
+    return encode(table_of(fields)).replace(b"comment made by a test\n", b"")
+
+
 def put(folder: Path, content: bytes) -> Path:
     path = folder / "scene.ply"
     path.write_bytes(content)
@@ -96,7 +101,7 @@ def assert_bits_equal(gaussians: Gaussians, fields: dict[str, np.ndarray]) -> No
         assert found.tobytes() == fields[name].tobytes(), name
 
 
-# --- what is written comes back ---
+# --- round trips ---
 
 
 @pytest.mark.parametrize("degree", range(5))
@@ -105,76 +110,44 @@ def test_round_trip_is_bit_exact(tmp_path, degree):
     path = tmp_path / "scene.PLY"
     save(path, make_gaussians(**fields))
     assert_bits_equal(load(path), fields)
+    assert path.read_bytes() == standard(fields)
     assert [p.name for p in tmp_path.iterdir()] == ["scene.PLY"]
 
 
-def test_written_bytes_are_the_standard_layout(tmp_path):
-    fields = random_fields(5, 2)
-    write_ply(tmp_path / "a.ply", make_gaussians(**fields))
-    wanted = encode(table_of(fields)).replace(b"comment made by a test\n", b"")
-    assert (tmp_path / "a.ply").read_bytes() == wanted
-
-
-@pytest.mark.parametrize("count", [1, 40_000])
-def test_far_means_come_back_bit_by_bit(tmp_path, count):
+@pytest.mark.parametrize("count", [1, 40_000])  # more rows than are read at a time
+def test_means_far_from_the_origin_round_trip_bit_by_bit(tmp_path, count):
+    """Also through an export; and near ones are written as float32."""
     fields = random_fields(count, 0)
     near, origin = fields["means"], np.asarray([4e6, -5e6, 123.456])
-    path = tmp_path / "a.ply"
+    path, exported = tmp_path / "a.ply", tmp_path / "b.ply"
     with jax.enable_x64(True):
         far = fields | {"means": near + origin}
         save(path, make_gaussians(**far))
         back = np.asarray(load(path).params.means)
+        wide = make_gaussians(**{k: v.astype(np.float64) for k, v in fields.items()})
+        save(tmp_path / "near.ply", wide)
+    assert (tmp_path / "near.ply").read_bytes() == standard(fields)
     assert back.tobytes() == far["means"].tobytes()
     assert np.abs(back - origin - near).max() < 1e-8
     kinds = [line.split()[1:] for line in path.read_bytes().split(b"\n")[3:20]]
-    wide = [name for kind, name in kinds if kind == b"double"]
-    assert wide == [b"x", b"y", b"z"]
+    assert [name for kind, name in kinds if kind == b"double"] == [b"x", b"y", b"z"]
+    assert export_scene(path, exported) == (count, count)
+    assert exported.read_bytes() == path.read_bytes()
 
 
-def test_float64_that_float32_holds_is_written_as_the_standard_layout(tmp_path):
-    fields = random_fields(7, 1)
-    fields["means"][3] = np.nan, np.inf, -0.0
-    with jax.enable_x64(True):
-        wide = make_gaussians(**{k: v.astype(np.float64) for k, v in fields.items()})
-        assert wide.params.means.dtype == np.float64
-        with pytest.warns(UserWarning, match="1 of the Gaussians"):
-            save(tmp_path / "a.ply", wide)
-    assert (tmp_path / "a.ply").read_bytes() == encode(table_of(fields)).replace(
-        b"comment made by a test\n", b""
-    )
-
-
-def test_means_that_float32_moves_are_told(tmp_path):
+def test_means_that_float32_moves_are_warned_about(tmp_path):
     fields = random_fields(50, 0)
     fields["log_scales"][:] = -3
-    near = tmp_path / "near.ply"
-    shifted = {"near": 0.1, "far": 1e6}
     with jax.enable_x64(True):
-        for name, by in shifted.items():
+        for name, by in {"near": 0.1, "far": 1e6}.items():
             moved = fields | {"means": fields["means"].astype(np.float64) + by}
             save(tmp_path / f"{name}.ply", make_gaussians(**moved))
     with jax.enable_x64(False):
-        assert load(near).params.means.dtype == np.float32
-        wanted = r"far\.ply: \d+ of 50 .*float32 moves them, by up to 0\.03.*x64"
-        with pytest.warns(UserWarning, match=wanted):
+        assert load(tmp_path / "near.ply").params.means.dtype == np.float32
+        message = r"far\.ply: float32 moves \d+ of 50 .*by up to 0\.03.*x64"
+        with pytest.warns(UserWarning, match=message):
             means = np.asarray(load(tmp_path / "far.ply").params.means)
     np.testing.assert_allclose(means, fields["means"] + 1e6, rtol=1e-7)
-
-
-def test_an_export_loses_nothing(tmp_path):
-    fields = random_fields(5, 0)
-    first, second = tmp_path / "a.ply", tmp_path / "b.ply"
-    with jax.enable_x64(True):
-        far = fields["means"] + np.asarray([1e7, 0, 0.1])
-        save(first, make_gaussians(**fields | {"means": far}))
-    assert export_scene(first, second) == (5, 5)
-    assert second.read_bytes() == first.read_bytes()
-
-
-def test_more_rows_than_a_piece(tmp_path):
-    fields = random_fields(40_000, 0)
-    write_ply(tmp_path / "a.ply", make_gaussians(**fields))
-    assert_bits_equal(read_ply(tmp_path / "a.ply"), fields)
 
 
 def test_only_active_slots_are_written_in_order(tmp_path):
@@ -186,14 +159,14 @@ def test_only_active_slots_are_written_in_order(tmp_path):
     assert_bits_equal(read_ply(tmp_path / "a.ply"), kept)
 
 
-def test_no_gaussians_round_trip(tmp_path):
+def test_an_empty_scene_round_trips(tmp_path):
     write_ply(tmp_path / "a.ply", make_gaussians(**random_fields(0, 3)))
     gaussians = read_ply(tmp_path / "a.ply")
     assert (gaussians.capacity, gaussians.sh_degree) == (1, 3)
     assert not gaussians.active.any()
 
 
-def test_existing_file_is_replaced_only_when_asked(tmp_path):
+def test_an_existing_file_is_replaced_only_when_asked(tmp_path):
     first, second = random_fields(2, 0, 1), random_fields(3, 0, 2)
     path = tmp_path / "a.ply"
     save(path, make_gaussians(**first))
@@ -204,7 +177,7 @@ def test_existing_file_is_replaced_only_when_asked(tmp_path):
     assert_bits_equal(load(path), second)
 
 
-def test_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
+def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     path = tmp_path / "a.ply"
     fields = random_fields(2, 0)
     save(path, make_gaussians(**fields))
@@ -219,28 +192,17 @@ def test_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     assert_bits_equal(load(path), fields)
 
 
-def test_bad_targets(tmp_path):
-    gaussians = make_gaussians(**random_fields(1, 0))
-    with pytest.raises(InputError, match=r"none.* is missing; create it"):
-        save(tmp_path / "none" / "a.ply", gaussians)
-    (tmp_path / "folder.ply").mkdir()
-    with pytest.raises(InputError, match=r"folder\.ply: is a folder"):
-        save(tmp_path / "folder.ply", gaussians, overwrite=True)
-    for call in (load, lambda path: save(path, gaussians)):
-        with pytest.raises(InputError, match=r"a\.obj: .*'\.obj'.*known: \.ply"):
-            call(tmp_path / "a.obj")
-
-
-def test_values_not_finite_are_written_with_a_warning(tmp_path):
+def test_values_that_are_not_finite_are_written_with_a_warning(tmp_path):
     fields = random_fields(4, 0)
-    fields["means"][2, 1] = np.nan
+    fields["means"][2] = np.nan, np.inf, -0.0
     with pytest.warns(UserWarning, match=r"a\.ply: 1 of the Gaussians written"):
         save(tmp_path / "a.ply", make_gaussians(**fields))
+    assert (tmp_path / "a.ply").read_bytes() == standard(fields)
     with pytest.raises(InputError, match="drop_nonfinite"):
         load(tmp_path / "a.ply")
 
 
-# --- every form of the same file ---
+# --- variants of the same file ---
 
 
 @settings(max_examples=20, deadline=None)
@@ -251,7 +213,7 @@ def test_values_not_finite_are_written_with_a_warning(tmp_path):
     kind=st.sampled_from(["binary_little_endian", "binary_big_endian", "ascii"]),
     eol=st.sampled_from(["\n", "\r\n"]),
 )
-def test_any_order_and_form_reads_the_same(
+def test_any_order_and_encoding_reads_the_same(
     tmp_path_factory, order, degree, normals, kind, eol
 ):
     fields = random_fields(3, degree)
@@ -271,15 +233,6 @@ def test_other_scalar_types(tmp_path, kind):
     types |= {f"rot_{i}": "uchar" for i in range(4)} | {"nx": "int"}
     path = put(tmp_path, encode(table_of(fields), kind=kind, types=types))
     assert_bits_equal(read_ply(path), fields)
-
-
-def test_double_beyond_float32_is_not_finite(tmp_path):
-    table = {k: v.astype(np.float64) for k, v in table_of(random_fields(3, 0)).items()}
-    table["x"][1] = np.nan
-    table["y"][2] = np.inf
-    path = put(tmp_path, encode(table, types=dict.fromkeys(table, "double")))
-    with pytest.raises(InputError, match=r"2 of 3 .*means: 2.*\[1, 2\]"):
-        read_ply(path)
 
 
 @pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
@@ -315,8 +268,8 @@ def test_text_in_many_blocks(tmp_path, eol):
     for at in (0, 2_345, 4_999):
         before = start + sum(len(line) + len(eol) for line in lines[:at])
         bad = content[:before] + b"x" + content[before:]
-        wanted = rf"vertex {at} \(byte {before}\): could not convert string .*'x"
-        with pytest.raises(InputError, match=wanted):
+        message = rf"vertex {at} \(byte {before}\): expected 17 numbers, got 'x"
+        with pytest.raises(InputError, match=message):
             read_ply(put(tmp_path, bad))
 
 
@@ -326,9 +279,9 @@ def test_agrees_with_plyfile(tmp_path, degree):
     fields = random_fields(7, degree)
     write_ply(tmp_path / "a.ply", make_gaussians(**fields))
     vertex = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
-    wanted = table_of(fields)
-    assert list(vertex.dtype.names) == list(wanted)
-    for name, column in wanted.items():
+    expected = table_of(fields)
+    assert list(vertex.dtype.names) == list(expected)
+    for name, column in expected.items():
         np.testing.assert_array_equal(vertex[name], column)
     for text, order in ((True, "="), (False, ">"), (False, "<")):
         element = plyfile.PlyElement.describe(np.asarray(vertex), "vertex")
@@ -353,108 +306,84 @@ def test_guitar():
     assert np.median(np.asarray(gaussians.params.log_scales)) < 0
 
 
-# --- what is damaged is refused ---
+# --- damaged files; see tests/stress/bad_files.py for more ---
 
 
-def test_every_truncation_is_refused_quickly(tmp_path):
-    content = encode(table_of(random_fields(3, 0)))
-    path = tmp_path / "scene.ply"
-    for size in range(len(content)):
-        path.write_bytes(content[:size])
-        start = time.perf_counter()
-        with pytest.raises(InputError, match=r"scene\.ply"):
-            read_ply(path)
-        assert time.perf_counter() - start < 1, size
-    assert read_ply(put(tmp_path, content)).capacity == 3
+def assert_rejected(path: Path, message: str) -> None:
+    """With this message, and before much is read or allocated."""
+    start = time.perf_counter()
+    with pytest.raises(InputError, match=rf"(?s)scene\.ply.*{message}"):
+        read_ply(path)
+    assert time.perf_counter() - start < 1
 
 
-def test_truncated_ascii(tmp_path):
+def test_truncated_text(tmp_path):
     content = encode(table_of(random_fields(3, 0)), kind="ascii")
-    with pytest.warns(UserWarning, match="the last line has no end"):
+    with pytest.warns(UserWarning, match="the last line has no newline"):
         read_ply(put(tmp_path, content[:-1]))
     short = content[: content.rindex(b" ")]
-    with pytest.raises(InputError, match=r"vertex 2 \(byte \d+\): found 16 .* 17"):
-        read_ply(put(tmp_path, short))
-    wrong = content[: content.rindex(b" ")] + b" one\n"
-    with pytest.raises(InputError, match=r"vertex 2 .*'?one'?.*pass numbers"):
-        read_ply(put(tmp_path, wrong))
+    assert_rejected(put(tmp_path, short), r"vertex 2 \(byte \d+\): .* 17 .* got 16;")
+    assert_rejected(put(tmp_path, short + b" one\n"), "vertex 2 .* got 'one'")
+    gone = content[: content.rindex(b"\n", 0, -1) + 1] + b" " * 100 + b"\n"
+    assert_rejected(put(tmp_path, gone), "vertex 2 .* got 0;")
 
 
 GOOD = encode(table_of(random_fields(3, 0)))
+
+
+def good_but(*changes: tuple[bytes, bytes]) -> bytes:
+    content = GOOD
+    for old, new in changes:
+        content = content.replace(old, new)
+    return content
+
+
+def degree_1(change) -> bytes:
+    """A file of degree 1 with properties renamed, or removed where that is None."""
+    table = {change(k): v for k, v in table_of(random_fields(3, 1)).items()}
+    return encode({k: v for k, v in table.items() if k is not None})
+
+
+COMMENT, COUNT, ASCII = b"comment made by a test", b"vertex 3", b"binary_little_endian"
 BAD_FILES = {
-    "empty": (b"", "byte 0: found b''"),
-    "other magic": (b"solid stl\n", "byte 0.*solid"),
-    "png": (b"\x89PNG\r\n\x1a\n" + bytes(100), "byte 0.*PNG"),
-    "zeros": (bytes(5000), "byte 0"),
-    "no end_header": (b"ply\n" + b"comment x\n" * 300_000, "no line 'end_header'"),
     "nothing between": (b"ply\nend_header\n", "no 'format'"),
-    "no format": (GOOD.replace(b"format binary_little_endian 1.0\n", b""), "'format'"),
-    "format": (GOOD.replace(b"binary_little", b"binary_middle"), "line 2.*one format"),
-    "version": (GOOD.replace(b"endian 1.0", b"endian 2.0"), "line 2.*one format, 1.0"),
+    "no format": (good_but((b"format binary_little_endian 1.0\n", b"")), "'format'"),
+    "format": (good_but((b"binary_little", b"binary_middle")), "line 2.*one format"),
+    "version": (good_but((b"endian 1.0", b"endian 2.0")), "line 2.*one format 1.0"),
     "format twice": (
-        GOOD.replace(b"comment made", b"format ascii 1.0\ncomment made"),
+        good_but((COMMENT, b"format ascii 1.0")),
         r"line 3 \(byte 36\).*one format",
     ),
-    "no vertex": (GOOD.replace(b"element vertex", b"element corner"), "corner"),
+    "no vertex": (good_but((b"element vertex", b"element corner")), "corner"),
     "vertex twice": (
-        GOOD.replace(b"end_header", b"element vertex 3\nend_header"),
+        good_but((b"end_header", b"element vertex 3\nend_header")),
         "declared twice",
     ),
     "property twice": (
-        GOOD.replace(b"float nx", b"float x"),
+        good_but((b"float nx", b"float x")),
         "property float x.*declared twice",
     ),
-    "negative count": (GOOD.replace(b"vertex 3", b"vertex -3"), "line 4.*-3.*wanted"),
-    "no count": (GOOD.replace(b"vertex 3", b"vertex"), "line 4.*wanted"),
-    "fractional count": (GOOD.replace(b"vertex 3", b"vertex 3.5"), "line 4.*wanted"),
-    "2**63 vertices": (
-        GOOD.replace(b"vertex 3", b"vertex %d" % 2**63),
-        rf"truncated.*{68 * 2**63} bytes.*204 are there",
-    ),
-    "many digits": (GOOD.replace(b"vertex 3", b"vertex " + b"9" * 5000), "line 4"),
-    "one more vertex": (
-        GOOD.replace(b"vertex 3", b"vertex 4"),
-        "truncated.*272 bytes.*204 are there",
-    ),
+    "no count": (good_but((COUNT, b"vertex")), "line 4.*expected"),
+    "fractional count": (good_but((COUNT, b"vertex 3.5")), "line 4.*expected"),
+    "many digits": (good_but((COUNT, b"vertex " + b"9" * 5000)), "line 4"),
+    "one more vertex": (good_but((COUNT, b"vertex 4")), "truncated.*272 .*got 204"),
     "2**63 ascii": (
-        GOOD.replace(b"vertex 3", b"vertex %d" % 2**63).replace(
-            b"binary_little_endian", b"ascii"
-        ),
+        good_but((COUNT, b"vertex %d" % 2**63), (ASCII, b"ascii")),
         "truncated.*at least",
     ),
-    "unknown type": (GOOD.replace(b"float x", b"half x"), "half x.*unknown type"),
-    "malformed": (GOOD.replace(b"property float x", b"propertyfloat x"), "line 5"),
-    "blank line": (GOOD.replace(b"comment made by a test", b""), "line 3"),
+    "malformed": (good_but((b"property float x", b"propertyfloat x")), "line 5"),
+    "blank line": (good_but((COMMENT, b"")), "line 3"),
     "property first": (
-        GOOD.replace(b"comment made by a test", b"property float a"),
+        good_but((COMMENT, b"property float a")),
         "line 3.*property float a.*'element",
     ),
-    "list in vertex": (
-        GOOD.replace(b"property float nx", b"property list uchar int nx"),
-        r"list properties \['nx'\]",
-    ),
-    "missing": (
-        GOOD.replace(b"float rot_3", b"float a").replace(b"float opacity", b"float b"),
-        "lacks the properties opacity, rot_3;",
-    ),
     "f_rest gap": (
-        encode(
-            {
-                k.replace("rest_4", "rest_40"): v
-                for k, v in table_of(random_fields(3, 1)).items()
-            }
-        ),
+        degree_1(lambda name: name.replace("rest_4", "rest_40")),
         "lacks the properties f_rest_4;",
     ),
     "f_rest count": (
-        encode(
-            {k: v for k, v in table_of(random_fields(3, 1)).items() if k[-2:] != "_8"}
-        ),
-        r"8 properties f_rest.*\[0, 9, 24, 45, 72\]",
-    ),
-    "point cloud": (
-        encode({n: np.ones(3) for n in ("x", "y", "z", "red", "green", "blue")}),
-        "is a point cloud.*not a Gaussian PLY",
+        degree_1(lambda name: None if name[-2:] == "_8" else name),
+        r"\[0, 9, 24, 45, 72\] properties f_rest.*got 8",
     ),
     "compressed": (
         encode({"packed_position": np.ones(3)}, types={"packed_position": "int"}),
@@ -465,42 +394,27 @@ BAD_FILES = {
 
 @pytest.mark.parametrize("name", BAD_FILES)
 def test_bad_files(tmp_path, name):
-    content, wanted = BAD_FILES[name]
-    path = put(tmp_path, content)
-    start = time.perf_counter()
-    with pytest.raises(InputError, match=rf"(?s)scene\.ply.*{wanted}"):
-        read_ply(path)
-    assert time.perf_counter() - start < 1
+    content, message = BAD_FILES[name]
+    assert_rejected(put(tmp_path, content), message)
 
 
-def test_missing_file_folder_and_pipe(tmp_path):
-    with pytest.raises(InputError, match=r"none\.ply: cannot be read: No such file"):
-        load(tmp_path / "none.ply")
-    (tmp_path / "folder.ply").mkdir()
-    with pytest.raises(InputError, match=r"folder\.ply: not a regular file"):
-        load(tmp_path / "folder.ply")
-    if hasattr(os, "mkfifo"):
-        os.mkfifo(tmp_path / "pipe.ply")
-        with pytest.raises(InputError, match=r"pipe\.ply: not a regular file"):
-            load(tmp_path / "pipe.ply")
+# --- values ---
 
 
-def test_rows_not_finite_are_named_or_dropped(tmp_path):
+def test_rows_that_are_not_finite_are_named_or_dropped(tmp_path):
     fields = random_fields(9, 1)
-    fields["means"][1, 2] = np.inf
-    fields["sh"][4, 3, 1] = np.nan
-    fields["logit_opacities"][7] = np.nan
-    path = put(tmp_path, encode(table_of(fields)))
-    wanted = (
-        r"3 of 9 Gaussians .*means: 1, logit_opacities: 1, sh: 1.*"
+    table = {k: v.astype(np.float64) for k, v in table_of(fields).items()}
+    table["z"][1], table["f_rest_5"][4], table["opacity"][7] = np.inf, np.nan, np.nan
+    path = put(tmp_path, encode(table, types=dict.fromkeys(table, "double")))
+    message = (
+        r"in 3 of 9 Gaussians .*means: 1, logit_opacities: 1, sh: 1.*"
         r"first: \[1, 4, 7\].*drop_nonfinite=True"
     )
-    with pytest.raises(InputError, match=wanted):
+    with pytest.raises(InputError, match=message):
         read_ply(path)
     with pytest.warns(UserWarning, match=r"3 of 9 .* dropped"):
         gaussians = read_ply(path, drop_nonfinite=True)
-    kept = {k: v[[0, 2, 3, 5, 6, 8]] for k, v in fields.items()}
-    assert_bits_equal(gaussians, kept)
+    assert_bits_equal(gaussians, {k: v[[0, 2, 3, 5, 6, 8]] for k, v in fields.items()})
 
 
 def test_infinite_opacities_are_clamped(tmp_path):
@@ -517,7 +431,7 @@ def test_infinite_opacities_are_clamped(tmp_path):
 
 
 def test_the_filter_of_mip_splatting_is_applied(tmp_path):
-    """Scales √(s² + σ²), and as much to be seen of each: opacity × Π s / Π scales."""
+    """Scales become √(s² + σ²), and opacities are multiplied by Π s / Π scales."""
     fields, rng = random_fields(50, 1), np.random.default_rng(1)
     table = table_of(fields)
     sigmas = table["filter_3D"] = np.exp(rng.normal(-1, 2, 50)).astype(np.float32)
@@ -536,26 +450,27 @@ def test_the_filter_of_mip_splatting_is_applied(tmp_path):
     np.testing.assert_array_equal(read.log_scales[:4], fields["log_scales"][:4])
 
 
-def test_zero_quaternions_are_warned_of(tmp_path):
-    fields = random_fields(4, 0)
+def zero_quaternion(fields):
     fields["quats"][2] = 0
-    path = put(tmp_path, encode(table_of(fields)))
-    with pytest.warns(UserWarning, match=r"1 of 4 quaternions.*\[2\].*culled"):
-        assert_bits_equal(read_ply(path), fields)
 
 
-def test_activated_values_are_warned_of(tmp_path):
-    fields = random_fields(20, 0)
+def activated(fields):
     fields["logit_opacities"] = 1 / (1 + np.exp(-fields["logit_opacities"]))
     fields["log_scales"] = np.exp(fields["log_scales"])
-    path = put(tmp_path, encode(table_of(fields)))
-    with pytest.warns(UserWarning, match="looks like activated values"):
-        assert_bits_equal(read_ply(path), fields)
 
 
-@pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
-def test_trailing_bytes_are_warned_of(tmp_path, kind):
-    fields = random_fields(3, 0)
-    path = put(tmp_path, encode(table_of(fields), kind=kind) + b"12345")
-    with pytest.warns(UserWarning, match=r"scene\.ply: .*after the last element"):
+@pytest.mark.parametrize(
+    ("change", "kind", "tail", "message"),
+    [
+        (zero_quaternion, "ascii", b"", r"1 of 4 quaternions.*\[2\].*culled"),
+        (activated, "ascii", b"", "looks like activated values"),
+        (id, "binary_little_endian", b"12345", "5 bytes after the last element"),
+        (id, "ascii", b"12345", "text after the last element"),
+    ],
+)
+def test_suspicious_contents_are_warned_about(tmp_path, change, kind, tail, message):
+    fields = random_fields(4, 0)
+    change(fields)
+    path = put(tmp_path, encode(table_of(fields), kind=kind) + tail)
+    with pytest.warns(UserWarning, match=rf"scene\.ply: .*{message}"):
         assert_bits_equal(read_ply(path), fields)

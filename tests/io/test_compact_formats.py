@@ -1,7 +1,7 @@
-"""SPZ and `.splat` files, held against their layouts written out number by number.
+"""SPZ and `.splat` files, compared with independent decoders of their layouts.
 
-The bytes of `THEIRS` are what another program (@playcanvas/splat-transform 2.7.1) makes
-of the Gaussians of `given`, in version 3 of SPZ.
+`THEIRS` is the Gaussians of `given` as another program (@playcanvas/splat-transform
+2.7.1) writes them, in version 3 of SPZ.
 """
 
 import gzip
@@ -35,7 +35,7 @@ NAMES = ("means", "log_scales", "logit_opacities", "sh")
 
 
 def given(degree: int = 3, **changes) -> gsjax.Gaussians:
-    """Three, the values of which SPZ holds almost all of."""
+    """Three Gaussians that SPZ represents almost exactly."""
     rng = np.random.default_rng(7)
     fields = {
         "means": [[1.5, -2.25, 0.125], [-100.0, 3.0, 7.5], [0, 0, -0.5]],
@@ -62,21 +62,21 @@ def opacities(logits) -> np.ndarray:
     return 1 / (1 + np.exp(-np.asarray(logits, np.float64)))
 
 
-def assert_alike(found: gsjax.Gaussians, wanted: gsjax.Gaussians, sh: float) -> None:
-    """To half a step of SPZ in each number, ``sh`` for harmonics."""
+def assert_alike(found: gsjax.Gaussians, expected: gsjax.Gaussians, sh: float) -> None:
+    """Equal to half a step of SPZ in each number, ``sh`` for harmonics."""
     for name in NAMES:
-        values = [np.asarray(getattr(one.params, name)) for one in (found, wanted)]
+        values = [np.asarray(getattr(one.params, name)) for one in (found, expected)]
         if name == "logit_opacities":
             values = map(opacities, values)
         bound = {"means": 2.0**-13, "log_scales": 1 / 32, "sh": sh}.get(name, 0.5 / 255)
         np.testing.assert_allclose(*values, rtol=0, atol=bound + 1e-6)
-    np.testing.assert_allclose(rotations(found), rotations(wanted), atol=6e-3)
+    np.testing.assert_allclose(rotations(found), rotations(expected), atol=6e-3)
 
 
 # --- SPZ ---
 
 
-def test_what_another_program_writes_is_read(tmp_path):
+def test_reads_files_of_another_program(tmp_path):
     (tmp_path / "a.SPZ").write_bytes(gzip.compress(THEIRS))
     found = gsjax.load(tmp_path / "a.SPZ")
     assert found.sh_degree == 3
@@ -85,7 +85,7 @@ def test_what_another_program_writes_is_read(tmp_path):
 
 
 def by_the_book(raw: bytes) -> list[dict[str, list[float]]]:
-    """Each Gaussian of version 3, as Niantic's README says."""
+    """Each Gaussian of version 3, decoded after Niantic's README."""
     magic, version, count, degree, fraction, flags, reserved = struct.unpack_from(
         "<4sIIBBBB", raw
     )
@@ -123,15 +123,15 @@ def by_the_book(raw: bytes) -> list[dict[str, list[float]]]:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_what_is_written_is_as_the_format_says(tmp_path, degree):
-    """In axes of which y and z point the other way; what is inactive is not written."""
+def test_written_files_follow_the_specification(tmp_path, degree):
+    """With y and z turned, and without inactive slots."""
     scene = gsjax.concatenate(given(degree), given(degree))
     scene = gsjax.select(scene, np.arange(6) > 2)
     gsjax.save(tmp_path / "a.spz", scene)
     raw = gzip.decompress((tmp_path / "a.spz").read_bytes())
     rows = by_the_book(raw)
     assert len(rows) == 3
-    # Of 100, 24 bits hold 2⁻¹⁶.
+    # 24 bits hold 100 to 2⁻¹⁶.
     assert raw[13] == 16
     turn = np.diag([1, -1, -1])
     params, turned = given(degree).params, turn @ rotations(given()) @ turn
@@ -140,18 +140,18 @@ def test_what_is_written_is_as_the_format_says(tmp_path, degree):
     for index, row in enumerate(rows):
         np.testing.assert_array_equal(row["means"], params.means[index] @ turn)
         np.testing.assert_allclose(row["opacity"][0], shares[index], atol=0.5 / 255)
-        wanted = 0.5 + C0 * params.sh[index, 0]
-        np.testing.assert_allclose(row["color"], wanted, atol=0.51 / 255 * 1.9)
+        expected = 0.5 + C0 * params.sh[index, 0]
+        np.testing.assert_allclose(row["color"], expected, atol=0.51 / 255 * 1.9)
         np.testing.assert_array_equal(row["log_scales"], params.log_scales[index])
         found = matrices(*row["xyzw"])
         np.testing.assert_allclose(found, turned[index], atol=6e-3)
         sign = [s for band in range(1, degree + 1) for s in signs[band]]
-        wanted = np.asarray(params.sh[index, 1:]) * np.asarray(sign).reshape(-1, 1)
-        # To 6 bits in degree 1, 5 above, of which these have all.
-        np.testing.assert_array_equal(row["sh"], wanted.ravel())
+        expected = np.asarray(params.sh[index, 1:]) * np.asarray(sign).reshape(-1, 1)
+        # The values have no more than the 5 bits that are kept.
+        np.testing.assert_array_equal(row["sh"], expected.ravel())
 
 
-def test_means_are_as_fine_as_their_range_allows(tmp_path):
+def test_means_are_as_precise_as_their_range_allows(tmp_path):
     for largest, step in ((0.5, 2**-20), (7.9, 2**-20), (8.1, 2**-19), (1e6, 2**-3)):
         means = np.asarray([[largest, 0, 0], [1 / 3, -1 / 3, 0.1], [0, 0, 0]])
         scene = given(0, means=means, log_scales=np.full((3, 3), 5.0))
@@ -162,8 +162,8 @@ def test_means_are_as_fine_as_their_range_allows(tmp_path):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_what_is_read_is_written_to_the_same_bytes(tmp_path, degree):
-    """Nothing is rounded twice, and nothing in the file depends on when or where."""
+def test_a_file_that_is_read_is_written_to_the_same_bytes(tmp_path, degree):
+    """Nothing is rounded twice, and files are deterministic."""
     rng = np.random.default_rng(degree)
     count = 200
     scene = gsjax.make_gaussians(
@@ -180,7 +180,7 @@ def test_what_is_read_is_written_to_the_same_bytes(tmp_path, degree):
     first, second = ((tmp_path / f"{n}.spz").read_bytes() for n in "ab")
     whole = [np.frombuffer(gzip.decompress(raw), np.uint8) for raw in (first, second)]
     quats = slice(16 + 16 * count, 16 + 20 * count)
-    # Of two components that are largest either may be left out.
+    # Of two equally large components either may be left out.
     packed = [one[quats].view("<u4") for one in whole]
     assert np.mean(packed[0] != packed[1]) < 0.02
     same = [np.delete(one, np.r_[quats]) for one in whole]
@@ -188,7 +188,7 @@ def test_what_is_read_is_written_to_the_same_bytes(tmp_path, degree):
 
 
 def as_version_2(raw: bytes, quats: np.ndarray) -> bytes:
-    """The same file with x, y and z of quaternions [N, 4] xyzw in a byte each."""
+    """The same file with quaternions [N, 4] xyzw in three bytes each."""
     count = len(quats)
     packed = to_bytes(127.5 + 127.5 * quats[:, :3] * np.sign(quats[:, 3:]))
     start = 16 + 16 * count
@@ -214,22 +214,23 @@ def save_raw(path: Path, raw: bytes) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("flags", "told"), [(0, "bytes behind the last"), (2, "extensions are not read")]
+    ("flags", "tail", "message"),
+    [
+        (0, b"more", "bytes after the last Gaussian"),
+        (2, b"more", "extensions are ignored"),
+        (1, b"", r"render it with RasterConfig\(antialias=True"),
+    ],
 )
-def test_what_follows_is_told_of(tmp_path, flags, told):
-    raw = THEIRS[:14] + bytes([flags]) + THEIRS[15:] + b"more"
-    with pytest.warns(UserWarning, match=told):
+def test_flags_and_trailing_bytes_are_warned_about(tmp_path, flags, tail, message):
+    raw = THEIRS[:14] + bytes([flags]) + THEIRS[15:] + tail
+    with pytest.warns(UserWarning, match=message):
         found = gsjax.load(save_raw(tmp_path / "a.spz", raw))
     assert_alike(found, given(), 1 / 16)
+    write_spz(tmp_path / "b.spz", given(0), antialias=flags == 1)
+    assert gzip.decompress((tmp_path / "b.spz").read_bytes())[14] == (flags == 1)
 
 
-def test_antialiasing_is_told_of(tmp_path):
-    write_spz(tmp_path / "a.spz", given(0), antialias=True)
-    with pytest.warns(UserWarning, match=r"looks right with RasterConfig\(antialias"):
-        gsjax.load(tmp_path / "a.spz")
-
-
-def test_opacities_of_zero_and_one_stay_so(tmp_path):
+def test_opacities_of_zero_and_one_round_trip(tmp_path):
     gsjax.save(tmp_path / "a.spz", given(0, logit_opacities=[-np.inf, np.inf, -9.0]))
     found = gsjax.load(tmp_path / "a.spz").params.logit_opacities
     np.testing.assert_allclose(opacities(found), [0, 1, 0], atol=0.5 / 255)
@@ -237,36 +238,59 @@ def test_opacities_of_zero_and_one_stay_so(tmp_path):
 
 
 def test_an_empty_scene_is_written_and_read(tmp_path):
-    empty = gsjax.select(given(1), np.zeros(3, bool))
+    empty = gsjax.select(given(0), np.zeros(3, bool))
     for suffix in (".spz", ".splat"):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("warnings.warn", lambda *_, **__: None)
-            gsjax.save(tmp_path / f"a{suffix}", empty)
+        gsjax.save(tmp_path / f"a{suffix}", empty)
     assert int(gsjax.num_active(gsjax.load(tmp_path / "a.spz"))) == 0
     assert (tmp_path / "a.splat").read_bytes() == b""
 
 
-# --- what they do not hold ---
+# --- values out of range ---
 
 FEW = np.asarray([[1.0, 0, 0], [0, 0, 0], [1, 2, 3]])
-BEYOND = {
-    "log scales": ({"log_scales": np.full((3, 3), -11.0), "means": 0 * FEW}, 3),
-    "colours": ({"sh": np.full((3, 1, 3), 4.0)}, 3),
-    "harmonics": ({"sh": np.ones((3, 4, 3)) * [[[0]], [[1.5]], [[-1]]]}, 1),
-    "means": ({"means": 9e4 * FEW}, 2),
+WHITE = np.zeros((3, 1, 3))
+WHITE[2, 0, 1] = 2.0
+CLIPPED = {
+    "log scales": (
+        "a.spz",
+        {"log_scales": np.full((3, 3), -11.0), "means": 0 * FEW},
+        "3 of 3 Gaussians have log scales",
+    ),
+    "colours": (
+        "a.spz",
+        {"sh": np.full((3, 1, 3), 4.0)},
+        "3 of 3 Gaussians have colours",
+    ),
+    "harmonics": (
+        "a.spz",
+        {"sh": np.ones((3, 4, 3)) * [[[0]], [[1.5]], [[-1]]]},
+        "1 of 3 Gaussians have harmonics",
+    ),
+    "means": ("a.spz", {"means": 9e4 * FEW}, "2 of 3 Gaussians have means"),
+    "splat colours": ("a.splat", {"sh": WHITE}, r"1 of 3 colours are out of \[0, 1\]"),
+    "splat means": (
+        "a.splat",
+        {"means": np.asarray([[5e6 + 0.3, 0, 0], [0, 0, 0], [1, 2, 3]])},
+        "1 of 3 Gaussians have means rounded by",
+    ),
 }
 
 
-@pytest.mark.parametrize("what", BEYOND)
-def test_what_is_clipped_is_told_of(tmp_path, what):
-    changes, count = BEYOND[what]
-    message = f"{count} of 3 Gaussians have {what} "
-    with pytest.warns(UserWarning, match=message) as told:
-        gsjax.save(tmp_path / "a.spz", given(0, **changes))
-    assert len(told) == 1
+@pytest.mark.parametrize("case", CLIPPED)
+def test_lost_precision_is_warned_about(tmp_path, case):
+    name, changes, message = CLIPPED[case]
+    with (
+        jax.enable_x64(case == "splat means"),
+        pytest.warns(UserWarning, match=message) as caught,
+    ):
+        gsjax.save(tmp_path / name, given(0, **changes))
+    assert len(caught) == 1
+    if case == "splat colours":
+        raw = (tmp_path / name).read_bytes()
+        assert {raw[32 * k + 25] for k in range(3)} == {128, 255}
 
 
-def test_what_is_clipped_is_the_nearest(tmp_path):
+def test_values_are_clipped_to_the_nearest(tmp_path):
     sh = np.zeros((3, 4, 3))
     sh[0, :] = (9.0, -9.0, 0.5)
     scene = given(1, sh=sh, log_scales=[[9, -19, 0], [0, 0, 0], [1, 1, 1]])
@@ -280,19 +304,7 @@ def test_what_is_clipped_is_the_nearest(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".splat"])
-def test_what_is_not_finite_is_refused(tmp_path, suffix):
-    for name in ("means", "quats", "log_scales", "sh"):
-        wrong = np.array(getattr(given(0).params, name))
-        wrong[1] = np.inf
-        with pytest.raises(InputError, match=r"1 of 3 Gaussians are NaN or infinite"):
-            gsjax.save(tmp_path / f"a{suffix}", given(0, **{name: wrong}))
-    with pytest.raises(InputError, match="NaN or infinite"):
-        gsjax.save(tmp_path / f"a{suffix}", given(0, logit_opacities=[0, np.nan, 0]))
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("suffix", [".spz", ".splat"])
-def test_what_is_never_drawn_is_left_out(tmp_path, suffix):
+def test_gaussians_that_are_never_drawn_are_left_out(tmp_path, suffix):
     quats = np.asarray([[1, 0, 0, 0], [0, 0, 0, 0], [0, 1e-20, 0, 0]])
     path = tmp_path / f"a{suffix}"
     with pytest.warns(UserWarning, match="1 of 3 quaternions are zero"):
@@ -303,37 +315,37 @@ def test_what_is_never_drawn_is_left_out(tmp_path, suffix):
         assert gsjax.load(path).capacity == 2
 
 
-@pytest.mark.parametrize("suffix", [".spz", ".splat"])
-def test_what_would_draw_nothing_is_refused(tmp_path, suffix):
-    nothing = given(0, quats=np.zeros((3, 4)))
-    with pytest.raises(InputError, match="quaternions of all 3 Gaussians are zero"):
-        gsjax.save(tmp_path / f"a{suffix}", nothing)
-    assert list(tmp_path.iterdir()) == []
+BOTH, NOT_FINITE = (".spz", ".splat"), "1 of 3 Gaussians are NaN or infinite"
+INFINITE = np.asarray([0, np.inf, 0])[:, None]
+REFUSED = [
+    (BOTH, {"means": INFINITE * np.ones(3)}, NOT_FINITE),
+    (BOTH, {"quats": 1 + INFINITE * np.ones(4)}, NOT_FINITE),
+    (BOTH, {"log_scales": INFINITE * np.ones(3)}, NOT_FINITE),
+    (BOTH, {"sh": INFINITE[:, None] * np.ones((1, 3))}, NOT_FINITE),
+    (BOTH, {"logit_opacities": [0, np.nan, 0]}, NOT_FINITE),
+    (BOTH, {"quats": np.zeros((3, 4))}, "quaternions of all 3 Gaussians are zero"),
+    ([".splat"], {"means": 1e39 * FEW}, "2 of 3 means exceed float32"),
+    ([".spz"], {"means": 1e7 * FEW}, "expected means up to 8,388,607"),
+    ([".spz"], {"sh": np.ones((3, 25, 3))}, "SH degree 0 to 3, got 4; .*--sh-degree"),
+]
 
 
-def test_means_beyond_float32_have_no_place_in_splat(tmp_path):
-    means = 1e39 * np.asarray([[1, 0, 0], [0, 0, 0], [0, 0, -1]])
+@pytest.mark.parametrize("row", range(len(REFUSED)))
+def test_scenes_that_a_format_cannot_store_are_refused(tmp_path, row):
+    suffixes, changes, message = REFUSED[row]
     with jax.enable_x64(True):
-        far = given(0, means=means)
-        with pytest.raises(InputError, match="2 of 3 means are beyond float32"):
-            gsjax.save(tmp_path / "a.splat", far)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_what_has_no_place_in_spz_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"SH degree 4; SPZ has up to 3.*--sh-degree"):
-        gsjax.save(tmp_path / "a.spz", gsjax.with_sh_degree(given(), 4))
-    far = given(0, means=np.asarray([[1e7, 0, 0], [0, 0, 0], [0, 0, 0]]))
-    with pytest.raises(InputError, match="beyond the 8,388,607 of SPZ"):
-        gsjax.save(tmp_path / "a.spz", far)
+        scene = given(0, **changes)
+        for suffix in suffixes:
+            with pytest.raises(InputError, match=message):
+                gsjax.save(tmp_path / f"a{suffix}", scene)
     assert list(tmp_path.iterdir()) == []
 
 
 # --- .splat ---
 
 
-def test_a_splat_file_is_as_viewers_read_it(tmp_path):
-    """32 bytes each; what covers most comes first."""
+def test_splat_files_follow_the_layout(tmp_path):
+    """32 bytes each, the largest first."""
     with pytest.warns(UserWarning, match="degree 1 to 3 are left out") as caught:
         gsjax.save(tmp_path / "a.splat", given())
     assert len(caught) == 1
@@ -348,42 +360,19 @@ def test_a_splat_file_is_as_viewers_read_it(tmp_path):
         np.testing.assert_allclose(
             floats[3:], np.exp(np.asarray(params.log_scales[index])), rtol=1e-6
         )
-        wanted = 0.5 + C0 * np.asarray(params.sh[index, 0])
+        expected = 0.5 + C0 * np.asarray(params.sh[index, 0])
         found = np.asarray([red, green, blue]) / 255
-        np.testing.assert_allclose(found, wanted, atol=0.5 / 255)
-        wanted = opacities(params.logit_opacities[index])
-        np.testing.assert_allclose(alpha / 255, wanted, atol=0.5 / 255)
+        np.testing.assert_allclose(found, expected, atol=0.5 / 255)
+        expected = opacities(params.logit_opacities[index])
+        np.testing.assert_allclose(alpha / 255, expected, atol=0.5 / 255)
         found = matrices(*((np.asarray([x, y, z, w]) - 128) / 128))
         np.testing.assert_allclose(found, rotations(given())[index], atol=0.03)
-
-
-def test_a_colour_beyond_white_is_told_of(tmp_path):
-    sh = np.zeros((3, 1, 3))
-    sh[2, 0, 1] = 2.0
-    with pytest.warns(UserWarning, match="1 of 3 colours are darker than black or"):
-        gsjax.save(tmp_path / "a.splat", given(0, sh=sh))
-    raw = (tmp_path / "a.splat").read_bytes()
-    assert {raw[32 * k + 25] for k in range(3)} == {128, 255}
-
-
-def test_a_splat_file_far_from_the_origin_is_told_of(tmp_path):
-    means = np.asarray([[5e6 + 0.3, 0, 0], [0, 0, 0], [1, 2, 3]])
-    with jax.enable_x64(True):
-        far = given(0, means=means)
-        with pytest.warns(UserWarning, match="1 of 3 Gaussians have means rounded by"):
-            gsjax.save(tmp_path / "a.splat", far)
-
-
-def test_a_splat_file_is_not_read(tmp_path):
-    gsjax.save(tmp_path / "a.splat", given(0))
-    with pytest.raises(InputError, match=r"known: \.ply, \.spz; convert"):
-        gsjax.load(tmp_path / "a.splat")
 
 
 # --- the command line ---
 
 
-def test_scenes_are_exported_by_suffix(tmp_path, capsys):
+def test_export_selects_the_format_by_suffix(tmp_path, capsys):
     gsjax.save(tmp_path / "a.ply", given())
     out = tmp_path / "new" / "b.spz"
     assert main.main(["export", str(tmp_path / "a.ply"), str(out)]) == 0
@@ -401,4 +390,4 @@ def test_scenes_are_exported_by_suffix(tmp_path, capsys):
     assert main.main(["export", str(tmp_path / "e.ply"), str(tmp_path / "e.spz")]) == 0
     assert "2 of 3 Gaussians" in capsys.readouterr().out
     assert main.main(["export", str(out), str(tmp_path / "d.xyz")]) == 3
-    assert "known: .ply, .splat, .spz; " in capsys.readouterr().err
+    assert "a suffix of .ply, .splat, .spz, got" in capsys.readouterr().err

@@ -1,0 +1,84 @@
+"""Pictures and movies that a notebook displays."""
+
+import base64
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from gsjax.errors import InputError
+from gsjax.io import images
+from gsjax.runtime.files import write_file
+
+MIN_SIZE = 240  # px: smaller pictures are displayed enlarged
+MIME_TYPES = {"webp": "image/webp", "gif": "image/gif", "webm": "video/webm"}
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A picture that a notebook displays, enlarged if it is small.
+
+    Attributes:
+      pixels: [H, W, 3] uint8.
+    """
+
+    pixels: np.ndarray
+
+    @property
+    def png(self) -> bytes:
+        """Contents of a PNG file."""
+        return images.encode_png(self.pixels)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write a PNG file, in place of an existing one.
+
+        Raises:
+          InputError: if the suffix is not .png, or the file cannot be written.
+        """
+        path = Path(path)
+        if path.suffix.lower() != ".png":
+            raise InputError(
+                f"{path}: expected the suffix .png, got {path.suffix!r}; rename it"
+            )
+        write_file(path, self.png)
+
+    def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
+        height, width = self.pixels.shape[:2]
+        zoom = max(1, MIN_SIZE // max(height, width))
+        return self.png, {"width": zoom * width, "height": zoom * height}
+
+    def __repr__(self) -> str:
+        height, width = self.pixels.shape[:2]
+        return f"Picture({width} × {height} px)"
+
+
+@dataclass(frozen=True)
+class Movie:
+    """A movie that a notebook plays in a loop.
+
+    Attributes:
+      data: contents of the file.
+      kind: "webp", "gif" or "webm".
+      frames: number of frames.
+      size: (width, height) in px at which it is shown.
+    """
+
+    data: bytes
+    kind: str
+    frames: int
+    size: tuple[int, int]
+
+    def _repr_html_(self) -> str:
+        source = base64.b64encode(self.data).decode()
+        width, height = self.size
+        shape = f'width="{width}" height="{height}"'
+        url = f'src="data:{MIME_TYPES[self.kind]};base64,{source}"'
+        if self.kind == "webm":
+            switches = "autoplay loop muted playsinline controls"
+            return f"<video {shape} {switches} {url}></video>"
+        return f"<img {shape} {url}>"
+
+    def __repr__(self) -> str:
+        kilobytes = len(self.data) / 1000
+        return f"Movie({self.frames} frames, {self.kind}, {kilobytes:.0f} kB)"
