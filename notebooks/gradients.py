@@ -12,26 +12,24 @@
 # ---
 
 # %% [markdown]
-# # Gradients you can't get elsewhere
+# # Gradients beyond training
 #
-# Renderers with kernels of their own mostly have one derivative: the gradient that
-# training needs, in reverse mode, written by hand. `gsjax.render` is JAX all the way
-# down, so `jvp`, `linearize`, `vmap` and `grad` go through it, and through each other.
-# Four things to do with that:
+# Most splatting renderers provide one derivative: the reverse-mode gradient that
+# training needs. `gsjax.render` also supports `jvp`, `linearize`, `vmap` and second
+# derivatives, and their combinations. This notebook uses them for four things:
 #
-# 1. **Forward mode**: how a picture changes with the pose of its camera, in one go,
-#    for Gauss–Newton.
-# 2. **`vmap` over seeds**: four trainings as one program.
+# 1. **Forward mode**: the change of an image with the pose of its camera, for
+#    Gauss–Newton.
+# 2. **`vmap` over seeds**: three training runs as one program.
 # 3. **`vmap` over cameras**.
-# 4. **Hessian–vector products**: which Gaussians are not missed.
+# 4. **Hessian–vector products**: which Gaussians can be removed.
 #
-# Everything is small: compiling takes longer than all else. XLA compiles a program on
-# one core, so the programs are written down first and compiled side by side, in
+# All scenes are small, so compiling takes longer than running. XLA compiles a program
+# on one core; the programs are therefore defined first and compiled side by side, in
 # threads.
 
 # %%
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -52,33 +50,34 @@ compiler = ThreadPoolExecutor(2)
 
 
 def compiled(function, *arguments):
-    """A program for arguments like these, which will be there when it is asked for."""
+    """Compile a function for arguments like these, in a thread."""
     return compiler.submit(lambda: jax.jit(function).lower(*arguments).compile())
 
 
 # %% [markdown]
 # ## The programs
 #
-# **A picture and its six tangents.** A camera can move in six ways. `jax.linearize`
-# gives the picture and the function that pushes a movement forward to a change of the
-# picture; `vmap` pushes all six. Reverse mode would need a pass for each of the 20 736
-# numbers of the picture to come to the same Jacobian.
+# **An image and its six tangents.** A camera moves in six ways. `jax.linearize` returns
+# the image and the function that maps a motion to a change of the image; `vmap` applies
+# it to all six. Reverse mode would need one pass for each of the image's 9216 numbers
+# to get the same Jacobian.
 #
-# A movement is three angles and three lengths, in the camera's own axes. The quaternion
-# $(1, \omega/2)$ is normalised where it is used; to first order it turns by $\omega$,
-# and nothing is singular at 0.
+# A motion is three angles and three lengths, in the camera's own axes. The quaternion
+# $(1, \omega/2)$ is normalised where it is used; to first order it rotates by $\omega$,
+# and nothing is singular at 0. The preset is `accurate`, because pose gradients of the
+# default preset miss what enters and leaves its α cut.
 
 # %%
-POSE = gsjax.RasterConfig.accurate(pair_capacity=12_288, **SMALL)
-made = torus_knot_scene(600, frames=8, width=96, height=72)
+POSE = gsjax.RasterConfig.accurate(pair_capacity=8192, **SMALL)
+made = torus_knot_scene(400, frames=8, width=64, height=48)
 knot, camera, behind = made.gaussians, made.cameras[0], jnp.asarray(made.background)
 
 
 def moved(x):
-    """The camera after a movement [6]."""
+    """Return the camera after a motion [6]."""
     turn = quaternion_to_matrix(jnp.concatenate([jnp.ones(1), x[:3] / 2]))
     motion = jnp.eye(4).at[:3, :3].set(turn).at[:3, 3].set(x[3:])
-    return replace(camera, viewmat=motion @ camera.viewmat)
+    return camera.replace(viewmat=motion @ camera.viewmat)
 
 
 def picture_at(x):
@@ -87,7 +86,7 @@ def picture_at(x):
 
 
 def with_tangents(x):
-    """rgb [H, W, 3], its Jacobian [H, W, 3, 6], and whether capacity was short."""
+    """Return rgb [H, W, 3], its Jacobian [H, W, 3, 6], and the overflow flag."""
     rgb, push, overflowed = jax.linearize(picture_at, x, has_aux=True)
     return rgb, jax.vmap(push, out_axes=-1)(jnp.eye(6)), overflowed
 
@@ -95,20 +94,20 @@ def with_tangents(x):
 posing = compiled(with_tangents, jnp.zeros(6))
 
 # %% [markdown]
-# **A training, four times.** Photographs of the still life that `gsjax demo` trains on,
-# 64 × 48 pixels, from 16 places, of which every fourth is held out. 400 Gaussians of
-# one colour from all sides, Adam, one random view a step, and `lax.scan` over all
-# steps. The seed decides where the Gaussians start and which views are drawn.
-# `jax.vmap(fit)` is four trainings, which begin at once and go on in a thread.
+# **Three training runs.** Photographs of the still life of `gsjax demo`, 48 × 36
+# pixels, from 12 places; every fourth is held out. 300 Gaussians of SH degree 0, Adam,
+# one random view per step, and `lax.scan` over all steps. The seed chooses the initial
+# points and the views. `jax.vmap(fit)` is all runs at once; it starts now and continues
+# in a thread.
 
 # %%
-WIDTH, HEIGHT, N, SEEDS, STEPS = 64, 48, 400, 4, 240
-CONFIG = gsjax.RasterConfig(chunk_size=16, pair_capacity=4096, **SMALL)
-viewmats, K = demo_cameras(16, WIDTH, HEIGHT)
+WIDTH, HEIGHT, VIEWS, N, SEEDS, STEPS = 48, 36, 12, 300, 3, 160
+CONFIG = gsjax.RasterConfig(chunk_size=16, pair_capacity=2048, **SMALL)
+viewmats, K = demo_cameras(VIEWS, WIDTH, HEIGHT)
 photos = jnp.asarray([cast(v, K, WIDTH, HEIGHT, samples=2)[0] for v in viewmats])
 cameras = gsjax.make_camera(viewmat=viewmats, K=K, width=WIDTH, height=HEIGHT)
-test = np.arange(0, 16, 4)
-train = np.setdiff1d(np.arange(16), test)
+test = np.arange(0, VIEWS, 4)
+train = np.setdiff1d(np.arange(VIEWS), test)
 
 RATES = gsjax.GaussianParams(
     means=0.01, quats=0.02, log_scales=0.03, logit_opacities=0.05, sh=0.03
@@ -118,7 +117,7 @@ DECAY = optax.exponential_decay(1.0, STEPS, 0.1)
 
 
 def start(seed):
-    """Gaussians at points on the surfaces, drawn by the seed."""
+    """Return Gaussians at random points on the surfaces."""
     views = [View("", Path(), v, K, WIDTH, HEIGHT) for v in viewmats]
     scene = Dataset(Path(), "", tuple(views), *surface_points(N, seed))
     return gsjax.init_gaussians(scene, sh_degree=0, opacity=0.5, scale=0.7)
@@ -129,7 +128,7 @@ def one_of(batch, index):
 
 
 def fit(gaussians, key):
-    """All steps: the scene, loss [STEPS], and the largest demand for pairs."""
+    """Train; return the scene, the losses [STEPS] and the largest pair demand."""
 
     def loss_of(params, view):
         scene = gaussians.replace(params=params)
@@ -157,8 +156,7 @@ keys = jax.random.split(jax.random.key(0), SEEDS)
 fitting = compiler.submit(jax.jit(jax.vmap(fit)), starts, keys)
 
 # %% [markdown]
-# **All cameras in one call.** A camera is a pytree; `vmap` maps over its arrays as over
-# anything else.
+# **All cameras in one call.** A camera is a pytree; `vmap` maps over its arrays.
 
 
 # %%
@@ -172,19 +170,18 @@ seeing_one = compiled(picture_from, first, one_of(cameras, 0))
 
 # %% [markdown]
 # **A Hessian–vector product.** Give each Gaussian a factor $m_i$ on its opacity, 1 now,
-# and ask what a change of the factors does to the pictures of all training views:
+# and ask how a change of the factors affects the images of all training views:
 #
 # $$ L(m) = \tfrac12 \sum_{\text{views}} \lVert I(m) - I(1) \rVert^2. $$
 #
-# At $m = 1$ that is 0, and so is the gradient: all there is to know is in the Hessian,
-# which here is exactly Gauss and Newton's $J^\top J$. It has 160 000 entries and is
-# never written down. Forward mode over reverse mode multiplies it with a vector for the
-# price of a few gradients.
+# At $m = 1$ this is 0, and so is its gradient; the Hessian there is exactly
+# Gauss–Newton's $J^\top J$. It has 90 000 entries and is never formed. Forward mode
+# over reverse mode multiplies it with a vector for the cost of a few gradients.
 
 
 # %%
 def masked(gaussians, factors):
-    """With opacities times ``factors`` [N]."""
+    """Multiply opacities by ``factors`` [N]."""
     opacities = jax.nn.sigmoid(gaussians.params.logit_opacities) * factors
     logits = jnp.log(opacities) - jnp.log1p(-opacities)
     params = gaussians.params.replace(logit_opacities=logits)
@@ -192,7 +189,7 @@ def masked(gaussians, factors):
 
 
 def hessian_times(gaussians, vector):
-    """H v [N], summed over the training views."""
+    """Return H v [N], summed over the training views."""
     ones = jnp.ones(N)
 
     def of_view(camera):
@@ -210,11 +207,11 @@ def hessian_times(gaussians, vector):
 multiplying = compiled(hessian_times, first, jnp.ones(N))
 
 # %% [markdown]
-# ## 1. Where was this taken?
+# ## 1. Pose estimation
 #
-# The photograph is of the knot from a place that we pretend not to know. We start 2.4
-# degrees and a sixth of a unit off, which is some five pixels. First the tangents at
-# the true place: how each pixel changes as the camera turns or shifts. Grey is no
+# The photograph shows the knot from a pose that we pretend not to know. We start 2.4
+# degrees and a sixth of a unit away, which is about four pixels. First the tangents at
+# the true pose: how each pixel changes as the camera rotates or shifts. Grey is no
 # change.
 
 # %%
@@ -226,8 +223,8 @@ shades = [0.5 + 0.25 * tangents[..., i] / np.std(tangents[..., i]) for i in rang
 show(photo, *shades, captions=["photograph", *WAYS], columns=4, zoom=2)
 
 # %% [markdown]
-# Each held against what it is the limit of, the difference of two pictures a
-# thousandth of a unit to either side:
+# Each is compared with the difference of two images a thousandth of a unit to either
+# side:
 
 # %%
 for i in range(6):
@@ -240,11 +237,10 @@ for i in range(6):
     print(f"{WAYS[i]:13} against differences: {relative:.1e}")
 
 # %% [markdown]
-# **Gauss–Newton** linearises the picture and solves for the movement that would explain
-# what is left over: $x \leftarrow x - (J^\top J)^{-1} J^\top r$, with a little damping
-# (1e-3 of the diagonal). A 6 × 6 system. **Adam** gets the gradient of the same error,
-# $J^\top r$, from the same program, with a rate of 0.02, the best of three that were
-# tried.
+# **Gauss–Newton** linearises the image and solves for the motion that explains the
+# residual: $x \leftarrow x - (J^\top J)^{-1} J^\top r$, with a little damping (1e-3 of
+# the diagonal). This is a 6 × 6 system. **Adam** uses the gradient of the same error,
+# $J^\top r$, from the same program, with a learning rate of 0.02.
 
 
 # %%
@@ -252,7 +248,7 @@ matrix_of = jax.jit(lambda x: moved(x).viewmat)
 
 
 def errors(x):
-    """Degrees and units that a movement is away from the truth, which is 0."""
+    """Return the rotation and position error of a motion, in degrees and units."""
     viewmat, true = (np.asarray(m, float) for m in (matrix_of(x), camera.viewmat))
     turn = viewmat[:3, :3] @ true[:3, :3].T
     sine = np.linalg.norm(turn - turn.T) / np.sqrt(8)
@@ -306,11 +302,10 @@ show(
 )
 
 # %% [markdown]
-# The first steps overshoot, for the checkerboard repeats itself and a picture is far
-# from linear over five pixels; then the error falls by a factor of six a step. From 1.7
-# times as far it strays to seven degrees and comes back. Blurring both pictures, first
-# widely and then less, widens the basin and costs no program: the blur of a tangent is
-# the tangent of the blur.
+# The first steps overshoot, because the checkerboard repeats itself and an image is far
+# from linear over several pixels; then the error falls several times per step. From
+# farther away, blur both images first: the blur of a tangent is the tangent of the
+# blur.
 
 # %%
 degrees, units = np.transpose([errors(x) for x in by_newton])
@@ -322,11 +317,11 @@ assert errors(by_adam[-1])[0] > 10 * degrees[-1]
 assert float(jnp.abs(after - photo).max()) < 0.02
 
 # %% [markdown]
-# ## 2. Four seeds, one program
+# ## 2. Three seeds, one program
 #
-# One call trains all four, and each goes its own way: other points to start from, other
-# views drawn. What differs in the end is chance, and says how much of a difference
-# between two settings is worth believing.
+# One call trains all three, each from other points and with other views. Their final
+# difference is chance; it shows how much of a difference between two settings is
+# significant.
 
 # %%
 scenes, losses, demands = fitting.result()
@@ -336,7 +331,7 @@ images = [see(one_of(scenes, seed), cameras) for seed in range(SEEDS)]
 
 
 def held_out(images):
-    """PSNR of the views held out, dB."""
+    """Return the PSNR of the held-out views in dB."""
     return float(-10 * jnp.log10(jnp.mean((images[test] - photos[test]) ** 2)))
 
 
@@ -355,7 +350,7 @@ show(
     photos[0],
     *[seen[0] for seen in images],
     captions=["held out", *(f"seed {seed}" for seed in range(SEEDS))],
-    columns=5,
+    columns=4,
     zoom=2,
 )
 assert min(quality) > 20
@@ -363,7 +358,7 @@ assert max(quality) - min(quality) < 1.5
 assert len({round(value, 4) for value in quality}) == SEEDS
 
 # %% [markdown]
-# In a notebook a batch of scenes shows itself as a sheet of sketches:
+# In a notebook a batch of scenes displays itself as a sheet of sketches:
 
 # %%
 scenes
@@ -371,27 +366,28 @@ scenes
 # %% [markdown]
 # ## 3. All cameras in one call
 #
-# The pictures above came from `vmap` over 16 cameras. One by one they are the same.
+# The images above came from `vmap` over 12 cameras. Rendered one by one they are the
+# same.
 
 # %%
 see_one = seeing_one.result()
-one_by_one = [see_one(one_of(scenes, 0), one_of(cameras, i)) for i in range(16)]
+one_by_one = [see_one(one_of(scenes, 0), one_of(cameras, i)) for i in range(VIEWS)]
 np.testing.assert_allclose(images[0], np.stack(one_by_one), rtol=0, atol=1e-6)
-show(images[0], columns=8, zoom=2)
+show(images[0], columns=6, zoom=2)
 
 # %% [markdown]
-# ## 4. Which Gaussians are not missed?
+# ## 4. Which Gaussians can be removed?
 #
-# Removing Gaussian $i$ means $m_i = 0$, a step of −1 from where we are, and by the
-# Hessian costs $\tfrac12 H_{ii}$. The diagonal comes from products with random signs,
-# $H_{ii} = \mathrm{E}[v_i (H v)_i]$ (Hutchinson), here 32 of them.
+# Removing Gaussian $i$ means $m_i = 0$, a step of −1, and costs $\tfrac12 H_{ii}$ by
+# the Hessian. The diagonal is estimated from products with random signs, $H_{ii} =
+# \mathrm{E}[v_i (H v)_i]$ (Hutchinson), here 32 of them.
 #
-# That is for one Gaussian at a time. Of two that stand in for each other each may go,
-# but not both. If a set $S$ is gone already, one more costs
-# $\tfrac12 H_{ii} + (H 1_S)_i$, one more product; so a third way prunes in rounds, 5 %
-# each, and asks again after each.
+# That holds for one Gaussian at a time. Of two that replace each other, either may go,
+# but not both. If a set $S$ is gone already, one more costs $\tfrac12 H_{ii} + (H
+# 1_S)_i$: one more product. So a third method prunes in rounds of 10 % each and
+# evaluates the cost again after each.
 #
-# Against all of it stands what everyone does: the least opaque ones go first.
+# The baseline removes the least opaque first.
 
 # %%
 scene = one_of(scenes, 0)
@@ -401,14 +397,14 @@ signs = rng.choice(np.float32([-1, 1]), (32, N))
 diagonal = np.mean([v * times(scene, jnp.asarray(v)) for v in signs], axis=0)
 opacity = np.asarray(jax.nn.sigmoid(scene.params.logit_opacities))
 
-# The Hessian is symmetric, and nowhere negative.
+# The Hessian is symmetric and positive semidefinite.
 u, v = (jnp.asarray(rng.normal(size=N), jnp.float32) for _ in range(2))
 Hu, Hv = times(scene, u), times(scene, v)
 np.testing.assert_allclose(u @ Hv, v @ Hu, rtol=1e-3)
 assert min(float(u @ Hu), float(v @ Hv)) > 0
 
 # %%
-FRACTIONS = np.arange(0, 0.76, 0.05)
+FRACTIONS = np.arange(0, 0.71, 0.1)
 gone = np.zeros(N, bool)
 by_rounds = []
 for fraction in FRACTIONS:
@@ -420,7 +416,7 @@ for fraction in FRACTIONS:
 
 
 def all_but_first(score):
-    """Masks of what is left, for each fraction, if the lowest scores go first."""
+    """Return the remaining mask of each fraction if the lowest scores go first."""
     rank = np.argsort(np.argsort(score))
     return [rank >= round(fraction * N) for fraction in FRACTIONS]
 
@@ -428,7 +424,7 @@ def all_but_first(score):
 orders = {
     "opacity": all_but_first(opacity),
     "½ diagonal of H": all_but_first(diagonal),
-    "H, in rounds of 5 %": by_rounds,
+    "H, in rounds of 10 %": by_rounds,
 }
 curves = {
     name: [
@@ -440,12 +436,12 @@ curves = {
 figure, ax = plt.subplots(figsize=(7, 3.4), layout="constrained")
 for name, values in curves.items():
     ax.plot(100 * FRACTIONS, values, ".-", lw=1.2, label=name)
-ax.set(xlabel="Gaussians removed [%]", ylabel="PSNR, views held out [dB]")
+ax.set(xlabel="Gaussians removed [%]", ylabel="PSNR of held-out views [dB]")
 ax.legend(frameon=False)
 plt.show()
 half = int(np.argmin(np.abs(FRACTIONS - 0.5)))
 for name, values in curves.items():
-    print(f"{name:20} {values[half]:.2f} dB with half of them gone")
+    print(f"{name:20} {values[half]:.2f} dB with half removed")
 show(
     photos[0],
     images[0][0],
@@ -460,18 +456,18 @@ show(
 
 # %%
 assert all(mask.sum() == N - round(f * N) for f, mask in zip(FRACTIONS, by_rounds))
-assert all(len(set(np.round(values, 6))) > 5 for values in curves.values())
+assert all(len(set(np.round(values, 6))) > 4 for values in curves.values())
 assert curves["½ diagonal of H"][half] > curves["opacity"][half] + 0.5
-assert curves["H, in rounds of 5 %"][half] > curves["opacity"][half] + 0.5
+assert curves["H, in rounds of 10 %"][half] > curves["opacity"][half] + 0.5
 
 # %% [markdown]
-# ## What to take away
+# ## Summary
 #
-# - Forward mode is for few inputs and many outputs. Six tangents of a picture cost a
-#   few renders, and with them the pose of a camera is a least-squares problem: a dozen
-#   steps to what float32 can tell, where Adam is still on its way after fifty.
-# - A program that trains is a function like any other: `vmap` gives error bars.
-# - Curvature knows what opacity does not: who covers how much, and who stands behind
-#   whom. With half of the Gaussians gone, the views held out are 3.8 dB worse by
-#   opacity, 3.0 dB by the diagonal, and 2.5 dB where the product is asked again after
-#   each round. What one would do next is train on, which mends most of any of it.
+# - Forward mode suits few inputs and many outputs. Six tangents of an image cost a few
+#   renders, and with them the pose of a camera is a least-squares problem: a dozen
+#   steps to the limit of float32, where Adam has not converged after fifty.
+# - A training run is a function like any other: `vmap` gives error bars.
+# - Curvature knows what opacity does not: who covers how much, and who is behind whom.
+#   With half of the Gaussians removed, held-out views are better by the diagonal than
+#   by opacity, and better still in rounds. Training on after pruning repairs most of
+#   either.

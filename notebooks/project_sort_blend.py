@@ -14,15 +14,15 @@
 # %% [markdown]
 # # Project, sort, blend
 #
-# What `gsjax.render` does, once more in plain NumPy, slowly and in the open, with a
-# picture of each step:
+# This notebook repeats what `gsjax.render` does in plain NumPy, with an image of each
+# step:
 #
-# 1. **Project**: each Gaussian of the scene becomes an ellipse on the image.
-# 2. **Sort**: ellipses are dealt out to tiles of 16 × 16 pixels; each tile gets a list
-#    of those that it meets, the nearest first.
+# 1. **Project**: each Gaussian becomes an ellipse on the image.
+# 2. **Sort**: each tile of 16 × 16 pixels gets a list of the ellipses that it meets,
+#    nearest first.
 # 3. **Blend**: each pixel goes through the list of its tile, front to back.
 #
-# At the end the picture is held against that of `gsjax.render`.
+# At the end the image is compared with that of `gsjax.render`.
 
 # %%
 import jax
@@ -48,10 +48,9 @@ CONFIG = gsjax.RasterConfig.compat(
 )
 
 # %% [markdown]
-# The scene is a torus knot over a floor, of some 1200 Gaussians, flat ones that lie on
-# the surfaces. Theirs would be an opacity of 0.97; here it is at most 0.6, so that
-# light comes through and lists have something to say. In a notebook a scene shows
-# itself, as a sketch: discs, which nobody had to render.
+# The scene is a torus knot over a floor: about 1200 flat Gaussians on the surfaces.
+# Their opacity is limited to 0.6 here, so that light passes and the lists matter. In a
+# notebook a scene displays itself as a sketch of discs, without rendering.
 
 # %%
 made = torus_knot_scene(360, frames=8, width=WIDTH, height=HEIGHT)
@@ -67,22 +66,21 @@ camera
 # %% [markdown]
 # ## 1. Project
 #
-# The mean of a Gaussian goes through the camera like any point: into the camera's
-# coordinates, $p = R\,\mu + t$, and onto the image, $u = f_x\,x/z + c_x$,
-# $v = f_y\,y/z + c_y$.
+# The mean of a Gaussian is projected like any point: to camera coordinates, $p = R\,\mu
+# + t$, and onto the image, $u = f_x\,x/z + c_x$, $v = f_y\,y/z + c_y$.
 #
-# Its covariance $\Sigma = R_q\,S^2 R_q^\top$ would become something that is no
-# Gaussian any more, for the lens is not linear. EWA splatting (Zwicker et al. 2001)
-# takes the lens for linear around $p$: with its Jacobian there,
+# Its covariance $\Sigma = R_q\,S^2 R_q^\top$ does not stay Gaussian under a perspective
+# projection. EWA splatting (Zwicker et al. 2001) linearises the projection at $p$. With
+# the Jacobian
 #
 # $$ J = \begin{pmatrix} f_x / z & 0 & -f_x\,x / z^2 \\
 #    0 & f_y / z & -f_y\,y / z^2 \end{pmatrix}, \qquad
 #    \Sigma' = J R\,\Sigma\,R^\top J^\top + 0.3\,I. $$
 #
-# The 0.3 px² keep an ellipse from falling between the pixels. Far outside the view a
-# linear lens is a wild guess, and ellipses would grow into it from there; $J$ is
-# therefore taken no further out than 1.3 times half the view. Colours depend on the
-# direction from which a Gaussian is seen, here by spherical harmonics of degree 1.
+# The 0.3 px² keep an ellipse from falling between the pixels. Far outside the view the
+# linearisation is poor, and ellipses there would become huge; $J$ is therefore
+# evaluated at most 1.3 times half the view from the middle. Colours depend on the
+# viewing direction, here by spherical harmonics of degree 1.
 
 # %%
 viewmat, K = np.asarray(camera.viewmat, float), np.asarray(camera.K, float)
@@ -115,10 +113,10 @@ colors = np.maximum(colors, 0)
 print(f"{N} Gaussians at depths of {z.min():.1f} to {z.max():.1f}")
 
 # %% [markdown]
-# An ellipse never ends, but at some distance α is less than 1/255 and nobody can see
-# it. There it is cut: where $\tfrac12 Q = \ln(255\,o)$, with
-# $Q = d^\top \Sigma'^{-1} d$ and the opacity $o$. For an opacity of 0.6 that is at
-# 3.2 standard deviations, for one of 0.01 already at 1.4.
+# An ellipse has no end, but at some distance α falls below 1/255 and nobody can see it.
+# It is cut there: where $\tfrac12 Q = \ln(255\,o)$, with $Q = d^\top \Sigma'^{-1} d$
+# and the opacity $o$. For an opacity of 0.6 that is at 3.2 standard deviations, for
+# 0.01 at 1.4.
 
 # %%
 reach = 2 * np.log(np.maximum(255 * opacities, 1))  # Q at the cut
@@ -166,12 +164,11 @@ plt.show()
 #
 # ### Which tile meets which ellipse
 #
-# The easy answer is a box: the square around the circle of radius 3 σ of the longest
-# axis, and all tiles that it meets. A thin ellipse that lies aslant fills little of
-# it. The exact answer asks each tile for the pixel centre within it that is nearest to
-# the ellipse's own, in units of $Q$, and whether that is within reach. It is a
-# quadratic over a rectangle, and convex: if its minimum, the mean, lies outside, the
-# smallest value is on the edge.
+# The simple answer is a box: the square around the circle of 3 σ of the longest axis,
+# and all tiles that it meets. A thin diagonal ellipse fills little of it. The exact
+# answer finds, in each tile, the pixel centre nearest to the ellipse's centre in units
+# of $Q$, and tests whether it is within reach. This minimises a convex quadratic over a
+# rectangle: if the mean lies outside, the minimum is on the border.
 
 
 # %%
@@ -199,7 +196,7 @@ boxed = (u + radius >= tile_x * TILE) & (u - radius <= (tile_x + 1) * TILE)
 boxed &= (v + radius >= tile_y * TILE) & (v - radius <= (tile_y + 1) * TILE)
 print(f"{met.sum()} pairs exactly, {boxed.sum()} by boxes")
 
-# Of those that are as opaque as any, the one whose box wastes most.
+# Among the most opaque, the one whose box wastes most.
 waste = boxed.sum((1, 2)) - met.sum((1, 2))
 example = int(np.argmax(np.where(opacities > 0.59, waste, 0)))
 figure, ax = plt.subplots(figsize=(6.4, 4.6), layout="constrained")
@@ -217,11 +214,11 @@ assert met[example].sum() < boxed[example].sum()
 # %% [markdown]
 # ### Pairs, and one sort for all tiles
 #
-# Each meeting is a *pair* of a tile and a Gaussian. They are written down in any order
-# and sorted once, by (tile, depth). Then every list is a stretch of one array, in the
-# order of depth, and all that a tile must know is where its stretch begins and ends.
-# This is the part that wants a capacity in JAX: how many pairs there will be depends
-# on the scene, and arrays under `jit` have fixed sizes.
+# Each meeting is a *pair* of a tile and a Gaussian. Pairs are written in any order and
+# sorted once, by (tile, depth). Then each list is a range of one array, in depth order,
+# and a tile only needs to know where its range begins and ends. In JAX this part needs
+# a capacity: the number of pairs depends on the scene, and arrays under `jit` have
+# fixed sizes.
 
 # %%
 gaussian, row, col = np.nonzero(met)
@@ -251,7 +248,7 @@ figure, panels = plt.subplots(
 for ax, (tiles, gaussians), title in zip(
     panels,
     [(tile, gaussian), (sorted_tile, sorted_gaussian)],
-    ["as written down", "sorted by (tile, depth)"],
+    ["unsorted", "sorted by (tile, depth)"],
 ):
     dots = ax.scatter(
         np.arange(len(tiles)), z[gaussians], c=tiles, cmap="prism", s=3, lw=0
@@ -264,10 +261,10 @@ plt.show()
 
 # %% [markdown]
 # Left, pairs follow the Gaussians: along the knot, then over the floor. Right, each
-# stroke is the list of one tile, colours tell neighbours apart, and within each stroke
-# depth only grows. The lengths of the strokes are the heat map below. Work is as uneven
-# as that: a renderer that gives every tile the time of the longest list wastes most
-# of it.
+# stroke is the list of one tile; colours separate neighbours, and depth only grows
+# within a stroke. The lengths of the strokes are the heat map below. The work is
+# uneven: a renderer that gives every tile the time of the longest list wastes most of
+# it.
 
 # %%
 steps = np.diff(z[sorted_gaussian])
@@ -288,12 +285,12 @@ print(f"mean {lengths.mean():.1f}, longest {lengths.max()}, of {N} Gaussians")
 # %% [markdown]
 # ## 3. Blend
 #
-# A pixel begins with a transmittance of $T = 1$ and goes through the list of its tile.
-# Each entry has here $\alpha = o\,e^{-Q/2}$, at most 0.99; if it is below 1/255 it is
-# passed over. Else the pixel takes $\alpha\,T$ of its colour, and what is left for
-# those behind is $T\,(1 - \alpha)$. If that would fall below 1e-4 the pixel stops.
+# A pixel starts with a transmittance of $T = 1$ and goes through the list of its tile.
+# Each entry has $\alpha = o\,e^{-Q/2}$ there, at most 0.99; it is skipped if it is
+# below 1/255. Otherwise the pixel takes $\alpha\,T$ of its colour and leaves $T\,(1 -
+# \alpha)$ to those behind. If that would fall below 1e-4, the pixel terminates.
 #
-# The function below is all of it, for one pixel. It returns what happened.
+# The function below does all of this for one pixel and returns what happened.
 
 
 # %%
@@ -323,10 +320,10 @@ for py in range(HEIGHT):
         seen[py, px] = len(told)
 
 # %% [markdown]
-# One pixel, one that most Gaussians contribute to: the way through its list. Bars are
-# weights, $\alpha\,T$, in the colour of the Gaussian; the line is the transmittance
-# behind each entry. The weights and what is left at the end add up to 1, so a pixel is
-# a weighted mean of the colours and the background.
+# One pixel, to which most Gaussians contribute. Bars are weights, $\alpha\,T$, in the
+# colour of the Gaussian; the line is the transmittance behind each entry. The weights
+# and the final transmittance add up to 1, so a pixel is a weighted mean of colours and
+# background.
 
 # %%
 py, px = np.unravel_index(np.argmax(seen), seen.shape)
@@ -350,7 +347,8 @@ ax.legend(frameon=False, loc="upper center")
 plt.show()
 
 # %% [markdown]
-# And all pixels, the first 2, 5, 15 entries that a pixel has any α in, and all:
+# The image after the first 2, 5 and 15 contributing entries of each pixel, and after
+# all:
 
 
 # %%
@@ -382,20 +380,18 @@ gsjax.notebook.show(
 )
 
 # %% [markdown]
-# `first_entries` is written the other way round, Gaussian by Gaussian over the whole
-# picture, and knows no tiles. With no limit it has to give the same picture: tiles are
-# there for speed, and nothing else.
+# `first_entries` works the other way round, Gaussian by Gaussian over the whole image,
+# without tiles. Without a limit it gives the same image: tiles only serve speed.
 
 # %%
 np.testing.assert_allclose(first_entries(N), image, rtol=0, atol=1e-12)
 
 # %% [markdown]
-# ## Held against `gsjax.render`
+# ## Comparison with `gsjax.render`
 #
-# The same scene, camera and constants, in float32, compiled, and differentiable. It
-# also tells how many pairs it made: very nearly as many as we did. It leaves a little
-# room for rounding where an ellipse just touches a tile, and asks of the columns of
-# pixels, not only of their rectangle, whether the ellipse meets one.
+# The same scene, camera and constants, in float32, compiled, and differentiable. Its
+# number of pairs nearly equals ours: it leaves a little room for rounding where an
+# ellipse touches a tile, and tests columns of pixels, not only their rectangle.
 
 # %%
 result = gsjax.render_exact(scene, camera, CONFIG)
@@ -416,16 +412,13 @@ gsjax.notebook.show(
 )
 
 # %% [markdown]
-# ## What to take away
+# ## Summary
 #
-# - Projection happens once a Gaussian, blending once a pixel and entry. The lists in
-#   between are what makes the second affordable: a pixel looks at some tens of entries
-#   in place of all Gaussians.
-# - Exact lists are shorter than boxes, here by three tenths, and leave the picture as
-#   it is.
-# - Order is by the depth of the *centres*, the same in the whole tile. Where Gaussians
-#   pass through each other that is wrong, and it is the method's error, not the
-#   program's.
-# - The real thing differs in layout, not in arithmetic: lists go through in chunks,
-#   tiles of like length side by side, and for the gradient the chunks are gone through
-#   once more rather than kept.
+# - Projection costs once per Gaussian, blending once per pixel and entry. The lists in
+#   between make the second affordable: a pixel visits tens of entries instead of all
+#   Gaussians.
+# - Exact lists are shorter than boxes, here by three tenths, and leave the image
+#   unchanged.
+# - The order is that of the depth of the *centres*, the same in the whole tile. It is
+#   wrong where Gaussians intersect; this is an error of the method, not of the program.
+# - `gsjax.render` differs in layout, not in arithmetic.
