@@ -1,7 +1,6 @@
-"""Photographs made by code, for structure from motion.
+"""Photographs for structure from motion: the corner of a room, by ray casting.
 
-They are of the corner of a room, three planes of random texture, by casting rays: the
-cameras' centres and focal length are known exactly.
+Three planes of random texture; the cameras' poses and focal length are known exactly.
 """
 
 import struct
@@ -14,23 +13,23 @@ import pytest
 
 from gsjax import look_at
 
-WIDTH, HEIGHT, FOCAL, COUNT = 320, 240, 297.0, 6
+WIDTH, HEIGHT, FOCAL, COUNT = 320, 240, 297.0, 5
 NAMES = [f"photo {i}.jpg" for i in range(COUNT)]  # with a space
-TURNED = 2  # this one is stored turned, with an EXIF orientation
+ROTATED = 2  # index of the photograph stored rotated, with an EXIF orientation
 
 
 def viewmat_at(turn: float) -> np.ndarray:
-    """A camera in the corner x, y, z > 0, on an arc around it; ``turn`` in 0 … 1."""
+    """Return a camera in the corner x, y, z > 0, on an arc; ``turn`` in [0, 1]."""
     angle = 0.45 + 0.6 * turn
     eye = np.array([3.2 * np.cos(angle), 1.5 + 0.5 * turn, 3.2 * np.sin(angle)])
     return np.asarray(look_at(eye, (0.5, 0.6, 0.5)), np.float64)
 
 
-def corner_view(viewmat: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """[H, W, 3] uint8 of the room's corner: the nearest of three planes, by rays."""
-    width, height = round(WIDTH * scale), round(HEIGHT * scale)
+def corner_view(index: float = 0, scale: float = 1.0) -> np.ndarray:
+    """Return the photograph [H, W, 3] uint8 of camera ``index`` of `COUNT`."""
+    viewmat = viewmat_at(index / (COUNT - 1))
+    width, height, focal = round(WIDTH * scale), round(HEIGHT * scale), FOCAL * scale
     y, x = np.mgrid[:height, :width] + 0.5
-    focal = FOCAL * scale
     rays = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, x * 0 + 1], -1)
     rays = rays @ viewmat[:3, :3]
     eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
@@ -38,18 +37,18 @@ def corner_view(viewmat: np.ndarray, scale: float = 1.0) -> np.ndarray:
         depths = np.where(rays < -1e-9, -eye / rays, np.inf)
     plane = depths.argmin(-1)
     points = eye + rays * depths.min(-1)[..., None]
-    picture = np.zeros((height, width, 3), np.uint8)
+    image = np.zeros((height, width, 3), np.uint8)
     for axis in range(3):
         a, b = (points[..., k].astype(np.float32) * 120 for k in range(3) if k != axis)
         wrap = cv2.BORDER_WRAP
         seen = cv2.remap(texture(axis), a, b, cv2.INTER_LINEAR, borderMode=wrap)
-        picture[plane == axis] = seen[plane == axis]
-    return picture
+        image[plane == axis] = seen[plane == axis]
+    return image
 
 
 @cache
 def texture(seed: int) -> np.ndarray:
-    """Blobs of several sizes, which is what SIFT looks for."""
+    """Return blobs of several sizes, which SIFT detects."""
     rng = np.random.default_rng(seed)
     total = np.zeros((512, 512, 3))
     for size in (64, 128, 256):
@@ -64,9 +63,12 @@ def exif(
     focal_mm: tuple[int, int] = (60, 10),
     camera: tuple[bytes, bytes] = (b"Maker", b"Model"),
 ) -> bytes:
-    """EXIF with an orientation, a camera, and its focal length.
+    """Return an EXIF segment.
 
-    For 35 mm film, which counts unless it is 0, and of the lens, as a fraction.
+    Args:
+      focal_35mm: focal length for 35 mm film, which takes precedence unless it is 0.
+      focal_mm: focal length of the lens as a fraction.
+      camera: maker and model.
     """
 
     def ifd(entries, at):
@@ -81,11 +83,9 @@ def exif(
         return head + b"\0" * 4 + tail
 
     short = struct.Struct("<H").pack
+    names = zip((0x010F, 0x0110), camera)
     main = [
-        *(
-            (tag, 2, len(name) + 1, name + b"\0")
-            for tag, name in zip((0x010F, 0x0110), camera)
-        ),
+        *((tag, 2, len(name) + 1, name + b"\0") for tag, name in names),
         (0x0112, 3, 1, short(orientation)),
         (0x8769, 4, 1, struct.pack("<I", 8)),
     ]
@@ -95,15 +95,14 @@ def exif(
         (0x920A, 5, 1, struct.pack("<II", *focal_mm)),
         (0xA405, 3, 1, short(focal_35mm)),
     ]
-    body = b"II*\0" + struct.pack("<I", 8) + ifd(main, 8) + ifd(lens, start)
-    body = b"Exif\0\0" + body
+    body = b"Exif\0\0II*\0" + struct.pack("<I", 8) + ifd(main, 8) + ifd(lens, start)
     return b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
 
 
 def write_photo(
     path: Path, upright: np.ndarray, orientation=1, focal_35mm=0, **lens
 ) -> None:
-    """A JPEG of RGB pixels; of orientation 6 it is stored turned to the left."""
+    """Write RGB pixels as JPEG; with orientation 6 they are stored rotated left."""
     stored = np.rot90(upright, 1) if orientation == 6 else upright
     quality = [cv2.IMWRITE_JPEG_QUALITY, 97]
     data = cv2.imencode(".jpg", np.ascontiguousarray(stored[..., ::-1]), quality)[1]
@@ -113,8 +112,8 @@ def write_photo(
     path.write_bytes(data)
 
 
-def blank(path: Path, seed: int | None = None) -> None:
-    """A photo of nothing, or of noise that no other has."""
+def write_blank(path: Path, seed: int | None = None) -> None:
+    """Write a grey photograph, or one of noise that matches no other."""
     pixels = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     if seed is not None:
         pixels = texture(100 + seed)[:HEIGHT, :WIDTH]
@@ -122,38 +121,28 @@ def blank(path: Path, seed: int | None = None) -> None:
 
 
 def read(path: Path) -> np.ndarray:
+    """Decode an image as stored: RGB or grey."""
     pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     assert pixels is not None
     return pixels[..., ::-1] if pixels.ndim == 3 else pixels
 
 
-def alike(a: np.ndarray, b: np.ndarray) -> float:
-    """Correlation of two pictures."""
-    assert min(a.std(), b.std()) > 20, "neither is empty"
-    return np.corrcoef(a.ravel(), b.ravel())[0, 1]
-
-
 def make_room(folder: Path) -> Path:
-    """Fill a folder: photographs with EXIF, one stored turned, and what is none."""
+    """Fill a folder: photographs with EXIF, one stored rotated, and other files."""
     for i, name in enumerate(NAMES):
-        pixels = corner_view(viewmat_at(i / (COUNT - 1)))
-        write_photo(folder / name, pixels, 6 if i == TURNED else 1, 32)
+        write_photo(folder / name, corner_view(i), 6 if i == ROTATED else 1, 32)
     (folder / "notes.txt").write_text("not a photo")
     (folder / "._photo 0.jpg").write_text("of another system")
     return folder
 
 
 def make_video(path: Path) -> None:
-    """Thirty frames on the arc, all but every fifth blurred; .avi."""
+    """Write an .avi of thirty frames on the arc; all but every fifth are blurred."""
     code = cv2.VideoWriter.fourcc(*"MJPG")
     writer = cv2.VideoWriter(str(path), code, 10, (WIDTH, HEIGHT))
     if not writer.isOpened():
         pytest.skip("this OpenCV writes no MJPG")
     for i in range(30):
-        pixels = corner_view(viewmat_at(i / 29))[..., ::-1]
+        pixels = corner_view(i * (COUNT - 1) / 29)[..., ::-1]
         writer.write(pixels if i % 5 == 3 else cv2.GaussianBlur(pixels, (0, 0), 3))
     writer.release()
-
-
-def leftovers(folder: Path) -> list[str]:
-    return [path.name for path in folder.iterdir() if path.name.startswith(".gsjax")]

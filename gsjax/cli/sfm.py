@@ -1,4 +1,4 @@
-"""`gsjax sfm`: photographs or a video to a dataset with cameras."""
+"""`gsjax sfm`: a dataset with cameras from photographs or a video."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,47 +7,48 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from gsjax.cli.common import Command, UsageError
+from gsjax.cli.options import integer
 from gsjax.runtime.console import note, say
 
 
 @dataclass(kw_only=True)
 class SfmCommand(Command):
-    """Find the cameras of photos or of a video (COLMAP), for training on them."""
+    """Estimate the cameras of photographs or of a video with COLMAP."""
 
     source: Annotated[Positional[Path], arg(metavar="PHOTOS|VIDEO")]
-    """A folder of photos, or a video."""
+    """Folder of photographs, or a video."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="DATASET")]
     """Folder for images/, sparse/0/, masks/ and the report sfm.json."""
     matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Match all pairs, or neighbours in order of the names; auto: all pairs of at most
-    60 photos, neighbours of more and of video."""
+    """Match all pairs (exhaustive) or neighbours in order of their names (sequential).
+    auto: exhaustive for up to 60 photographs, sequential for more and for video."""
     camera: Literal["auto", "single", "per-image"] = "auto"
-    """Which photos share intrinsics; auto: those of the same size, camera and focal
-    length (EXIF)."""
-    max_size: Annotated[int, arg(metavar="PX")] = 1600
-    """Longer side: larger photos are scaled down to it, for the features and in the
-    dataset; 0 leaves them as they are."""
-    frames: int | None = None
-    """How many frames of a video to take, the sharpest of each stretch; default:
-    100."""
+    """Which photographs share intrinsics. auto: those of the same size, camera and
+    focal length (EXIF)."""
+    max_size: Annotated[int, arg(metavar="PX"), integer(0)] = 1600
+    """Longest side in px, to which larger photographs are scaled down, for features and
+    in the dataset; 0 for no limit."""
+    frames: Annotated[int | None, integer(2)] = None
+    """Number of frames to take from a video, evenly spaced, the sharpest of each
+    interval; default: 100."""
     masks: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder of masks, black where a photo is to be ignored: for IMG.jpg, IMG.png or
-    IMG.jpg.png, as large as the photo seen upright. Where a photo is transparent it is
-    ignored too."""
-    seed: int = 0
-    """Of the random numbers."""
+    """Folder of masks, black where a photograph is ignored: IMG.png or IMG.jpg.png for
+    IMG.jpg, of the size of the upright photograph. Transparent pixels are ignored,
+    too."""
+    seed: Annotated[int, integer(0)] = 0
+    """Seed of the random numbers."""
     overwrite: bool = False
     """Replace a dataset that this command wrote."""
 
     def run(self) -> int:
-        if self.max_size < 64 and self.max_size != 0:
-            raise UsageError(f"--max-size {self.max_size}: 64 or more, or 0, is wanted")
-        if self.frames is not None and self.frames < 2:
-            raise UsageError(f"--frames {self.frames}: 2 or more are wanted")
+        if 0 < self.max_size < 64:
+            raise UsageError(
+                f"--max-size: expected 0 or at least 64, got {self.max_size}"
+            )
         if self.frames is not None and self.source.is_dir():
-            raise UsageError(f"--frames are of a video, and {self.source} is a folder")
-        if not 0 <= self.seed < 2**31:
-            raise UsageError(f"--seed {self.seed}: from 0 to {2**31 - 1} is wanted")
+            raise UsageError(
+                f"--frames goes with a video, but {self.source} is a folder"
+            )
         from gsjax.errors import SfmError
         from gsjax.sfm.reconstruction import SfmSettings, run_sfm
 
@@ -60,7 +61,7 @@ class SfmCommand(Command):
             seed=self.seed,
         )
         report = run_sfm(
-            self.source, self.out, settings, overwrite=self.overwrite, tell=note
+            self.source, self.out, settings, overwrite=self.overwrite, progress=note
         )
         lines = {
             name: f"registered, {n} points" for name, n in report.registered.items()
@@ -71,10 +72,10 @@ class SfmCommand(Command):
         say(
             f"{len(report.registered)} of {len(lines)} images registered, "
             f"{report.points} points, reprojection error "
-            f"{report.mean_reprojection_error:.2f} px, each point in "
+            f"{report.mean_reprojection_error:.2f} px, track length "
             f"{report.mean_track_length:.1f} images"
         )
-        note(", ".join(f"{what} {s:.1f} s" for what, s in report.seconds.items()))
+        note(", ".join(f"{stage} {s:.1f} s" for stage, s in report.seconds.items()))
         if report.problem is not None:
             raise SfmError(report.problem)
         return 0

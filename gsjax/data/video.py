@@ -1,4 +1,4 @@
-"""Frames of a video: of each stretch of time the sharpest."""
+"""Selection of the sharpest video frame in each of several time windows."""
 
 import os
 import warnings
@@ -8,24 +8,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsjax.data.decode import libraries_heard
+from gsjax.data.decode import captured_stderr
+from gsjax.data.image_files import SUFFIXES
 from gsjax.errors import InputError
-from gsjax.io.images import opencv
-from gsjax.sfm.photos import READ, shrink
+from gsjax.io.images import opencv, shrink
 
-_MOST = 0.9  # of the frames; what a file says of their number is often a little off
-_JUDGED_AT = 640  # px: noise of single pixels is not sharpness
+_COMPLETE = 0.9  # share of the frames: declared numbers are often slightly off
+_JUDGED_AT = 640  # px: keeps the noise of single pixels out of the sharpness
 
 
 class Frame(NamedTuple):
-    """A frame: which one of the video it is, from 0, and [H, W, 3] BGR uint8."""
+    """A frame: its index in the video, from 0, and [H, W, 3] BGR uint8."""
 
     number: int
     pixels: np.ndarray
 
 
 def sharpness(pixels: np.ndarray) -> float:
-    """Variance of the Laplacian: a heuristic that compares like with like.
+    """Return the variance of the Laplacian, to compare images of the same content.
 
     Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy", ICPR 2000.
     """
@@ -34,29 +34,32 @@ def sharpness(pixels: np.ndarray) -> float:
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())
 
 
-def sharpest_frames(path: Path, wanted: int, max_size: int = 0) -> Iterator[Frame]:
-    """The video in ``wanted`` windows of equal length, and of each the sharpest frame.
+def sharpest_frames(path: Path, windows: int, max_size: int = 0) -> Iterator[Frame]:
+    """Yield the sharpest frame in each of several time windows of equal length.
+
+    Warns if the video ends early.
 
     Args:
-      wanted: how many; of a shorter video all frames are taken.
-      max_size: the longer side in px is at most this; 0 for any size.
+      path: the video.
+      windows: number of windows; of a shorter video all frames are taken.
+      max_size: longest side in px; 0 for any size.
 
     Raises:
-      InputError: if it is not a video, or breaks off before the second frame.
-
-    Warns:
-      if it breaks off later.
+      InputError: if it is not a video, or ends before the second frame.
     """
     total = _count(path)
     if total < 2:
-        raise InputError(f"{path}: a video of {total} frames; more are wanted")
-    return _sharpest(path, min(wanted, total), total, max_size)
+        raise InputError(
+            f"{path}: expected a video of at least 2 frames, got {total}; "
+            "pass a longer one"
+        )
+    return _sharpest(path, min(windows, total), total, max_size)
 
 
-def _sharpest(path: Path, wanted: int, total: int, max_size: int) -> Iterator[Frame]:
+def _sharpest(path: Path, windows: int, total: int, max_size: int) -> Iterator[Frame]:
     best, best_score, window, index = None, -1.0, 0, -1
     for index, pixels in enumerate(_frames(path)):
-        here = min(index * wanted // total, wanted - 1)
+        here = min(index * windows // total, windows - 1)
         if here != window and best is not None:
             yield best
             best, best_score, window = None, -1.0, here
@@ -65,21 +68,21 @@ def _sharpest(path: Path, wanted: int, total: int, max_size: int) -> Iterator[Fr
             best, best_score = Frame(index, shrink(pixels, max_size)), score
     if best is not None:
         yield best
-    if index + 1 < _MOST * total:
+    if index + 1 < _COMPLETE * total:
         warnings.warn(
-            f"{path}: breaks off after {index + 1} of {total} frames; copy it again if "
-            "it is to be longer",
+            f"{path}: ends after {index + 1} of {total} frames; copy it again if it is "
+            "truncated",
             UserWarning,
             stacklevel=2,
         )
 
 
 def _frames(path: Path) -> Iterator[np.ndarray]:
-    """All frames, turned as the file says."""
+    """Yield all frames, rotated as the file says."""
     capture = _opened(path)
     try:
         while True:
-            with libraries_heard():
+            with captured_stderr():
                 good, pixels = capture.read()
             if not good:
                 return
@@ -89,14 +92,14 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
 
 
 def _count(path: Path) -> int:
-    """How many frames there are; counted where the file does not say so."""
+    """Return the number of frames, counting them if the file does not declare it."""
     capture = _opened(path)
     try:
         told = int(capture.get(opencv().CAP_PROP_FRAME_COUNT))
         if told > 0:
             return told
         counted = 0
-        with libraries_heard():
+        with captured_stderr():
             while capture.grab():
                 counted += 1
         return counted
@@ -105,13 +108,14 @@ def _count(path: Path) -> int:
 
 
 def _opened(path: Path):
-    if path.suffix.lower() in READ:
-        raise InputError(f"{path}: is a single image; a folder or a video is wanted")
+    if path.suffix.lower() in SUFFIXES:
+        raise InputError(f"{path}: is a single image; pass its folder, or a video")
     cv2 = opencv()
-    with libraries_heard():  # FFmpeg takes a relative "10:30.mp4" for an address
+    with captured_stderr():  # FFmpeg takes a relative "10:30.mp4" for a URL
         capture = cv2.VideoCapture(os.path.abspath(path))
     if not capture.isOpened():
         raise InputError(
-            f"{path}: is neither a folder of photos nor a video that OpenCV reads"
+            f"{path}: is neither a folder of photos nor a video that OpenCV reads; "
+            "convert it to MP4"
         )
     return capture

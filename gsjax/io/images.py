@@ -39,6 +39,16 @@ def opencv():
     return cv2
 
 
+def shrink(pixels: np.ndarray, max_size: int) -> np.ndarray:
+    """Scale an image down until its longer side is at most ``max_size`` px; 0: never."""
+    height, width = pixels.shape[:2]
+    scale = max_size / max(height, width) if max_size else 1.0
+    if scale >= 1:
+        return pixels
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return opencv().resize(pixels, size, interpolation=opencv().INTER_AREA)
+
+
 def to_8_bit(image: np.ndarray) -> np.ndarray:
     """Clip values to [0, 1] and round them to uint8; no gamma."""
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)

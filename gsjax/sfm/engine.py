@@ -1,6 +1,4 @@
-"""COLMAP as a program: loaded, quiet, seeded, run in a thread so that progress can be
-told and Ctrl-C is heard.
-"""
+"""Access to pycolmap: loading, logging, random seed, progress and cancellation."""
 
 import subprocess
 import sys
@@ -13,8 +11,7 @@ from typing import Any
 from gsjax.errors import MissingExtraError
 from gsjax.io import images
 
-_FATAL = 3  # of glog's levels
-_WAIT = 5.0  # seconds between lines of progress
+_FATAL = 3  # glog level
 _COUNT_ROWS = """
 import sqlite3, sys
 uri, table = sys.argv[1:]
@@ -22,22 +19,22 @@ read = sqlite3.connect(uri + "?mode=ro", uri=True)
 print(read.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
 """
 
-Tell = Callable[[str], None]
+Progress = Callable[[str], None]
 
 
 def colmap() -> Any:
-    """The module pycolmap.
+    """Return the module pycolmap.
 
     Raises:
       MissingExtraError: if it is absent or does not load.
     """
-    # OpenCV first: loaded after pycolmap 4.2, OpenCV 5.0 aborts as it writes a PNG.
+    # OpenCV first: loaded after pycolmap 4.2, OpenCV 5.0 aborts when it writes a PNG.
     images.opencv()
     try:
         import pycolmap
     except ImportError as error:
         raise MissingExtraError(
-            f"pycolmap, which finds the cameras, does not load ({error}); install "
+            f"pycolmap is needed to find cameras and does not load ({error}); install "
             "it: pip install pycolmap"
         ) from error
     return pycolmap
@@ -45,7 +42,7 @@ def colmap() -> Any:
 
 @contextmanager
 def quiet_and_seeded(seed: int) -> Iterator[None]:
-    """Within, COLMAP logs nothing, and its random numbers start from ``seed``."""
+    """Silence COLMAP's log and seed its random numbers within the context."""
     log = colmap().logging
     before, log.minloglevel = log.minloglevel, _FATAL
     try:
@@ -55,32 +52,38 @@ def quiet_and_seeded(seed: int) -> Iterator[None]:
         log.minloglevel = before
 
 
-def watched(work: Callable[[Any], Any], look: Callable[[], str], tell: Tell) -> Any:
-    """What ``work(token)`` returns, run in a thread and cancelled by Ctrl-C, or where
-    progress cannot be told."""
+def run_cancellable(
+    work: Callable[[Any], Any],
+    status: Callable[[], str],
+    progress: Progress,
+    interval: float = 5.0,
+) -> Any:
+    """Run ``work(token)`` in a thread and return its result.
+
+    ``progress(status())`` is called every ``interval`` seconds. The token is cancelled
+    on Ctrl-C, or if ``progress`` raises.
+    """
     token = colmap().CancellationToken()
     with ThreadPoolExecutor(1) as pool:
         running = pool.submit(work, token)
         try:
             while True:
                 try:
-                    return running.result(timeout=_WAIT)
+                    return running.result(timeout=interval)
                 except TimeoutError:
-                    tell(look())
+                    progress(status())
         except BaseException as error:
             token.cancel()
             if isinstance(error, KeyboardInterrupt):
-                tell("stopping when the images that are begun are done")
+                progress("stopping once the images in progress are done")
             raise
 
 
-def rows_of(database: Path, table: str) -> int:
-    """How far a step is that fills a table.
+def count_rows(database: Path, table: str) -> int:
+    """Return the number of rows in a table; 0 if it cannot be read.
 
-    Looked at from another process. COLMAP brings an SQLite of its own, and two of them
-    in one process undo each other's locks as soon as either closes the file (so does
-    whoever opens and closes it): COLMAP then reads what is half written, or dies of
-    SIGBUS.
+    The count runs in another process: COLMAP links its own SQLite, and two copies of
+    SQLite in one process release each other's file locks, which corrupts reads.
     """
     call = [sys.executable, "-I", "-S", "-c", _COUNT_ROWS, database.as_uri(), table]
     try:

@@ -1,6 +1,6 @@
-"""COLMAP's steps, through pycolmap: features, matching, mapping, and what they found.
+"""COLMAP's steps through pycolmap: features, matching and incremental mapping.
 
-Everything that pycolmap does to a database is in this file.
+All access to COLMAP's database is in this file.
 """
 
 import re
@@ -10,26 +10,25 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gsjax.runtime.machine import usable_cores
-from gsjax.sfm.engine import Tell, colmap, rows_of, watched
+from gsjax.sfm.engine import Progress, colmap, count_rows, run_cancellable
 
 MAX_FEATURES = 8192
 _FEW_FEATURES = 100
-_SCANT = "too few to place it, or not consistent"
-_AGAIN, _AGAIN_EACH = 60, 5  # pairs matched again: in all, and of each image
-# To begin with COLMAP wants 30. Half of that still cannot be chance: of random matches
-# one in 4000 lies within the 12 px that count as agreeing.
-_LAST_INLIERS = 15
+_MAX_GUIDED_PAIRS, _MAX_GUIDED_PAIRS_PER_IMAGE = 60, 5
+# COLMAP starts with 30. 15 are still not chance: one in 4000 random matches lies within
+# the 12 px that count as an inlier.
+_MIN_INLIERS_EXTENDED = 15
 
 
-class Shot(NamedTuple):
-    """A photograph as the steps see it: a file, and the camera that took it.
+class ImageRecord(NamedTuple):
+    """An image as COLMAP's database has it.
 
     Attributes:
-      file: name within the folder of photographs, as the database has it; without
-        spaces, which COLMAP's lists of pairs cannot have.
-      width, height: in px.
-      focal: px, from EXIF; None where it is not known.
-      camera: key of the camera: shots of equal keys share their intrinsics.
+      file: name within the folder of photographs; without spaces, which COLMAP's pair
+        lists do not allow.
+      width, height: px.
+      focal: focal length in px from EXIF; None if unknown.
+      camera: key of the camera; images with equal keys share their intrinsics.
     """
 
     file: str
@@ -40,47 +39,46 @@ class Shot(NamedTuple):
 
 
 def exif_camera(path: Path) -> tuple[str, float | None]:
-    """Name of the camera and focal length in px of the stored photograph.
+    """Return the camera name and the focal length in px from EXIF.
 
-    The length is that of a side × (mm / mm of the sensor), the sensor being known from
-    EXIF or from COLMAP's table of cameras. Nothing is invented: None if it is absent
-    or beyond what COLMAP takes for a camera, as what comes of zeros is; "" likewise.
+    The focal length is side × (mm / sensor mm); the sensor size comes from EXIF or from
+    COLMAP's table of cameras. A missing name is ""; a focal length that is missing or
+    outside COLMAP's limits is None.
     """
     bitmap = colmap().Bitmap.read(str(path), False)
     if bitmap is None:
         return "", None
-    # The name ends in the stored size, whose sides change places in a turned photo.
+    # The name ends in the stored size, whose sides are swapped in a rotated photograph.
     name = re.sub(r"-\d+x\d+$", "", bitmap.exif_camera_model() or "")
     focal = bitmap.exif_focal_length() or 0.0
-    least, most = _focal_limits(max(bitmap.width, bitmap.height))
-    return name, focal if least < focal < most else None  # nor if it is no number
+    side, limits = max(bitmap.width, bitmap.height), colmap().IncrementalMapperOptions()
+    least, most = limits.min_focal_length_ratio, limits.max_focal_length_ratio
+    return name, focal if least * side < focal < most * side else None
 
 
-def _focal_limits(side: int) -> tuple[float, float]:
-    """Focal lengths in px between which COLMAP looks, of photographs of that side."""
-    mapper = colmap().IncrementalMapperOptions()
-    return mapper.min_focal_length_ratio * side, mapper.max_focal_length_ratio * side
-
-
-def extract(
-    database: Path, folder: Path, masks: Path | None, shots: Sequence[Shot], tell: Tell
+def extract_features(
+    database: Path,
+    folder: Path,
+    masks: Path | None,
+    records: Sequence[ImageRecord],
+    progress: Progress,
 ) -> None:
-    """SIFT features of all shots on the CPU, and their cameras, into the database.
+    """Write the cameras and SIFT features (CPU) of all images to the database.
 
-    The images are entered one after the other beforehand: threads would number them in
-    the order in which they happen to finish, and nothing could be repeated.
+    Images are registered in order beforehand: COLMAP's threads would number them in the
+    order in which they finish, and results would not repeat.
     """
     pycolmap = colmap()
-    pycolmap.Database.open(database).close()  # makes it
+    pycolmap.Database.open(database).close()  # creates it
     reader = pycolmap.ImageReaderOptions()
-    for key in dict.fromkeys(shot.camera for shot in shots):
-        names = [shot.file for shot in shots if shot.camera == key]
+    for key in dict.fromkeys(record.camera for record in records):
+        names = [record.file for record in records if record.camera == key]
         mode = pycolmap.CameraMode.SINGLE
         pycolmap.import_images(database, folder, mode, names, reader)
-    _set_focal_lengths(database, shots)
+    _set_focal_lengths(database, records)
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
-    options.num_threads = usable_cores()  # COLMAP knows nothing of containers
+    options.num_threads = usable_cores()  # COLMAP ignores container limits
     options.sift.max_num_features = MAX_FEATURES
     if masks is not None:
         reader.mask_path = masks
@@ -89,58 +87,59 @@ def extract(
         pycolmap.extract_features(
             database,
             folder,
-            image_names=[shot.file for shot in shots],
-            camera_mode=pycolmap.CameraMode.PER_IMAGE,  # those already there stay
+            image_names=[record.file for record in records],
+            camera_mode=pycolmap.CameraMode.PER_IMAGE,  # existing cameras are kept
             reader_options=reader,
             extraction_options=options,
             device=pycolmap.Device.cpu,
             cancellation_token=token,
         )
 
-    def look():
-        return f"features {rows_of(database, 'keypoints')}/{len(shots)}"
+    def status():
+        return f"features {count_rows(database, 'keypoints')}/{len(records)}"
 
-    watched(work, look, tell)
+    run_cancellable(work, status, progress)
 
 
-def _set_focal_lengths(database: Path, shots: Sequence[Shot]) -> None:
-    """Give the cameras what EXIF knows; the photographs in the folder have no EXIF."""
-    by_file = {shot.file: shot for shot in shots}
+def _set_focal_lengths(database: Path, records: Sequence[ImageRecord]) -> None:
+    """Store EXIF focal lengths; the working files have no EXIF."""
+    by_file = {record.file: record for record in records}
     with closing(colmap().Database.open(database)) as opened:
         for image in opened.read_all_images():
-            shot = by_file[image.name]
-            if shot.focal is None:
+            record = by_file[image.name]
+            if record.focal is None:
                 continue
             camera = opened.read_camera(image.camera_id)
-            camera.params = [shot.focal, shot.width / 2, shot.height / 2, 0.0]
+            camera.params = [record.focal, record.width / 2, record.height / 2, 0.0]
             camera.has_prior_focal_length = True
             opened.update_camera(camera)
 
 
-def match(database: Path, count: int, matcher: str, seed: int, tell: Tell) -> None:
-    """Match the features of pairs of images, and keep what a motion explains.
+def match_features(
+    database: Path, count: int, matcher: str, seed: int, progress: Progress
+) -> None:
+    """Match features between pairs of images and verify them geometrically.
 
     Args:
-      count: of images.
-      matcher: "exhaustive" for all pairs; "sequential" for neighbours by name: ten on,
-        and then at distances that double.
+      count: number of images.
+      matcher: "exhaustive" for all pairs, or "sequential" for each image's ten
+        successors by name and those at distances that double.
     """
     pycolmap = colmap()
-    every = matcher == "exhaustive"
+    exhaustive = matcher == "exhaustive"
 
     def work(token):
-        step = pycolmap.match_exhaustive if every else pycolmap.match_sequential
-        step(database, **_matching(seed), cancellation_token=token)
+        step = pycolmap.match_exhaustive if exhaustive else pycolmap.match_sequential
+        step(database, **_matching_options(seed), cancellation_token=token)
 
-    def look():
-        wanted = f"/{count * (count - 1) // 2}" if every else ""
-        return f"matching pairs {rows_of(database, 'two_view_geometries')}{wanted}"
+    def status():
+        total = f"/{count * (count - 1) // 2}" if exhaustive else ""
+        return f"matching pairs {count_rows(database, 'two_view_geometries')}{total}"
 
-    watched(work, look, tell)
+    run_cancellable(work, status, progress)
 
 
-def _matching(seed: int, guided: bool = False) -> dict[str, Any]:
-    """Arguments of every matching step."""
+def _matching_options(seed: int, guided: bool = False) -> dict[str, Any]:
     pycolmap = colmap()
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
@@ -155,40 +154,39 @@ def _matching(seed: int, guided: bool = False) -> dict[str, Any]:
     }
 
 
-def reconstruct(
+def map_incrementally(
     database: Path,
     folder: Path,
     models: Path,
     seed: int,
-    tell: Tell,
+    progress: Progress,
     *,
     start: Path | None = None,
 ) -> list[Any]:
-    """Incremental mapping; the reconstructions, that of most images first.
+    """Return the reconstructions of incremental mapping, most images first.
 
     Args:
-      models: folder for what COLMAP writes.
-      start: folder of a model to be extended, by images of fewer inliers than one is
-        begun with; or None.
+      models: folder for COLMAP's output; created.
+      start: folder of a model to extend, with a lower minimum of inliers; or None.
     """
     pycolmap = colmap()
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
-    # Sums of several threads depend on who comes first: the last digits would vary.
+    # With several threads the order of summation, and so the last digits, would vary.
     options.num_threads = 1
     options.mapper.random_seed = seed
     options.triangulation.random_seed = seed
     if start is not None:
-        options.mapper.abs_pose_min_num_inliers = _LAST_INLIERS
-    placed = 0
+        options.mapper.abs_pose_min_num_inliers = _MIN_INLIERS_EXTENDED
+    registered = 0
 
-    def first():
-        nonlocal placed
-        placed = 2
+    def initial_pair():
+        nonlocal registered
+        registered = 2
 
-    def more():
-        nonlocal placed
-        placed += 1
+    def next_image():
+        nonlocal registered
+        registered += 1
 
     def work(token):
         return pycolmap.incremental_mapping(
@@ -197,55 +195,58 @@ def reconstruct(
             models,
             options=options,
             input_path="" if start is None else start,
-            initial_image_pair_callback=first,
-            next_image_callback=more,
+            initial_image_pair_callback=initial_pair,
+            next_image_callback=next_image,
             cancellation_token=token,
         )
 
     models.mkdir()
-    found = watched(work, lambda: f"mapping: {placed} images placed", tell)
+    found = run_cancellable(
+        work, lambda: f"mapping: {registered} images registered", progress
+    )
     for model in found.values():
-        _leave_out_impossible(model, options.mapper)
-    possible = [model for model in found.values() if model.num_reg_images() > 1]
-    return sorted(possible, key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+        deregister_implausible(model, options.mapper)
+    usable = [model for model in found.values() if model.num_reg_images() > 1]
+    return sorted(usable, key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
 
 
-def _leave_out_impossible(model: Any, limits: Any) -> None:
-    """Images that see no point, or by a camera that there can't be, are not placed.
+def deregister_implausible(model: Any, limits: Any) -> None:
+    """Remove images without points or with implausible intrinsics from a model.
 
-    COLMAP leaves them out before it adjusts for the last time, and not after.
+    COLMAP does so before its last bundle adjustment, but not after.
     """
     for image in list(model.images.values()):
-        impossible = image.camera.has_bogus_params(
+        implausible = image.camera.has_bogus_params(
             limits.min_focal_length_ratio,
             limits.max_focal_length_ratio,
             limits.max_extra_param,
         )
-        if impossible or not image.num_points3D:
+        if implausible or not image.num_points3D:
             model.deregister_frame(image.frame_id)
-    model.tear_down()  # else they are there still, without a pose
+    model.tear_down()  # otherwise they stay in the model, without a pose
 
 
-def match_again(database: Path, files: set[str], listing: Path, seed: int, tell: Tell):
-    """Guided matching of the best pairs of images that could not be placed.
+def rematch_guided(
+    database: Path, files: set[str], pair_list: Path, seed: int, progress: Progress
+) -> int:
+    """Match the best pairs of unregistered images again, guided by their geometry.
 
-    The motion found by the first matching tells where to look for more: it gives up
-    to ten times the matches, at about five times the cost, and so is for few pairs.
+    Guided matching finds up to ten times the matches at about five times the cost.
 
     Args:
-      files: the images.
-      listing: a file to write, of the pairs.
+      files: the unregistered images.
+      pair_list: file to write the pairs to.
 
     Returns:
-      How many pairs there were.
+      The number of pairs.
     """
     pycolmap = colmap()
     with closing(pycolmap.Database.open(database)) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
-        pairs, left = [], dict.fromkeys(files, _AGAIN_EACH)
-        for _count, ends in sorted(_verified(opened), reverse=True):
+        pairs, left = [], dict.fromkeys(files, _MAX_GUIDED_PAIRS_PER_IMAGE)
+        for _count, ends in sorted(_verified_pairs(opened), reverse=True):
             ours = [names[end] for end in ends if left.get(names[end], 0)]
-            if not ours or len(pairs) == _AGAIN:
+            if not ours or len(pairs) == _MAX_GUIDED_PAIRS:
                 continue
             for name in ours:
                 left[name] -= 1
@@ -254,37 +255,39 @@ def match_again(database: Path, files: set[str], listing: Path, seed: int, tell:
             opened.delete_matches(*ends)
     if not pairs:
         return 0
-    listing.write_text("\n".join(pairs))
+    pair_list.write_text("\n".join(pairs))
     options = pycolmap.ImportedPairingOptions()
-    options.match_list_path = listing
+    options.match_list_path = pair_list
 
     def work(token):
         pycolmap.match_image_pairs(
             database,
             pairing_options=options,
-            **_matching(seed, guided=True),
+            **_matching_options(seed, guided=True),
             cancellation_token=token,
         )
 
-    watched(work, lambda: f"matching pairs again: {len(pairs)}", tell)
+    run_cancellable(work, lambda: f"matching pairs again: {len(pairs)}", progress)
     return len(pairs)
 
 
-def _verified(opened: Any) -> list[tuple[int, tuple[int, int]]]:
-    """Matches that a motion explains, and the two images, of every pair with any."""
+def _verified_pairs(opened: Any) -> list[tuple[int, tuple[int, int]]]:
+    """Return (number of inliers, image ids) of every pair with inliers."""
     pairs = zip(*opened.read_two_view_geometry_num_inliers())
     return [(int(n), colmap().pair_id_to_image_pair(pair)) for pair, n in pairs if n]
 
 
-def why_not(database: Path, names: dict[str, str], placed: set[str]) -> dict[str, str]:
-    """Why images were not placed, as far as their features and matches tell.
+def registration_failures(
+    database: Path, names: dict[str, str], registered: set[str]
+) -> dict[str, str]:
+    """Return why images were not registered, judged by their features and matches.
 
     Args:
-      names: what users call each file.
-      placed: the files that were.
+      names: file → name to show to users.
+      registered: the files that were registered.
 
     Returns:
-      A reason for each file of ``names`` that was not.
+      File → reason, for each other file of ``names``.
     """
     with closing(colmap().Database.open(database)) as opened:
         files = {image.image_id: image.name for image in opened.read_all_images()}
@@ -292,33 +295,27 @@ def why_not(database: Path, names: dict[str, str], placed: set[str]) -> dict[str
             name: opened.num_keypoints_for_image(key) for key, name in files.items()
         }
         matches: dict[str, dict[str, int]] = {}
-        for count, ends in _verified(opened):
+        for count, ends in _verified_pairs(opened):
             first, second = (files[end] for end in ends)
             matches.setdefault(first, {})[second] = count
             matches.setdefault(second, {})[first] = count
-    return {
-        file: _reason(features.get(file, 0), matches.get(file, {}), names, placed)
-        for file in names
-        if file not in placed
-    }
+
+    def reason(file: str) -> str:
+        count, matched = features.get(file, 0), matches.get(file, {})
+        if count < _FEW_FEATURES:
+            return f"only {count} features found: blurred, dark or without texture"
+        if not matched:
+            return f"none of its {count} features matches another image consistently"
+        inside = {other: n for other, n in matched.items() if other in registered}
+        best = max(inside or matched, key=matched.__getitem__)
+        why = "too few, or not consistent" if inside else "not registered either"
+        return f"{matched[best]} matches at best, with {names[best]}: {why}"
+
+    return {file: reason(file) for file in names if file not in registered}
 
 
-def _reason(
-    features: int, matches: dict[str, int], names: dict[str, str], placed: set[str]
-) -> str:
-    """Why an image of so many features and matches with others was not placed."""
-    if features < _FEW_FEATURES:
-        return f"only {features} features in it: blurred, dark or without texture"
-    if not matches:
-        return f"none of its {features} features matches another image consistently"
-    inside = {other: n for other, n in matches.items() if other in placed}
-    best = max(inside or matches, key=matches.__getitem__)
-    told = f"{matches[best]} matches at best, with {names[best]}"
-    return f"{told}: {_SCANT if inside else 'not registered either'}"
-
-
-def best_pair(database: Path) -> tuple[int, int]:
-    """The most matches that two images have, and the pairs that have any."""
+def match_summary(database: Path) -> tuple[int, int]:
+    """Return the largest number of inliers of a pair, and the number of such pairs."""
     with closing(colmap().Database.open(database)) as opened:
-        counts = [count for count, _ in _verified(opened)]
+        counts = [count for count, _ in _verified_pairs(opened)]
     return max(counts, default=0), len(counts)

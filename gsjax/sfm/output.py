@@ -1,7 +1,7 @@
-"""A reconstruction as a dataset: undistorted photographs, masks and a COLMAP model.
+"""Write a reconstruction as a dataset: undistorted photographs, masks, COLMAP model.
 
-Photographs and masks go through the same map, one cubic interpolation (masks: nearest
-pixel) from the working files, so that nothing is resampled or compressed twice.
+Photographs and masks are resampled once, from the working files through one map (cubic;
+masks: nearest pixel), and encoded once.
 """
 
 import shutil
@@ -17,15 +17,16 @@ from gsjax.errors import InputError
 from gsjax.io.images import encode_png, opencv
 from gsjax.runtime.files import make_folder, temporary_in, write_file, writing
 from gsjax.sfm.engine import colmap
-from gsjax.sfm.photos import Photograph, Workshop, read_upright
+from gsjax.sfm.photos import PreparedPhoto, WorkFolder, read_upright
 
-ENTRIES = ("images", "masks", "sparse", "sfm.json")  # the last says: made by us
+# The last marks a dataset as written by this module.
+ENTRIES = ("images", "masks", "sparse", "sfm.json")
 JPEG_QUALITY = 95
-_BAND = 256  # rows of a map at a time
+_ROWS_PER_STEP = 256
 
 
-class _Lens(NamedTuple):
-    """From a pinhole's image to the photograph: for each pixel, where to look."""
+class _UndistortionMap(NamedTuple):
+    """A pinhole camera and, for each of its pixels, where the photograph shows it."""
 
     pinhole: Any
     x: np.ndarray
@@ -33,71 +34,79 @@ class _Lens(NamedTuple):
 
 
 def write_dataset(
-    model: Any, photographs: list[Photograph], work: Workshop, dataset: Path
+    model: Any, photos: list[PreparedPhoto], work: WorkFolder, dataset: Path
 ) -> None:
-    """Write ``images/``, ``masks/`` and ``sparse/0/`` of what is registered.
+    """Write ``images/``, ``masks/`` and ``sparse/0/`` of the registered images.
 
     Args:
-      model: pycolmap's reconstruction of the working files; is changed to that of the
-        undistorted ones.
+      model: pycolmap's reconstruction of the working files; changed in place to that of
+        the undistorted images.
       dataset: the folder, which exists.
     """
-    by_file = {photo.shot.file: photo for photo in photographs}
+    by_file = {photo.record.file: photo for photo in photos}
     for folder in ("images", "sparse/0"):
         make_folder(dataset / folder)
     images = sorted(model.images.values(), key=lambda image: image.camera_id)
-    # Camera by camera: the maps of one take as much memory as a few photographs.
+    # Camera by camera: the map of one takes as much memory as a few photographs.
     for key, of_camera in groupby(images, key=lambda image: image.camera_id):
         camera = model.cameras[key]
-        lens = _lens(camera)
+        undistortion = _undistortion_map(camera)
         for image in of_camera:
             photo = by_file[image.name]
-            _write_pixels(photo, lens, work, dataset)
-            _move_points(image, camera, lens)
+            _write_pixels(photo, undistortion, work, dataset)
+            _undistort_features(image, camera, undistortion.pinhole)
             image.name = photo.name
-        camera.model = lens.pinhole.model
-        camera.width, camera.height = lens.pinhole.width, lens.pinhole.height
-        camera.params = lens.pinhole.params
+        pinhole = undistortion.pinhole
+        camera.model = pinhole.model
+        camera.width, camera.height = pinhole.width, pinhole.height
+        camera.params = pinhole.params
     model.write_binary(dataset / "sparse" / "0")
 
 
-def _lens(camera: Any) -> _Lens:
-    """The pinhole that sees no further than the camera did, and the map to it."""
+def _undistortion_map(camera: Any) -> _UndistortionMap:
+    """Return the map to the pinhole whose view lies within that of the camera."""
     pycolmap = colmap()
     options = pycolmap.UndistortCameraOptions()
     options.max_image_size = max(camera.width, camera.height)
     pinhole = pycolmap.undistort_camera(options, camera)
     maps = np.empty((2, pinhole.height, pinhole.width), np.float32)
-    for top in range(0, pinhole.height, _BAND):
-        rows = np.arange(top, min(top + _BAND, pinhole.height))
+    for top in range(0, pinhole.height, _ROWS_PER_STEP):
+        rows = np.arange(top, min(top + _ROWS_PER_STEP, pinhole.height))
         y, x = np.meshgrid(rows + 0.5, np.arange(pinhole.width) + 0.5, indexing="ij")
         rays = pinhole.cam_from_img(np.stack([x.ravel(), y.ravel()], -1))
         seen = camera.img_from_cam(np.concatenate([rays, np.ones((len(rays), 1))], 1))
         maps[:, rows] = (seen - 0.5).T.reshape(2, *x.shape)
-    return _Lens(pinhole, *maps)
+    return _UndistortionMap(pinhole, *maps)
 
 
-def _write_pixels(photo: Photograph, lens: _Lens, work: Workshop, dataset: Path):
+def _write_pixels(
+    photo: PreparedPhoto,
+    undistortion: _UndistortionMap,
+    work: WorkFolder,
+    dataset: Path,
+) -> None:
     cv2 = opencv()
-    border = cv2.BORDER_REPLICATE
-    pixels = _read(work.photos / photo.shot.file)
-    pixels = cv2.remap(pixels, lens.x, lens.y, cv2.INTER_CUBIC, borderMode=border)
-    write_file(dataset / "images" / photo.name, _encoded(pixels, photo.name))
+    maps, border = (undistortion.x, undistortion.y), cv2.BORDER_REPLICATE
+    pixels = _read_working_file(work.photos / photo.record.file)
+    pixels = cv2.remap(pixels, *maps, cv2.INTER_CUBIC, borderMode=border)
+    write_file(dataset / "images" / photo.name, _encode(pixels, photo.name))
     if photo.mask:
         make_folder(dataset / "masks")
-        mask = _read(work.mask(photo.shot.file), grey=True)
-        mask = cv2.remap(mask, lens.x, lens.y, cv2.INTER_NEAREST, borderMode=border)
+        mask = _read_working_file(work.mask(photo.record.file), grey=True)
+        mask = cv2.remap(mask, *maps, cv2.INTER_NEAREST, borderMode=border)
         write_file(dataset / "masks" / f"{photo.name}.png", encode_png(mask))
 
 
-def _read(path: Path, grey: bool = False) -> np.ndarray:
+def _read_working_file(path: Path, grey: bool = False) -> np.ndarray:
     try:
         return read_upright(path, grey)
     except InputError as error:
-        raise InputError(f"{error}; this working file was whole before") from error
+        raise InputError(
+            f"{error}; the working file changed while in use; check the disk"
+        ) from error
 
 
-def _encoded(pixels: np.ndarray, name: str) -> bytes:
+def _encode(pixels: np.ndarray, name: str) -> bytes:
     if name.lower().endswith(".png"):
         return encode_png(pixels[..., ::-1])
     cv2 = opencv()
@@ -107,30 +116,26 @@ def _encoded(pixels: np.ndarray, name: str) -> bytes:
     return data.tobytes()
 
 
-def _move_points(image: Any, camera: Any, lens: _Lens) -> None:
-    """Where the features are in the undistorted image."""
+def _undistort_features(image: Any, camera: Any, pinhole: Any) -> None:
+    """Move the features of an image to their places in the undistorted image."""
     if not image.num_points2D():
         return
     before = np.array([point.xy for point in image.points2D])
     rays = camera.cam_from_img(before)
-    after = lens.pinhole.img_from_cam(
-        np.concatenate([rays, np.ones((len(rays), 1))], 1)
-    )
+    after = pinhole.img_from_cam(np.concatenate([rays, np.ones((len(rays), 1))], 1))
     for point, xy in zip(image.points2D, after):
         point.xy = xy
 
 
-def refuse_output(
-    output: Path, sources: Iterable[Path | None], overwrite: bool
-) -> None:
-    """Check the folder of the dataset before the work that fills it.
+def check_output(output: Path, sources: Iterable[Path | None], overwrite: bool) -> None:
+    """Check the folder of a dataset before the work that fills it.
 
     Raises:
-      InputError: if it is a file, or has entries that would be replaced unasked, or
-        that no dataset of ours put there; or if it would replace one of the sources.
+      InputError: if it is a file, if it would replace a source, if entries exist and
+        ``overwrite`` is not set, or if they were not written by `write_dataset`.
     """
     if output.exists() and not output.is_dir():
-        raise InputError(f"{output}: is a file; a folder is to be written there")
+        raise InputError(f"{output}: expected a folder, got a file; pass another to -o")
     for source in filter(None, sources):
         within = source.resolve()
         if any(within.is_relative_to((output / e).resolve()) for e in ENTRIES):
@@ -151,9 +156,10 @@ def refuse_output(
 
 
 @contextmanager
-def staging(output: Path) -> Iterator[Path]:
-    """A folder from which all can be moved to ``output``, gone at the end whatever
-    happens: within it, as it may be a disk of its own; beside it, if it is not there.
+def staging_folder(output: Path) -> Iterator[Path]:
+    """Yield a temporary folder on the disk of ``output``, removed on exit.
+
+    It lies in ``output`` if that exists, else beside it: files are moved, not copied.
     """
     base = output if output.is_dir() else output.parent
     make_folder(base)
@@ -165,11 +171,11 @@ def staging(output: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def install(dataset: Path, output: Path, stage: Path) -> None:
-    """Move a finished dataset into place; other files in ``output`` stay.
+def install_dataset(dataset: Path, output: Path, stage: Path) -> None:
+    """Move a finished dataset into place; other files in ``output`` are kept.
 
-    What is replaced goes to ``stage`` first. sfm.json leaves first and comes last:
-    while it is there, the dataset is whole.
+    Replaced entries move to ``stage``. sfm.json is moved away first and put in place
+    last, so its presence means that the dataset is complete.
 
     Raises:
       InputError: if files cannot be moved.

@@ -1,8 +1,7 @@
-"""Photographs and masks as structure from motion wants them: upright, and not large.
+"""Prepare photographs and masks for structure from motion: upright and scaled down.
 
-They are decoded by OpenCV, which turns them as EXIF says, scaled down, and written as
-PNG without EXIF: whatever reads those files sees the same pixels the same way up.
-Where a photograph is transparent is in its mask.
+OpenCV decodes them and applies the EXIF orientation; they are written as PNG without
+EXIF, so every reader sees the same pixels. Transparent parts go into the mask.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,111 +11,118 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsjax.data.decode import decode, libraries_heard, telling_of_damage
+from gsjax.data.decode import captured_stderr, decode, warn_of_damage
 from gsjax.data.image_files import (
-    by_suffix_of_either_case,
+    SUFFIXES,
     check_name,
+    files_by_lowered_suffix,
     find_mask,
     natural_order,
 )
 from gsjax.errors import InputError
-from gsjax.io.images import encode_png, opencv
+from gsjax.io.images import encode_png, opencv, shrink
 from gsjax.runtime.files import opened, write_file
-from gsjax.sfm.mapping import Shot, exif_camera
+from gsjax.sfm.mapping import ImageRecord, exif_camera
 
-READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-_KEPT = (".jpg", ".jpeg", ".png")  # formats in which the dataset is written
-_UNREAD = (
+_KEPT = (".jpg", ".jpeg", ".png")  # formats that the dataset keeps
+_UNSUPPORTED = (
     *(".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"),
     *(".orf", ".rw2", ".pef", ".srw", ".nrw", ".gif", ".jxl", ".jp2", ".psd"),
     *(".jfif", ".jpe", ".mpo", ".ppm"),
 )
-_JPEG = b"\xff\xd8"  # how such files, which have no alpha, begin
-_REACH = 2  # px, of the cubic interpolation that undoes the lens
+_JPEG = b"\xff\xd8"  # first bytes of a JPEG, which has no alpha
+_CUBIC_REACH = 2  # px, of the interpolation that undistorts
 
 
-class Photograph(NamedTuple):
+class PreparedPhoto(NamedTuple):
     """A photograph in the working folder.
 
     Attributes:
-      name: what the dataset calls it; the working file has a number for a name.
-      shot: what COLMAP is told of it.
-      mask: whether it came with one, or is transparent somewhere.
+      name: name in the dataset; the working file is named by number.
+      record: the image as COLMAP sees it.
+      mask: whether it has a mask, drawn or from transparency.
     """
 
     name: str
-    shot: Shot
+    record: ImageRecord
     mask: bool = False
 
 
-class Workshop(NamedTuple):
-    """The working folder: ``photos/`` and, if there are any, ``masks/``."""
+class WorkFolder(NamedTuple):
+    """The working folder: ``photos/``, ``masks/`` and COLMAP's files."""
 
     folder: Path
 
     @property
     def photos(self) -> Path:
+        """Folder of the photographs."""
         return self.folder / "photos"
 
     @property
     def masks(self) -> Path:
+        """Folder of the masks."""
         return self.folder / "masks"
 
+    @property
+    def database(self) -> Path:
+        """COLMAP's database."""
+        return (self.folder / "database.db").resolve()
+
     def mask(self, file: str) -> Path:
-        return self.masks / f"{file}.png"  # COLMAP's rule: a second suffix
+        """Return the mask of a working file; COLMAP expects a second suffix."""
+        return self.masks / f"{file}.png"
 
     def add(
         self, number: int, name: str, pixels: np.ndarray, focal: float | None, key: str
-    ) -> Photograph:
-        """Write a photograph [H, W, 3] BGR, whose focal length is in its own px."""
+    ) -> PreparedPhoto:
+        """Write a photograph [H, W, 3] BGR; ``focal`` is in its pixels."""
         file = f"{number:06d}.png"
         write_file(self.photos / file, encode_png(pixels[..., ::-1]))
         height, width = pixels.shape[:2]
-        return Photograph(name, Shot(file, width, height, focal, key))
+        return PreparedPhoto(name, ImageRecord(file, width, height, focal, key))
 
 
 def find_photos(folder: Path) -> list[Path]:
-    """The photographs in a folder (not in folders within), by name: 2 before 10.
+    """Return the photographs directly in a folder, in natural order (2 before 10).
 
     Raises:
-      InputError: if there are fewer than two, or any that cannot be read.
+      InputError: if there are fewer than two, if a format is not supported, or if two
+        would have the same name in the dataset.
     """
     files = [p for p in folder.iterdir() if p.is_file() and p.name[0] != "."]
     files.sort(key=lambda path: natural_order(path.name))
-    unread = [p for p in files if p.suffix.lower() in _UNREAD]
-    if unread:
+    unsupported = [p for p in files if p.suffix.lower() in _UNSUPPORTED]
+    if unsupported:
         raise InputError(
-            f"{_some(unread)}: {unread[0].suffix} photos are not read here; convert "
-            "them to JPEG (keeping EXIF), or move them away"
+            f"{_some(unsupported)}: {unsupported[0].suffix} is not supported; convert "
+            "the photos to JPEG (keeping EXIF), or move them away"
         )
-    found = [p for p in files if p.suffix.lower() in READ]
+    found = [p for p in files if p.suffix.lower() in SUFFIXES]
     if len(found) < 2:
+        below = [
+            p for p in folder.rglob("*") if p.parent != folder and p.name[0] != "."
+        ]
+        deeper = sum(path.suffix.lower() in SUFFIXES for path in below)
+        hint = f"; {deeper} photos lie in subfolders: move them up" if deeper else ""
         raise InputError(
-            f"{folder}: {len(found)} photo{'s' * (len(found) != 1)} "
-            f"({', '.join(READ)}) in it; at least two are wanted, rather twenty (a "
-            "video is given by its own name)" + _told_of_subfolders(folder)
+            f"{folder}: expected at least 2 photos ({', '.join(SUFFIXES)}), got "
+            f"{len(found)}; add photos (20 or more are better), or pass the file of a "
+            f"video{hint}"
         )
     names = [dataset_name(path) for path in found]
-    double = [p for p, name in zip(found, names) if names.count(name) > 1]
-    if double:
+    duplicates = [p for p, name in zip(found, names) if names.count(name) > 1]
+    if duplicates:
         raise InputError(
-            f"{_some(double)}: would have the same name in the dataset; rename one"
+            f"{_some(duplicates)}: would have the same name in the dataset; rename one"
         )
     return found
 
 
-def _told_of_subfolders(folder: Path) -> str:
-    below = [p for p in folder.rglob("*") if p.parent != folder and p.name[0] != "."]
-    count = sum(path.suffix.lower() in READ for path in below)
-    told = f"; subfolders are not searched, {count} photos lie there: move them up"
-    return told if count else ""
-
-
 def dataset_name(path: Path) -> str:
-    """What a photograph is called in the dataset: as it was, if JPEG or PNG.
+    """Return the name of a photograph in the dataset; other formats become .png.
 
     Raises:
-      InputError: if that is not UTF-8.
+      InputError: if the name is not UTF-8.
     """
     kept = path.suffix.lower() in _KEPT
     check_name(path)
@@ -124,32 +130,35 @@ def dataset_name(path: Path) -> str:
 
 
 def read_upright(path: Path, grey: bool = False) -> np.ndarray:
-    """[H, W, 3] BGR uint8, turned as EXIF says; or [H, W] grey, of as many bits as it
-    has: of 16, the darkest that is not black would be black in 8.
+    """Decode an image and apply its EXIF orientation.
+
+    Returns:
+      [H, W, 3] BGR uint8; with ``grey`` [H, W] in the file's bit depth, since 16-bit
+      values below 256 would become 0 in 8 bits.
 
     Raises:
-      InputError: if the file is no image, truncated, damaged, or declares more pixels
-        than any camera makes, which is found before they are taken.
+      InputError: if the file is no image, is truncated or corrupt, or declares more
+        pixels than a camera makes; the latter before any allocation.
     """
     cv2 = opencv()
-    with telling_of_damage([path]):
+    with warn_of_damage([path]):
         deep_grey = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
         return decode(path, deep_grey if grey else cv2.IMREAD_COLOR)
 
 
 def _read_photo(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """What `read_upright` reads, and where that is less than half opaque.
+    """Return a photograph and where it is less than half opaque, both upright.
 
     Returns:
-      [H, W, 3] BGR uint8, and [H, W] bool, or None if that is nowhere.
+      [H, W, 3] BGR uint8; [H, W] bool, or None if all of it is opaque.
     """
     upright = read_upright(path)
     with opened(path, "a photograph") as file:
         if file.read(2) == _JPEG:
             return upright, None
     cv2 = opencv()
-    with libraries_heard():  # all of which has been told
-        stored = decode(path, cv2.IMREAD_UNCHANGED)  # the only way to alpha
+    with captured_stderr():  # damage has been reported by `read_upright`
+        stored = decode(path, cv2.IMREAD_UNCHANGED)  # the only mode with alpha
         if stored.ndim < 3 or stored.shape[2] not in (2, 4):
             return upright, None
         alpha = stored[..., -1]
@@ -158,34 +167,34 @@ def _read_photo(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         if not hidden.any():
             return upright, None
         colors = decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    # How OpenCV turned the colours depends on format and version, and it does not say.
-    both = zip(_turned(colors), _turned(hidden))
+    # How OpenCV orients depends on format and version, so compare the pixels.
+    both = zip(_orientations(colors), _orientations(hidden))
     return upright, next(h for c, h in both if np.array_equal(c, upright))
 
 
-def _turned(pixels: np.ndarray) -> Iterator[np.ndarray]:
-    """In the eight ways of EXIF, as it is first."""
-    for picture in (pixels, pixels[:, ::-1]):
+def _orientations(pixels: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield an image in the eight EXIF orientations, as stored first."""
+    for image in (pixels, pixels[:, ::-1]):
         for quarters in range(4):
-            yield np.rot90(picture, quarters)
+            yield np.rot90(image, quarters)
 
 
 def prepare_photos(
-    paths: Sequence[Path], masks: Path | None, work: Workshop, max_size: int
-) -> list[Photograph]:
-    """Write the photographs, and their masks, into the working folder.
+    paths: Sequence[Path], masks: Path | None, work: WorkFolder, max_size: int
+) -> list[PreparedPhoto]:
+    """Write photographs and masks into the working folder.
 
-    Left out is what a mask says and what is less than half opaque. Once any has a mask,
-    there is one of each photograph, as COLMAP wants it.
+    A pixel is excluded where the mask is black or the photograph is less than half
+    opaque. If one photograph has a mask, one is written for each, as COLMAP expects.
 
     Args:
       masks: folder of masks, or None.
-      max_size: the longer side in px is at most this; 0 for any size.
+      max_size: upper limit of the longer side in px; 0 for none.
 
     Raises:
-      InputError: naming all that are unreadable, or a mask that does not fit.
+      InputError: if photographs cannot be read (all are named) or a mask does not fit.
     """
-    pairs = {} if masks is None else find_masks(masks, paths)
+    drawn = {} if masks is None else find_masks(masks, paths)
     made, bad = [], []
     for number, path in enumerate(paths):
         try:
@@ -200,101 +209,86 @@ def prepare_photos(
             focal *= max(small.shape) / max(height, width)
         key = f"{camera} {width}x{height} {focal}"
         photo = work.add(number, dataset_name(path), small, focal, key)
-        mask = _mask(pairs.get(path), hidden, path, small.shape[:2], (height, width))
+        mask = None
+        if path in drawn:
+            mask = _read_mask(drawn[path], path.name, small.shape[:2], (height, width))
+        if hidden is not None:
+            clear = _opaque_mask(hidden, small.shape[:2])
+            mask = clear if mask is None else np.minimum(clear, mask)
         if mask is not None:
-            write_file(work.mask(photo.shot.file), encode_png(mask))
+            write_file(work.mask(photo.record.file), encode_png(mask))
         made.append(photo._replace(mask=mask is not None))
     if bad:
         raise InputError(
-            f"{len(bad)} of {len(paths)} photos cannot be read; mend or remove: "
+            f"{len(bad)} of {len(paths)} photos cannot be read; repair or remove them: "
             + "; ".join([*bad[:5], *["…"] * (len(bad) > 5)])
         )
-    whole = [photo.shot for photo in made if not photo.mask]
-    for shot in whole if len(whole) < len(made) else ():
-        mask = np.full((shot.height, shot.width), 255, np.uint8)
-        write_file(work.mask(shot.file), encode_png(mask))
+    whole = [photo.record for photo in made if not photo.mask]
+    for record in whole if len(whole) < len(made) else ():
+        mask = np.full((record.height, record.width), 255, np.uint8)
+        write_file(work.mask(record.file), encode_png(mask))
     return made
 
 
-def shrink(pixels: np.ndarray, max_size: int) -> np.ndarray:
-    """The image with its longer side at most ``max_size`` (0: as it is)."""
-    height, width = pixels.shape[:2]
-    scale = max_size / max(height, width) if max_size else 1.0
-    if scale >= 1:
-        return pixels
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    cv2 = opencv()
-    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-
-
 def find_masks(folder: Path, photos: Sequence[Path]) -> dict[Path, Path]:
-    """The mask of each photograph that has one, named as `find_mask` knows them.
+    """Return the mask of each photograph that has one, named as `find_mask` expects.
 
     Raises:
-      InputError: if the folder is missing or has no mask for any.
+      InputError: if the folder does not exist or holds no mask for any photograph.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder of masks")
-    found, listing = {}, cache(by_suffix_of_either_case)
+        raise InputError(f"{folder}: no such folder of masks; check --masks")
+    found, listing = {}, cache(files_by_lowered_suffix)
     for photo in photos:
         mask = find_mask(folder, photo.name, listing)
         if mask is not None and not mask.samefile(photo):
             found[photo] = mask
     if not found:
         raise InputError(
-            f"{folder}: no mask for any photo; for {photos[0].name} one would be "
+            f"{folder}: no mask for any photo; name the mask of {photos[0].name} "
             f"{photos[0].stem}.png or {photos[0].name}.png"
         )
     return found
 
 
-def _mask(
-    path: Path | None,
-    hidden: np.ndarray | None,
-    photo: Path,
-    size: tuple[int, ...],
-    full: tuple[int, int],
-) -> np.ndarray | None:
-    """[h, w] of 0, to be left out, and 255; None where there is nothing to say so.
+def _opaque_mask(hidden: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """Return a mask [h, w], 0 wherever a resampled pixel mixes with hidden ones.
 
     Args:
-      path: a drawn mask, or None.
-      hidden: [H, W] bool, where the photograph is transparent; or None.
-      photo: the photograph, for messages.
+      hidden: [H, W] bool, where the photograph is transparent.
       size: h, w of the result.
-      full: H, W of the photograph.
     """
-    drawn = None if path is None else _drawn(path, photo, size, full)
-    if hidden is None:
-        return drawn
     cv2 = opencv()
-    # Colours that are not seen count as none, so neither do pixels that they mix into.
     share = cv2.resize(
         hidden.astype(np.float32), size[::-1], interpolation=cv2.INTER_AREA
     )
     clear = np.where(share > 0, 0, 255).astype(np.uint8)
-    clear = cv2.erode(clear, np.ones((2 * _REACH + 1,) * 2, np.uint8))
-    return clear if drawn is None else np.minimum(clear, drawn)
+    return cv2.erode(clear, np.ones((2 * _CUBIC_REACH + 1,) * 2, np.uint8))
 
 
-def _drawn(
-    path: Path, photo: Path, size: tuple[int, ...], full: tuple[int, int]
+def _read_mask(
+    path: Path, photo: str, size: tuple[int, ...], full: tuple[int, int]
 ) -> np.ndarray:
-    """[h, w] of 0, to be left out, and 255: whatever is not black in the file."""
+    """Return a drawn mask [h, w]: 0 where the file is black, else 255.
+
+    Args:
+      photo: name of the photograph, for messages.
+      size: h, w of the result.
+      full: H, W of the photograph.
+    """
     mask = read_upright(path, grey=True)
     if mask.shape != full and mask.shape != size:
         raise InputError(
-            f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]}, {photo.name} seen "
-            f"upright is {full[1]}x{full[0]}; draw it in that size"
+            f"{path}: expected {full[1]}x{full[0]} px, the upright size of {photo}, "
+            f"got {mask.shape[1]}x{mask.shape[0]}; draw the mask in that size"
         )
     cv2 = opencv()
-    wanted = (size[1], size[0])
-    mask = cv2.resize(mask, wanted, interpolation=cv2.INTER_NEAREST)
+    mask = cv2.resize(mask, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
     return np.where(mask > 0, 255, 0).astype(np.uint8)
 
 
 def _some(paths: Sequence[Path]) -> str:
-    """The first, and the names of some others."""
+    """Return the first path and the names of up to five others."""
     others = [path.name for path in paths[1:6]]
     dots = ["…"] if len(paths) > 6 else []
     return ", ".join([str(paths[0]), *others, *dots])

@@ -1,6 +1,6 @@
 """Structure from motion: from photographs or a video to a dataset with cameras.
 
-SIFT features, matching, incremental mapping by COLMAP (Schönberger and Frahm,
+SIFT features, matching and incremental mapping by COLMAP (Schönberger and Frahm,
 "Structure-from-Motion Revisited", CVPR 2016) through pycolmap, then undistortion.
 """
 
@@ -9,50 +9,47 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from gsjax.data.video import sharpest_frames
 from gsjax.errors import InputError, SfmError
 from gsjax.runtime.files import write_json
-from gsjax.sfm.engine import Tell, colmap, quiet_and_seeded
+from gsjax.sfm.engine import Progress, colmap, quiet_and_seeded
 from gsjax.sfm.mapping import (
-    Shot,
-    best_pair,
-    extract,
-    match,
-    match_again,
-    reconstruct,
-    why_not,
+    extract_features,
+    map_incrementally,
+    match_features,
+    match_summary,
+    registration_failures,
+    rematch_guided,
 )
-from gsjax.sfm.output import install, refuse_output, staging, write_dataset
-from gsjax.sfm.photos import (
-    Photograph,
-    Workshop,
-    find_photos,
-    prepare_photos,
+from gsjax.sfm.output import (
+    check_output,
+    install_dataset,
+    staging_folder,
+    write_dataset,
 )
+from gsjax.sfm.photos import PreparedPhoto, WorkFolder, find_photos, prepare_photos
 
-EXHAUSTIVE_UP_TO = 60  # photos: 1770 pairs, minutes on two cores
+EXHAUSTIVE_UP_TO = 60  # photos
 
 
 @dataclass(frozen=True)
 class SfmSettings:
-    """How cameras are looked for.
+    """Settings of structure from motion.
 
     Attributes:
       matcher: which pairs are matched: "exhaustive" for all; "sequential" for
-        neighbours in order of the names; "auto" for the former with at most 60 photos,
-        the latter with more and with video.
+        neighbours in order of the names; "auto" for "exhaustive" with at most 60
+        photos, else "sequential" (also for video).
       camera: which photos share their intrinsics: "single" for all; "per-image" for
-        none; "auto" for those that have the same size and the same camera and focal
-        length in EXIF.
-      max_size: px of the longer side; larger photos are scaled down to it, for the
-        features and for the dataset. 0 leaves them as they are.
-      frames: how many are taken from a video.
-      masks: folder of masks for the photos; nothing is looked for where they are
-        black, nor where the photos are less than half opaque. IMG.png, IMG.jpg or
-        IMG.jpg.png for IMG.jpg.
-      seed: of COLMAP's random numbers.
+        none; "auto" for those of equal size, camera and focal length (EXIF).
+      max_size: longer side in px that photos are scaled down to, for the features and
+        in the dataset; 0 for no limit.
+      frames: number of frames to take from a video.
+      masks: folder of masks; black pixels, and those where a photo is less than half
+        opaque, are excluded. The mask of IMG.jpg is IMG.png, IMG.jpg or IMG.jpg.png.
+      seed: seed of COLMAP's random numbers.
     """
 
     matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
@@ -65,19 +62,19 @@ class SfmSettings:
 
 @dataclass(frozen=True)
 class SfmReport:
-    """What came of it; also in the dataset as sfm.json.
+    """Outcome of structure from motion; stored in the dataset as sfm.json.
 
     Attributes:
       source, output: the photos or the video, and the dataset.
-      registered: points seen in each image that has a camera, by its name.
-      unregistered: why each of the others has none.
-      points: how many there are in space.
+      registered: image name → number of points seen in it, for images with a camera.
+      unregistered: image name → reason, for all others.
+      points: number of points in space.
       mean_reprojection_error: px.
-      mean_track_length: in how many images a point is seen on average.
-      cameras: how many different intrinsics.
-      other_models: images in each of the smaller models that were left out.
-      seconds: each phase's.
-      settings: what was asked for, with "auto" resolved in ``matcher``.
+      mean_track_length: mean number of images that see a point.
+      cameras: number of different intrinsics.
+      other_models: number of images in each smaller model, which is not written.
+      seconds: duration of each phase.
+      settings: the settings, with "auto" resolved in ``matcher``.
     """
 
     source: str
@@ -94,14 +91,29 @@ class SfmReport:
 
     @property
     def problem(self) -> str | None:
-        """What is wrong if fewer than half of the images are registered."""
+        """A message if fewer than half of the images are registered, else None."""
         good, bad = len(self.registered), len(self.unregistered)
         if good >= bad:
             return None
         return (
             f"only {good} of {good + bad} images could be registered (they are in "
-            f"{self.output}); {_remedy(self.settings['matcher'])}"
+            f"{self.output}); {_advice(self.settings['matcher'])}"
         )
+
+
+class _Job(NamedTuple):
+    """Values that every step of a reconstruction takes."""
+
+    work: WorkFolder
+    seed: int
+    progress: Progress
+    seconds: dict[str, float]
+
+    @contextmanager
+    def timed(self, phase: str) -> Iterator[None]:
+        start = time.monotonic()
+        yield
+        self.seconds[phase] = round(time.monotonic() - start, 2)
 
 
 def run_sfm(
@@ -110,237 +122,208 @@ def run_sfm(
     settings: SfmSettings | None = None,
     *,
     overwrite: bool = False,
-    tell: Tell | None = None,
+    progress: Progress | None = None,
 ) -> SfmReport:
-    """Find the cameras of photographs and write a dataset that can be trained on.
+    """Find the cameras of photographs and write a dataset to train on.
 
-    ``output`` gets ``images/`` (upright and undistorted), ``masks/`` of photographs
-    that have one or are transparent somewhere, ``sparse/0/`` (COLMAP's binary model,
-    PINHOLE cameras) and ``sfm.json``. It appears when all is done, or not at all; other
-    files in it are left alone.
+    ``output`` gets ``images/`` (upright, undistorted), ``masks/`` (for photographs that
+    have one or are partly transparent), ``sparse/0/`` (COLMAP's binary model with
+    PINHOLE cameras) and ``sfm.json``. They appear at the end, all or none; other files
+    in the folder are kept.
 
     Args:
       source: a folder of photographs, or a video.
       output: folder of the dataset.
       settings: default `SfmSettings()`.
-      overwrite: replace a dataset that this function wrote earlier.
-      tell: is called with lines of progress.
+      overwrite: whether to replace a dataset that this function wrote.
+      progress: called with lines of progress.
 
     Returns:
-      The report. Where ``report.problem`` is not None, fewer than half of the images
-      are registered.
+      The report; ``report.problem`` is not None if fewer than half of the images are
+      registered.
 
     Raises:
-      InputError: if something is wrong with the files.
-      SfmError: if there is no model at all.
-      MissingExtraError: without pycolmap or OpenCV.
+      InputError: if a file or a setting is not valid.
+      SfmError: if no model was found.
+      MissingExtraError: if pycolmap or OpenCV is absent.
     """
     settings = SfmSettings() if settings is None else settings
-    tell = (lambda _: None) if tell is None else tell
+    progress = (lambda _: None) if progress is None else progress
     colmap()
     _check(source, settings)
-    refuse_output(output, (source, settings.masks), overwrite)
-    seconds: dict[str, float] = {}
-    with staging(output) as stage, quiet_and_seeded(settings.seed):
-        work = Workshop(stage)
-        with _timed("photos", seconds):
-            photographs = _collect(source, settings, work, tell)
-        matcher = _matcher(settings, source, len(photographs))
-        models = _solve(photographs, matcher, settings, work, seconds, tell)
-        report = _report(
-            source, output, models, photographs, work, asdict(settings), seconds
+    check_output(output, (source, settings.masks), overwrite)
+    with staging_folder(output) as stage, quiet_and_seeded(settings.seed):
+        job = _Job(WorkFolder(stage), settings.seed, progress, {})
+        with job.timed("photos"):
+            photos = _collect(source, settings, job)
+        matcher = settings.matcher
+        if matcher == "auto":
+            few = source.is_dir() and len(photos) <= EXHAUSTIVE_UP_TO
+            matcher = "exhaustive" if few else "sequential"
+        models = _solve(photos, matcher, job)
+        masks = None if settings.masks is None else str(settings.masks)
+        resolved = {**asdict(settings), "matcher": matcher, "masks": masks}
+        report = SfmReport(
+            source=str(source),
+            output=str(output),
+            settings=resolved,
+            seconds=job.seconds,
+            **_statistics(models, photos, job.work),
         )
-        report.settings["matcher"] = matcher
         dataset = stage / "dataset"
         dataset.mkdir()
-        with _timed("undistortion", seconds):
-            tell(f"undistorting {len(report.registered)} images")
-            write_dataset(models[0], photographs, work, dataset)
-        write_json(dataset / "sfm.json", _facts(report), indent=2)
-        install(dataset, output, stage)
+        with job.timed("undistortion"):
+            progress(f"undistorting {len(report.registered)} images")
+            write_dataset(models[0], photos, job.work, dataset)
+        facts = {**asdict(report), "pycolmap": colmap().__version__}
+        write_json(dataset / "sfm.json", facts, indent=2)
+        install_dataset(dataset, output, stage)
     return report
 
 
 def _check(source: Path, settings: SfmSettings) -> None:
     if not source.exists():
-        raise InputError(f"{source}: no such folder of photos, nor a video")
+        raise InputError(f"{source}: no such folder of photos or video; check the path")
     if settings.max_size and settings.max_size < 64:
-        raise InputError(f"max_size {settings.max_size}: at least 64, or 0, is wanted")
+        raise InputError(
+            f"max_size: expected 0 or at least 64 px, got {settings.max_size}"
+        )
     if settings.frames < 2:
-        raise InputError(f"frames {settings.frames}: at least 2 are wanted")
+        raise InputError(f"frames: expected at least 2, got {settings.frames}")
     if settings.masks is not None and not source.is_dir():
-        raise InputError(f"{source}: masks go with a folder of photos, not a video")
+        raise InputError(
+            f"{source}: masks need a folder of photos, got a video; omit the masks"
+        )
 
 
-def _collect(
-    source: Path, settings: SfmSettings, work: Workshop, tell: Tell
-) -> list[Photograph]:
-    """The working files of the photographs, or of the frames of a video."""
-    work.photos.mkdir()
-    work.masks.mkdir()
+def _collect(source: Path, settings: SfmSettings, job: _Job) -> list[PreparedPhoto]:
+    """Write the working files of the photographs, or of the frames of a video."""
+    job.work.photos.mkdir()
+    job.work.masks.mkdir()
     size = settings.max_size
     if source.is_dir():
         paths = find_photos(source)
-        tell(f"reading {len(paths)} photos")
-        found = prepare_photos(paths, settings.masks, work, size)
+        job.progress(f"reading {len(paths)} photos")
+        found = prepare_photos(paths, settings.masks, job.work, size)
         masked = sum(photo.mask for photo in found)
         if masked or settings.masks is not None:
-            told = "have a mask or are transparent in part"
-            tell(f"{masked} of {len(found)} photos {told}")
+            job.progress(
+                f"{masked} of {len(found)} photos have a mask or are partly transparent"
+            )
     else:
-        frames = sharpest_frames(source, settings.frames, size)  # refuses what is none
-        tell(f"choosing the sharpest {settings.frames} frames")
+        frames = sharpest_frames(source, settings.frames, size)  # rejects other files
+        job.progress(f"choosing the sharpest {settings.frames} frames")
         found = []
         for number, pixels in frames:
             name = f"frame_{number:06d}.jpg"
-            found.append(work.add(number, name, pixels, None, "video"))
+            found.append(job.work.add(number, name, pixels, None, "video"))
         if len(found) < 2:
-            raise InputError(f"{source}: only {len(found)} frames of it can be read")
+            raise InputError(
+                f"{source}: only {len(found)} frames can be read, expected at least 2; "
+                "export the video again"
+            )
     return _with_cameras(found, settings.camera)
 
 
-def _with_cameras(photographs: list[Photograph], choice: str) -> list[Photograph]:
-    """The photographs, sharing cameras as chosen.
+def _with_cameras(photos: list[PreparedPhoto], choice: str) -> list[PreparedPhoto]:
+    """Return the photographs with camera keys as chosen by `SfmSettings.camera`.
 
     Raises:
-      InputError: if those of different sizes are to share one.
+      InputError: if photographs of different sizes would share one camera.
     """
     if choice == "auto":
-        return photographs
-    shots = [photo.shot for photo in photographs]
+        return photos
+    records = [photo.record for photo in photos]
     if choice == "per-image":
-        keys = [shot.file for shot in shots]
+        changed = [record._replace(camera=record.file) for record in records]
     else:
-        keys = ["single"] * len(shots)
-        sizes = {(shot.width, shot.height): shot.file for shot in shots}
+        sizes = {(r.width, r.height): photo.name for r, photo in zip(records, photos)}
         if len(sizes) > 1:
-            told = ", ".join(f"{name} is {w}x{h}" for (w, h), name in sizes.items())
+            found = ", ".join(f"{name} is {w}x{h}" for (w, h), name in sizes.items())
             raise InputError(
-                f"--camera single wants photos of one size: {told}; pass --camera auto"
+                "--camera single: expected photos of one size, got "
+                f"{found}; pass --camera auto"
             )
-    focal = next((s.focal for s in shots if s.focal), None)
-    changed = []
-    for photo, key in zip(photographs, keys):
-        own = photo.shot.focal if choice == "per-image" else focal
-        changed.append(photo._replace(shot=photo.shot._replace(camera=key, focal=own)))
-    return changed
+        focal = next((record.focal for record in records if record.focal), None)
+        changed = [record._replace(camera="single", focal=focal) for record in records]
+    return [photo._replace(record=record) for photo, record in zip(photos, changed)]
 
 
-def _remedy(matcher: str) -> str:
-    """What to do where cameras are not found, which were matched so."""
-    every = "" if matcher == "exhaustive" else "--matcher exhaustive, or "
+def _advice(matcher: str) -> str:
+    """Return what to try if cameras are not found."""
+    exhaustive = "" if matcher == "exhaustive" else "--matcher exhaustive or "
     return (
-        "photos that overlap by two thirds or more, sharp, of a scene with texture "
-        f"that stays still, help; so may {every}a larger --max-size"
+        "take sharp photos that overlap by two thirds or more, of a static scene with "
+        f"texture, or try {exhaustive}a larger --max-size"
     )
 
 
-def _matcher(settings: SfmSettings, source: Path, count: int) -> str:
-    if settings.matcher != "auto":
-        return settings.matcher
-    few = source.is_dir() and count <= EXHAUSTIVE_UP_TO
-    return "exhaustive" if few else "sequential"
-
-
-def _solve(
-    photographs: list[Photograph],
-    matcher: str,
-    settings: SfmSettings,
-    work: Workshop,
-    seconds: dict[str, float],
-    tell: Tell,
-) -> list[Any]:
-    """The models, largest first.
+def _solve(photos: list[PreparedPhoto], matcher: str, job: _Job) -> list[Any]:
+    """Return the reconstructed models, largest first.
 
     Raises:
       SfmError: if there is none.
     """
-    count, seed = len(photographs), settings.seed
-    database = _database(work)
-    masks = work.masks if any(photo.mask for photo in photographs) else None
-    shots = [photo.shot for photo in photographs]
-    with _timed("features", seconds):
-        tell(f"features of {count} images")
-        extract(database, work.photos, masks, shots, tell)
-    with _timed("matching", seconds):
-        tell(f"matching, {matcher}")
-        match(database, count, matcher, seed, tell)
-    with _timed("mapping", seconds):
-        tell("mapping")
-        models = reconstruct(database, work.photos, work.folder / "models", seed, tell)
+    count, work = len(photos), job.work
+    masks = work.masks if any(photo.mask for photo in photos) else None
+    records = [photo.record for photo in photos]
+    with job.timed("features"):
+        job.progress(f"features of {count} images")
+        extract_features(work.database, work.photos, masks, records, job.progress)
+    with job.timed("matching"):
+        job.progress(f"matching, {matcher}")
+        match_features(work.database, count, matcher, job.seed, job.progress)
+    with job.timed("mapping"):
+        job.progress("mapping")
+        models = map_incrementally(
+            work.database, work.photos, work.folder / "models", job.seed, job.progress
+        )
     if models and models[0].num_reg_images() < count:
-        with _timed("second effort", seconds):
-            models[0] = _second_effort(models[0], shots, work, seed, tell)
+        with job.timed("second effort"):
+            files = {record.file for record in records}
+            models[0] = _extend(models[0], files, job)
     if models:
         return models
-    most, pairs = best_pair(database)
+    most, pairs = match_summary(work.database)
     raise SfmError(
         f"no cameras could be found for the {count} images; {pairs} pairs of them "
-        f"match, the best by {most} features; {_remedy(matcher)}"
+        f"match, the best by {most} features; {_advice(matcher)}"
     )
 
 
-def _second_effort(
-    model: Any, shots: list[Shot], work: Workshop, seed: int, tell: Tell
-) -> Any:
-    """The model, extended by images that were not placed in it at first."""
-    placed = {image.name for image in model.images.values()}
-    missing = {shot.file for shot in shots} - placed
-    tell(f"looking again at {len(missing)} images that were not placed")
-    pairs = match_again(_database(work), missing, work.folder / "pairs", seed, tell)
-    if not pairs:
+def _extend(model: Any, files: set[str], job: _Job) -> Any:
+    """Return the model, extended by images that were not registered, if that works."""
+    work = job.work
+    missing = files - {image.name for image in model.images.values()}
+    job.progress(f"trying again with {len(missing)} images that were not registered")
+    pair_list = work.folder / "pairs"
+    if not rematch_guided(work.database, missing, pair_list, job.seed, job.progress):
         return model
     start, models = work.folder / "start", work.folder / "extended"
     start.mkdir()
     model.write_binary(start)
-    database = _database(work)
-    found = reconstruct(database, work.photos, models, seed, tell, start=start)
+    found = map_incrementally(
+        work.database, work.photos, models, job.seed, job.progress, start=start
+    )
     more = found and found[0].num_reg_images() > model.num_reg_images()
     return found[0] if more else model
 
 
-def _database(work: Workshop) -> Path:
-    return (work.folder / "database.db").resolve()
-
-
-def _report(
-    source: Path,
-    output: Path,
-    models: list[Any],
-    photographs: list[Photograph],
-    work: Workshop,
-    settings: dict[str, Any],
-    seconds: dict[str, float],
-) -> SfmReport:
+def _statistics(
+    models: list[Any], photos: list[PreparedPhoto], work: WorkFolder
+) -> dict[str, Any]:
+    """Return the fields of `SfmReport` that describe the models."""
     best, *others = models
     seen = {image.name: image.num_points3D for image in best.images.values()}
-    names = {photo.shot.file: photo.name for photo in photographs}
-    registered = {names[file]: int(seen[file]) for file in names if file in seen}
+    names = {photo.record.file: photo.name for photo in photos}
     lost = set(names) - set(seen)
-    why = why_not(_database(work), names, set(seen)) if lost else {}
-    unregistered = {names[file]: reason for file, reason in why.items()}
-    settings["masks"] = None if settings["masks"] is None else str(settings["masks"])
-    return SfmReport(
-        source=str(source),
-        output=str(output),
-        registered=registered,
-        unregistered=unregistered,
-        points=best.num_points3D(),
-        mean_reprojection_error=best.compute_mean_reprojection_error(),
-        mean_track_length=best.compute_mean_track_length(),
-        cameras=best.num_cameras(),
-        other_models=[model.num_reg_images() for model in others],
-        settings=settings,
-        seconds=seconds,
-    )
-
-
-def _facts(report: SfmReport) -> dict[str, Any]:
-    return {**asdict(report), "pycolmap": colmap().__version__}
-
-
-@contextmanager
-def _timed(phase: str, seconds: dict[str, float]) -> Iterator[None]:
-    start = time.monotonic()
-    yield
-    seconds[phase] = round(time.monotonic() - start, 2)
+    why = registration_failures(work.database, names, set(seen)) if lost else {}
+    return {
+        "registered": {names[file]: int(seen[file]) for file in names if file in seen},
+        "unregistered": {names[file]: reason for file, reason in why.items()},
+        "points": best.num_points3D(),
+        "mean_reprojection_error": best.compute_mean_reprojection_error(),
+        "mean_track_length": best.compute_mean_track_length(),
+        "cameras": best.num_cameras(),
+        "other_models": [model.num_reg_images() for model in others],
+    }
