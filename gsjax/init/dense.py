@@ -1,8 +1,7 @@
-"""More points of a scene than structure from motion gives: those on which views agree.
+"""Dense points of a dataset: depths on which several views agree.
 
-Views are swept against their neighbours (`gsjax.init.plane_sweep`), and what one finds is a
-point if others find it too. A training that starts from them need not grow a scene out
-of a few hundred points, and knows from the start how far away things are.
+Views are swept against their neighbours (`gsjax.init.plane_sweep`); a depth becomes a
+point if other views find it too.
 
 Axis legend: V views, M points.
 """
@@ -19,37 +18,48 @@ from gsjax.errors import InputError
 from gsjax.init.gaussians import points_in_ball
 from gsjax.init.plane_sweep import (
     DepthMap,
-    Pinhole,
-    Shot,
-    make_shot,
-    pinhole,
+    PinholeCamera,
+    SweepImage,
+    make_sweep_image,
     project,
+    scaled_pinhole,
     sweep,
     unproject,
 )
 from gsjax.runtime.machine import all_of, usable_cores
 
-_LONGEST = 192  # px, of the photographs as they are swept
-# Of more views some are swept, far from one another, and with each the two neighbours
-# that are to agree with it.
-_MOST_VIEWS, _SEEDS = 48, 16
-_NEIGHBOURS = 4
-# Between the directions from which two views see a point: narrow ones tell little of
-# how far it is, and at wide ones windows do not look alike.
-_LEAST_ANGLE, _BEST_ANGLE, _WIDEST_ANGLE = 0.5, 12.0, 60.0  # degrees
-_LEAST_SHARED = 0.1  # of what one view shows, in the other
+# Angles in degrees between the directions from which two views see a point: small ones
+# make depth uncertain, and windows do not match at large ones.
+_MIN_ANGLE, _BEST_ANGLE, _MAX_ANGLE = 0.5, 12.0, 60.0
+_MAX_NEIGHBOURS = 4
+_AGREEING = 2  # other views that have to confirm a depth
+_MIN_OVERLAP = 0.1  # share of the points of a view that another sees
 _SAMPLED = 2000  # points to choose neighbours by
-_LEAST_SCORE = 0.6
-_AGREEING = 2  # other views
-_STEPS = 1.5  # of depths, that two may differ by and still agree
-_ROOM = (0.8, 1.3)  # beyond the depths of the points that are known
-# Extents, where no points are known. What is farther than is looked for is found where
-# something happens to look alike; and evenly in 1 / z far costs next to nothing.
+_MIN_SCORE = 0.6
+_MAX_DEPTH_STEPS = 1.5  # difference at which two depths still agree
+_DEPTH_MARGIN = (0.8, 1.3)  # beyond the depths of the known points
+# Extents, for a dataset without points. Surfaces beyond the range of a sweep give false
+# matches within it; planes uniform in 1 / z make a large range cheap.
 _FARTHEST = 60.0
-_MOST_THREADS = 16  # with 20 MB each
+_MAX_THREADS = 16  # 20 MB each
 
 
-class Found(NamedTuple):
+class SweepSettings(NamedTuple):
+    """Settings of `find_points`.
+
+    Attributes:
+      longest_side: px that photographs are scaled down to.
+      max_views: number of views up to which all are swept.
+      seed_views: otherwise, number of distant views to sweep, each with its two best
+        neighbours.
+    """
+
+    longest_side: int = 192
+    max_views: int = 48
+    seed_views: int = 16
+
+
+class DensePoints(NamedTuple):
     """Points [M, 3] float64 and their colours [M, 3] uint8."""
 
     points: np.ndarray
@@ -57,85 +67,98 @@ class Found(NamedTuple):
 
 
 def find_points(
-    scene: Dataset, photos: Sequence[Photo], count: int, *, seed: int = 0
-) -> Found:
-    """Points that a view found, and two of its neighbours too (of one, that one).
+    dataset: Dataset,
+    photos: Sequence[Photo],
+    count: int,
+    *,
+    seed: int = 0,
+    settings: SweepSettings | None = None,
+) -> DensePoints:
+    """Return points that a view and two of its neighbours agree on (or its only one).
 
-    Of a scene of more than 48 views, 16 that lie far from one another are looked at,
-    each with two neighbours. Depths are looked for where the scene's points are or, if
-    it has none, from the ball around what its cameras look at to sixty extents away.
+    The depth range of a view covers the points of the dataset. If there are none, it
+    reaches from the ball around the point that the cameras look at to 60 extents.
 
     Args:
-      scene: its cameras and points.
-      photos: one for each view; what is masked or transparent is left out.
-      count: of more points than that, that many are drawn.
-      seed: of what is drawn.
+      dataset: cameras and points.
+      photos: one for each view; masked and transparent pixels are ignored.
+      count: upper limit; a random subset is drawn from more points.
+      seed: seed of the random draws.
+      settings: default `SweepSettings()`.
 
     Returns:
-      As many as there are; none where the views do not overlap or nothing in them can
-      be told from its surroundings.
+      The points; none if the views do not overlap or have no texture.
 
     Raises:
       InputError: if there is not one photo for each view.
       MissingExtraError: if OpenCV is absent.
     """
-    if len(photos) != len(scene.views):
+    if len(photos) != len(dataset.views):
         raise InputError(
-            f"{len(photos)} photos for {len(scene.views)} views; one for each is wanted"
+            f"photos: expected {len(dataset.views)}, one for each view, got "
+            f"{len(photos)}"
         )
-    rng = np.random.default_rng(seed)
-    around = _Surroundings(scene, photos, rng)
-    pairing = _paired(around)
+    rng, settings = np.random.default_rng(seed), settings or SweepSettings()
+    overlap = _ViewOverlap(dataset, photos, rng, settings.longest_side)
+    pairing = _choose_pairs(overlap, settings)
     needed = sorted({*pairing, *(view for some in pairing.values() for view in some)})
-    shots = {view: _shot(around.cameras[view], photos[view]) for view in needed}
+    images = {
+        view: _sweep_image(overlap.cameras[view], photos[view]) for view in needed
+    }
 
     def swept(view: int) -> DepthMap:
-        others = [shots[other] for other in pairing[view]]
-        return sweep(shots[view], others, *around.depths(view))
+        others = [images[other] for other in pairing[view]]
+        return sweep(images[view], others, *overlap.depth_range(view))
 
-    with ThreadPoolExecutor(min(_MOST_THREADS, usable_cores())) as pool:
+    with ThreadPoolExecutor(min(_MAX_THREADS, usable_cores())) as pool:
         maps = dict(zip(pairing, all_of(pool, swept, pairing)))
-    found = [_agreed(view, shots, maps, pairing[view]) for view in pairing]
+    found = [
+        _consistent_points(v, images, maps, others) for v, others in pairing.items()
+    ]
     points = np.concatenate([np.zeros((0, 3)), *(some.points for some in found)])
     none = np.zeros((0, 3), np.uint8)
     colors = np.concatenate([none, *(some.colors for some in found)])
     if len(points) > count:
         drawn = np.sort(rng.choice(len(points), count, replace=False))
         points, colors = points[drawn], colors[drawn]
-    return Found(points, colors)
+    return DensePoints(points, colors)
 
 
-def _shot(camera: Pinhole, photo: Photo) -> Shot:
-    """What of a photograph counts: what is neither masked nor transparent."""
+def _sweep_image(camera: PinholeCamera, photo: Photo) -> SweepImage:
+    """Return the image to sweep, without masked and transparent pixels."""
     valid = photo.valid
     if photo.alpha is not None:
         opaque = photo.alpha == 255
         valid = opaque if valid is None else valid & opaque
-    return make_shot(camera, photo.pixels, valid)
+    return make_sweep_image(camera, photo.pixels, valid)
 
 
-class _Surroundings:
-    """The cameras of all views, and points to tell by what they have in common.
+class _ViewOverlap:
+    """The cameras of all views, and sample points that measure their overlap.
 
     Attributes:
-      cameras: of the photographs as they are swept.
-      points: [M, 3], of the scene or of a ball.
-      inside: [V, M] which of them a view shows.
+      cameras: of the scaled photographs.
+      points: [M, 3] points of the dataset, or of `points_in_ball`.
+      inside: [V, M] bool, which points a view sees.
     """
 
     def __init__(
-        self, scene: Dataset, photos: Sequence[Photo], rng: np.random.Generator
+        self,
+        dataset: Dataset,
+        photos: Sequence[Photo],
+        rng: np.random.Generator,
+        longest: int,
     ):
         self.cameras = [
-            pinhole(view.viewmat, photo.K, photo.pixels.shape[1::-1], _LONGEST)
-            for view, photo in zip(scene.views, photos)
+            scaled_pinhole(view.viewmat, photo.K, photo.pixels.shape[1::-1], longest)
+            for view, photo in zip(dataset.views, photos)
         ]
         self.centres = np.stack([camera.centre for camera in self.cameras])
-        if has_points(scene):
-            points = scene.points[finite_points(scene)]
+        if has_points(dataset):
+            points = dataset.points[finite_points(dataset)]
             self._farthest = 0.0
         else:
-            points = points_in_ball(scene, _SAMPLED, rng)
+            points = points_in_ball(dataset, _SAMPLED, rng)
             self._farthest = _FARTHEST * scene_extent(self.centres)
         if len(points) > _SAMPLED:
             points = points[np.sort(rng.choice(len(points), _SAMPLED, replace=False))]
@@ -143,77 +166,84 @@ class _Surroundings:
         seen = [project(camera, points) for camera in self.cameras]
         self.inside = np.stack([pixels[:, 0] >= 0 for pixels, _ in seen])
 
-    def depths(self, view: int) -> tuple[float, float]:
-        """z to look for things between."""
+    def depth_range(self, view: int) -> tuple[float, float]:
+        """Return the smallest and largest z to sweep."""
         _, z = project(self.cameras[view], self.points[self.inside[view]])
         low, high = np.percentile(z, [1, 99])
-        return _ROOM[0] * low, max(_ROOM[1] * high, self._farthest)
+        return _DEPTH_MARGIN[0] * low, max(_DEPTH_MARGIN[1] * high, self._farthest)
 
     def neighbours(self, view: int) -> list[int]:
-        """The views to hold a view against, the best first, four at most.
+        """Return the views to sweep a view against, best first.
 
-        Best are those that see much of what it sees, from some 12° beside it and from
-        as near.
+        The score of a view is its overlap, weighted by how near the angle between the
+        views is to 12° and the ratio of their distances to 1.
         """
         inside = self.inside[view]
         shared = self.inside & inside
         share = shared.sum(1) / max(1, inside.sum())
         scores = np.zeros(len(self.cameras))
-        for other in np.flatnonzero(share >= _LEAST_SHARED):
+        for other in np.flatnonzero(share >= _MIN_OVERLAP):
             points = self.points[shared[other]]
             mine, theirs = points - self.centres[view], points - self.centres[other]
             near, far = np.linalg.norm(mine, axis=1), np.linalg.norm(theirs, axis=1)
             cosine = np.median(np.sum(mine * theirs, 1) / (near * far))
             angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-            if other != view and _LEAST_ANGLE < angle < _WIDEST_ANGLE:
+            if other != view and _MIN_ANGLE < angle < _MAX_ANGLE:
                 off = np.log(angle / _BEST_ANGLE), np.median(np.log(near / far))
                 scores[other] = share[other] * np.exp(-np.sum(np.square(off)))
-        best = np.argsort(-scores, kind="stable")[:_NEIGHBOURS]
+        best = np.argsort(-scores, kind="stable")[:_MAX_NEIGHBOURS]
         return [int(other) for other in best if scores[other] > 0]
 
 
-def _paired(around: _Surroundings) -> dict[int, list[int]]:
-    """The views to sweep, each with its neighbours; those without are left out."""
-    chosen = list(range(len(around.cameras)))
-    if len(chosen) > _MOST_VIEWS:
-        seeds = _spread_out(around.centres, _SEEDS)
-        agreeing = [view for seed in seeds for view in around.neighbours(seed)[:2]]
-        chosen = sorted({*seeds, *agreeing})
-    pairing = {view: around.neighbours(view) for view in chosen}
+def _choose_pairs(
+    overlap: _ViewOverlap, settings: SweepSettings
+) -> dict[int, list[int]]:
+    """Return the views to sweep and their neighbours; views without are left out."""
+    chosen = list(range(len(overlap.cameras)))
+    if len(chosen) > settings.max_views:
+        seeds = farthest_point_sample(overlap.centres, settings.seed_views)
+        partners = [other for seed in seeds for other in overlap.neighbours(seed)[:2]]
+        chosen = sorted({*seeds, *partners})
+    pairing = {view: overlap.neighbours(view) for view in chosen}
     return {view: others for view, others in pairing.items() if others}
 
 
-def _spread_out(centres: np.ndarray, count: int) -> list[int]:
-    """At most so many views, each as far as can be from those before it."""
+def farthest_point_sample(points: np.ndarray, count: int) -> list[int]:
+    """Return at most ``count`` indices of points [M, 3] far from one another."""
     chosen = [0]
-    apart = np.full(len(centres), np.inf)
+    apart = np.full(len(points), np.inf)
     while len(chosen) < count:
-        last = centres[chosen[-1]]
-        apart = np.minimum(apart, np.linalg.norm(centres - last, axis=1))
+        last = points[chosen[-1]]
+        apart = np.minimum(apart, np.linalg.norm(points - last, axis=1))
         chosen.append(int(np.argmax(apart)))
     return sorted(set(chosen))
 
 
-def _agreed(
-    view: int, shots: dict[int, Shot], maps: dict[int, DepthMap], others: list[int]
-) -> Found:
-    """What a view found, where enough of the others that were swept found it too."""
-    shot, mine = shots[view], maps[view]
-    rows, cols = np.nonzero(mine.score > _LEAST_SCORE)
-    points = unproject(shot.camera, rows, cols, mine.inverse[rows, cols])
+def _consistent_points(
+    view: int,
+    images: dict[int, SweepImage],
+    maps: dict[int, DepthMap],
+    others: list[int],
+) -> DensePoints:
+    """Return the points of a view that enough of the swept neighbours confirm."""
+    image, mine = images[view], maps[view]
+    rows, cols = np.nonzero(mine.score > _MIN_SCORE)
+    points = unproject(image.camera, rows, cols, mine.inverse[rows, cols])
     votes = np.zeros(len(points), int)
     others = [other for other in others if other in maps]
     for other in others:
-        votes += _confirmed(points, shots[other].camera, maps[other])
+        votes += _is_confirmed(points, images[other].camera, maps[other])
     kept = votes >= min(_AGREEING, max(1, len(others)))
-    return Found(points[kept], shot.colors[rows[kept], cols[kept]])
+    return DensePoints(points[kept], image.colors[rows[kept], cols[kept]])
 
 
-def _confirmed(points: np.ndarray, camera: Pinhole, found: DepthMap) -> np.ndarray:
-    """[M] which points a view found where they are."""
+def _is_confirmed(
+    points: np.ndarray, camera: PinholeCamera, depths: DepthMap
+) -> np.ndarray:
+    """Return [M] bool: whether the depth map of a view has each point."""
     pixels, z = project(camera, points)
     inside = pixels[:, 0] >= 0
     col, row = np.where(inside[:, None], pixels, 0).astype(int).T
-    off = np.abs(1 / np.where(inside, z, 1) - found.inverse[row, col])
-    scored = found.score[row, col] > _LEAST_SCORE
-    return inside & scored & (off < _STEPS * found.step)
+    off = np.abs(1 / np.where(inside, z, 1) - depths.inverse[row, col])
+    scored = depths.score[row, col] > _MIN_SCORE
+    return inside & scored & (off < _MAX_DEPTH_STEPS * depths.step)

@@ -1,4 +1,4 @@
-"""Gaussians to start from: at the points of a scene, or anywhere in view of it."""
+"""Initial Gaussians: at the points of a dataset, or at random in view of it."""
 
 from collections.abc import Callable
 
@@ -11,14 +11,14 @@ from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.math.sh import C0, num_bases
 
-_MOST_SPACING = 3.0  # times the median
-# Cameras that all look at one point from a narrow place see this much around it, as a
-# share of how far away it is.
-_IN_VIEW = 0.5
+_MAX_SPACING = 3.0  # times the median
+# Cameras close together that look at one point see this much around it, as a share of
+# its distance.
+_VISIBLE_SHARE = 0.5
 
 
 def init_gaussians(
-    scene: Dataset,
+    dataset: Dataset,
     *,
     sh_degree: int = 3,
     opacity: float = 0.1,
@@ -28,46 +28,51 @@ def init_gaussians(
     capacity: int | Callable[[int], int] | None = None,
     seed: int = 0,
 ) -> Gaussians:
-    """Isotropic Gaussians, as wide as their neighbours are far.
+    """Return isotropic Gaussians whose scales follow the distance to their neighbours.
+
+    Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", 2023.
 
     Args:
-      scene: its points are taken.
-      sh_degree: colours are of degree 0, the rest is zero.
-      opacity: of each, above 0 and below 1.
-      scale: times the root mean square distance to the three nearest neighbours.
-      max_count: of more points than that, that many are drawn.
-      random_count: that many, drawn evenly from a ball around the point that the
-        cameras look at, see `points_in_ball`, instead of its points.
-      capacity: number of slots, or what says it of the number of Gaussians; default
-        that number.
-      seed: of what is drawn.
+      dataset: provides points, colours and cameras.
+      sh_degree: degree of the SH coefficients; those above degree 0 are zero.
+      opacity: initial opacity, between 0 and 1 exclusive.
+      scale: factor on the root mean square distance to the three nearest neighbours.
+      max_count: upper limit; a random subset is drawn from more points.
+      random_count: number of random points from `points_in_ball`, with random colours,
+        that replace those of the dataset; None for the dataset's.
+      capacity: number of slots, or a function of the number of Gaussians; default that
+        number.
+      seed: seed of the random draws.
+
+    Returns:
+      Gaussians in float64 if x64 is enabled, else float32.
 
     Raises:
-      InputError: if the scene has no points and ``random_count`` is None, or not a
-        colour for each, or ``opacity`` or ``scale`` is out of its range.
+      InputError: if the dataset has no points and ``random_count`` is None, if points
+        and colours differ in number, or if ``opacity`` or ``scale`` is out of range.
     """
     if not 0 < opacity < 1:
-        raise InputError(f"opacity {opacity}: above 0 and below 1 is wanted")
+        raise InputError(f"opacity: expected a value between 0 and 1, got {opacity}")
     if not 0 < scale < np.inf:
-        raise InputError(f"scale {scale}: a number above 0 is wanted")
+        raise InputError(f"scale: expected a finite value above 0, got {scale}")
     rng = np.random.default_rng(seed)
     if random_count is not None:
-        points = points_in_ball(scene, random_count, rng)
+        points = points_in_ball(dataset, random_count, rng)
         colors = rng.uniform(size=(random_count, 3))
     else:
-        require_points(scene)
-        if len(scene.colors) != len(scene.points):
+        require_points(dataset)
+        if len(dataset.colors) != len(dataset.points):
             raise InputError(
-                f"{scene.source}: {len(scene.points)} points and {len(scene.colors)} "
-                "colours; one for each is wanted"
+                f"{dataset.source}: expected a colour for each point, got "
+                f"{len(dataset.points)} points and {len(dataset.colors)} colours"
             )
-        finite = finite_points(scene)
-        points, colors = scene.points[finite], scene.colors[finite] / 255.0
+        finite = finite_points(dataset)
+        points, colors = dataset.points[finite], dataset.colors[finite] / 255.0
     if len(points) > max_count:
         chosen = np.sort(rng.choice(len(points), max_count, replace=False))
         points, colors = points[chosen], colors[chosen]
     count = len(points)
-    spacing = scale * neighbour_distance(points, extent_of(scene))
+    spacing = scale * neighbour_distance(points, extent_of(dataset))
     sh = np.zeros((count, num_bases(sh_degree), 3))
     sh[:, 0] = (colors - 0.5) / C0
     return make_gaussians(
@@ -81,11 +86,11 @@ def init_gaussians(
 
 
 def neighbour_distance(points: np.ndarray, extent: float) -> np.ndarray:
-    """[M] root mean square distance to the three nearest other points.
+    """Return [M] root mean square distances to the three nearest other points.
 
-    At least 1e-7 and at most 0.1 of the extent, or three times the median where that is
-    more: points in one place, and points far from all others, would otherwise be
-    nothing or everything.
+    Values are clipped from below to 1e-7 of the extent, and from above to 0.1 of the
+    extent or three times the median, whichever is larger: scales of coincident points
+    and of outliers would otherwise vanish or cover the scene.
     """
     from scipy.spatial import cKDTree  # pyright: ignore
 
@@ -94,21 +99,23 @@ def neighbour_distance(points: np.ndarray, extent: float) -> np.ndarray:
         return np.full(len(points), 0.01 * extent)
     distance, _ = cKDTree(points).query(points, k=count)
     rms = np.sqrt(np.mean(np.square(distance[:, 1:]), 1))
-    most = max(0.1 * extent, _MOST_SPACING * float(np.median(rms)))
+    most = max(0.1 * extent, _MAX_SPACING * float(np.median(rms)))
     return np.clip(rms, 1e-7 * extent, most)
 
 
-def points_in_ball(scene: Dataset, count: int, rng: np.random.Generator) -> np.ndarray:
-    """[count, 3] drawn evenly from the ball around the point that the cameras look at.
+def points_in_ball(
+    dataset: Dataset, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Return [count, 3] points drawn uniformly from a ball in view of the cameras.
 
-    Its radius is the scene's extent, or half of their mean distance from that point
-    where that is more: cameras side by side see more of it than they are apart.
+    Its centre is the point that the cameras look at. Its radius is the extent of the
+    cameras, or half of their mean distance from the centre if that is larger.
     """
-    centres = np.stack([view.centre for view in scene.views])
+    centres = np.stack([view.centre for view in dataset.views])
     extent = scene_extent(centres)
-    middle = focus_point([view.viewmat for view in scene.views], depth=extent)
+    middle = focus_point([view.viewmat for view in dataset.views], depth=extent)
     away = float(np.linalg.norm(centres - middle, axis=1).mean())
-    extent = max(extent, _IN_VIEW * away)
+    extent = max(extent, _VISIBLE_SHARE * away)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     radius = extent * rng.uniform(size=(count, 1)) ** (1 / 3)

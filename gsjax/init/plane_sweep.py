@@ -1,8 +1,8 @@
-"""How far away what a photograph shows is, by plane sweep (Collins 1996).
+"""Depth map of a photograph by plane sweep (Collins 1996).
 
-For every depth of a list the neighbours of a view are warped into it, as if all that it
-shows lay in a plane of that depth. Where it does, windows around a pixel look alike:
-their zero-mean normalised cross-correlation (ZNCC) is near 1, whatever the exposure.
+For each of a list of depths the neighbours of a view are warped into it through a plane
+at that depth. At the right depth the windows around a pixel match: their zero-mean
+normalised cross-correlation (ZNCC) is near 1, at any exposure.
 
 Axis legend: D depths, H W image.
 """
@@ -15,21 +15,21 @@ import numpy as np
 from gsjax.data.photos import scaled_intrinsics, size_within
 from gsjax.io.images import opencv
 
-# px, a side: small ones keep edges, large ones find what has little texture.
+# px, side of the windows: small ones keep edges, large ones need less texture.
 _WINDOWS = (3, 7)
-_LEAST_DEPTHS, _MOST_DEPTHS = 16, 144
+_MIN_DEPTHS, _MAX_DEPTHS = 16, 144
 _MARGIN = max(_WINDOWS) // 2
-# Variance of a window that is told from noise: of 1.5 of 255 grey levels.
-_LEAST_VARIANCE = (1.5 / 255) ** 2
-# From a pixel as OpenCV counts, from its centre, to ours, and back.
-_TO_OURS = np.asarray([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-_TO_THEIRS = np.asarray([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
-_OUTSIDE = -1e3  # grey level of what is not there
-_REACHES_OUT = -1.0  # the mean of a window is below, with one such pixel in it
+# Variance of a window above noise: 1.5 of 255 grey levels.
+_MIN_VARIANCE = (1.5 / 255) ** 2
+# OpenCV has pixel centres at integers, gsjax at + 0.5.
+_FROM_OPENCV = np.asarray([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+_TO_OPENCV = np.asarray([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+_INVALID = -1e3  # grey level of pixels outside the image or masked
+_INVALID_MEAN = -1.0  # the mean of a window with an invalid pixel is below
 
 
-class Pinhole(NamedTuple):
-    """The camera of a photograph as it is swept.
+class PinholeCamera(NamedTuple):
+    """The camera of a scaled photograph.
 
     Attributes:
       viewmat: [4, 4] world → camera.
@@ -43,31 +43,31 @@ class Pinhole(NamedTuple):
 
     @property
     def centre(self) -> np.ndarray:
-        """[3] where it stands."""
+        """Position [3]."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
 
-class Shot(NamedTuple):
-    """A photograph as it is swept.
+class SweepImage(NamedTuple):
+    """A scaled photograph.
 
     Attributes:
-      camera: that took it.
-      grey: [H, W] float32 in [0, 1], `_OUTSIDE` where nothing counts.
+      camera: its camera.
+      grey: [H, W] float32 in [0, 1]; below 0 where invalid.
       colors: [H, W, 3] uint8.
     """
 
-    camera: Pinhole
+    camera: PinholeCamera
     grey: np.ndarray
     colors: np.ndarray
 
 
 class DepthMap(NamedTuple):
-    """What a sweep found.
+    """Result of a sweep.
 
     Attributes:
       inverse: [H, W] 1 / z.
-      score: [H, W] ZNCC there; −1 where nothing was found.
-      step: between two depths, as inverses.
+      score: [H, W] ZNCC at that depth; −1 where none was found.
+      step: difference of 1 / z between two depths of the sweep.
     """
 
     inverse: np.ndarray
@@ -75,30 +75,31 @@ class DepthMap(NamedTuple):
     step: float
 
 
-def pinhole(
+def scaled_pinhole(
     viewmat: np.ndarray, K: np.ndarray, size: tuple[int, int], longest: int
-) -> Pinhole:
-    """The camera of a photograph that is made small.
+) -> PinholeCamera:
+    """Return the camera of a photograph that is scaled down.
 
     Args:
-      viewmat, K: of the photograph.
-      size: its width and height, px.
-      longest: side, px, that it is scaled down to.
+      viewmat: [4, 4] world → camera.
+      K: [3, 3] intrinsics of the photograph, px.
+      size: width and height of the photograph, px.
+      longest: upper limit of the longer side, px.
     """
     width, height = size_within(*size, longest)
     scaled = scaled_intrinsics(K, width / size[0], height / size[1])
-    return Pinhole(np.asarray(viewmat, float), scaled, (width, height))
+    return PinholeCamera(np.asarray(viewmat, float), scaled, (width, height))
 
 
-def make_shot(
-    camera: Pinhole, pixels: np.ndarray, valid: np.ndarray | None = None
-) -> Shot:
-    """A photograph, made as small as its camera is.
+def make_sweep_image(
+    camera: PinholeCamera, pixels: np.ndarray, valid: np.ndarray | None = None
+) -> SweepImage:
+    """Scale a photograph to the size of its camera.
 
     Args:
-      camera: from `pinhole`.
+      camera: from `scaled_pinhole`.
       pixels: [H, W, 3] uint8 RGB.
-      valid: [H, W] bool, what counts; or None for all.
+      valid: [H, W] bool, pixels to use; None for all.
     """
     cv2 = opencv()
     small = cv2.resize(pixels, camera.size, interpolation=cv2.INTER_AREA)
@@ -106,12 +107,12 @@ def make_shot(
     if valid is not None:
         missing = (~valid).astype(np.float32)
         missing = cv2.resize(missing, camera.size, interpolation=cv2.INTER_AREA)
-        grey[missing > 0] = _OUTSIDE
-    return Shot(camera, grey, small)
+        grey[missing > 0] = _INVALID
+    return SweepImage(camera, grey, small)
 
 
-def project(camera: Pinhole, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(pixels [M, 2], z [M]) of points [M, 3]; pixels −1 of what is not in view."""
+def project(camera: PinholeCamera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (pixels [M, 2], z [M]) of points [M, 3]; pixels are −1 out of view."""
     seen = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     z = seen[:, 2]
     before = z > 0
@@ -120,33 +121,33 @@ def project(camera: Pinhole, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return np.where(inside[:, None], pixels, -1), z
 
 
-def unproject(camera: Pinhole, rows, cols, inverse: np.ndarray) -> np.ndarray:
-    """[M, 3] world points behind pixels, by their 1 / z."""
+def unproject(camera: PinholeCamera, rows, cols, inverse: np.ndarray) -> np.ndarray:
+    """Return the world points [M, 3] at pixels (rows, cols) [M], by their 1 / z [M]."""
     rays = np.stack([cols + 0.5, rows + 0.5, np.ones(len(rows))], 1)
     seen = rays @ np.linalg.inv(camera.K).T / inverse[:, None]
     return (seen - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
 
 
 def sweep(
-    shot: Shot, neighbours: Sequence[Shot], nearest: float, farthest: float
+    image: SweepImage, neighbours: Sequence[SweepImage], nearest: float, farthest: float
 ) -> DepthMap:
-    """Find the depth of every pixel that looks alike in the neighbours at one.
+    """Return the depth of every pixel at which it matches the neighbours best.
 
-    At each depth the better half of the neighbours count: what is hidden in the others
-    looks like nothing. Depths are as dense as a pixel of the neighbour that sees most
-    of a shift, up to 144, evenly in 1 / z; between them by a parabola.
+    The score of a depth is the mean over the better half of the neighbours: a surface
+    may be hidden in the others. Depths are uniform in 1 / z, 16 to 144 of them, one for
+    each pixel that the image of a point moves in a neighbour; a parabola interpolates.
 
     Args:
-      shot: the view.
-      neighbours: one or more.
-      nearest, farthest: z to look between.
+      image: the view.
+      neighbours: one or more other views.
+      nearest, farthest: range of z.
     """
-    width, height = shot.camera.size
-    warps = [_Warp(shot.camera, other) for other in neighbours]
+    width, height = image.camera.size
+    warps = [PlaneWarp(image.camera, other) for other in neighbours]
     shift = max(warp.shift(1 / farthest, 1 / nearest) for warp in warps)
-    count = int(np.clip(np.ceil(shift), _LEAST_DEPTHS, _MOST_DEPTHS))
+    count = int(np.clip(np.ceil(shift), _MIN_DEPTHS, _MAX_DEPTHS))
     inverses = np.linspace(1 / farthest, 1 / nearest, count)
-    view = _View(shot.grey)
+    windows = ZnccWindows(image.grey)
     counted = (len(warps) + 1) // 2
     scores = np.empty((count, height, width), np.float32)
     best = np.empty((counted, height, width), np.float32)
@@ -154,20 +155,20 @@ def sweep(
     for depth, inverse in enumerate(inverses):
         best.fill(-len(_WINDOWS))
         for warp in warps:
-            new = view.likeness(warp.image(inverse))
-            for held in best:  # the best of them, then the next
+            new = windows.zncc(warp.image(inverse))
+            for held in best:  # keeps the best scores, in order
                 np.minimum(held, new, out=less)
                 np.maximum(held, new, out=held)
                 new, less = less, new
         np.sum(best, axis=0, out=scores[depth])
     scores /= counted * len(_WINDOWS)
-    return _chosen(scores, inverses, view.usable)
+    return _best_depths(scores, inverses, windows.usable)
 
 
-class _Warp:
-    """A neighbour, seen from the view through a plane: H = A + b (0 0 1) / z."""
+class PlaneWarp:
+    """Warp of a neighbour into a view through a plane: H = A + b (0 0 1) / z."""
 
-    def __init__(self, camera: Pinhole, other: Shot):
+    def __init__(self, camera: PinholeCamera, other: SweepImage):
         theirs = other.camera
         turn = theirs.viewmat[:3, :3] @ camera.viewmat[:3, :3].T
         move = theirs.viewmat[:3, 3] - turn @ camera.viewmat[:3, 3]
@@ -176,7 +177,7 @@ class _Warp:
         self.size, self.grey = camera.size, other.grey
 
     def shift(self, low: float, high: float) -> float:
-        """The longest way, px, of a pixel in the neighbour's image over the depths."""
+        """Return the longest path, px, of a view's pixel over a range of 1 / z."""
         width, height = self.size
         x, y = (a.ravel() for a in np.meshgrid([0, 0.5, 1], [0, 0.5, 1]))
         corners = np.stack([x * width, y * height, np.ones(9)])
@@ -196,48 +197,49 @@ class _Warp:
         return float(ways.max())
 
     def image(self, inverse: float) -> np.ndarray:
-        """[H, W] the neighbour warped into the view."""
+        """Return the neighbour warped into the view, [H, W]."""
         cv2 = opencv()
         plane = self.turn + inverse * self.move
-        matrix = _TO_THEIRS @ plane @ _TO_OURS
+        matrix = _TO_OPENCV @ plane @ _FROM_OPENCV
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         image = cv2.warpPerspective(
-            self.grey, matrix, self.size, flags=flags, borderValue=_OUTSIDE
+            self.grey, matrix, self.size, flags=flags, borderValue=_INVALID
         )
-        # What is behind the neighbour would be seen upside down. z is linear.
+        # Points behind the neighbour would appear upside down. z is linear.
         width, height = self.size
         by_x, by_y, constant = plane[2]
         if constant + min(0, by_x * width) + min(0, by_y * height) <= 0:
             across, down = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-            image[by_x * across + by_y * down + constant <= 0] = _OUTSIDE
-        image[image < 0] = _OUTSIDE  # partly, too
+            image[by_x * across + by_y * down + constant <= 0] = _INVALID
+        image[image < 0] = _INVALID  # interpolated with invalid pixels
         return image
 
 
-class _View:
-    """The windows of a view, of every size, to be held against those of others.
+class ZnccWindows:
+    """Windows of several sizes around every pixel of a view, for comparison by ZNCC.
 
     Attributes:
-      usable: [H, W] where the largest has something to tell it from others by.
+      usable: [H, W] bool, where the largest window has texture and no invalid pixel.
     """
 
     def __init__(self, grey: np.ndarray):
         self._grey = _with_margin(grey)
-        # An image, its square and its product with the view, one above the other: to be
-        # filtered in one go.
+        # An image, its square and its product with the view, filtered in one call.
         self._moments: np.ndarray = np.empty((3, *self._grey.shape), np.float32)
         self._set(grey)
         self._windows = []
         for side in _WINDOWS:
             mean, square, _ = self._means(side)
             variance = square - mean * mean
-            scale = 1 / np.sqrt(np.maximum(variance, _LEAST_VARIANCE))
+            scale = 1 / np.sqrt(np.maximum(variance, _MIN_VARIANCE))
             self._windows.append((side, mean, scale))
-            self.usable = (variance > _LEAST_VARIANCE) & (mean > _REACHES_OUT)
+            self.usable = (variance > _MIN_VARIANCE) & (mean > _INVALID_MEAN)
 
-    def likeness(self, other: np.ndarray) -> np.ndarray:
-        """[H, W] the sum over the windows of their ZNCC with those of an image, −1
-        where they reach out of it."""
+    def zncc(self, other: np.ndarray) -> np.ndarray:
+        """Return the sum over window sizes of the ZNCC with an image, [H, W].
+
+        A window with invalid pixels contributes −1.
+        """
         self._set(other)
         total = np.zeros(other.shape, np.float32)
         for side, my_mean, my_scale in self._windows:
@@ -245,8 +247,8 @@ class _View:
             square -= mean * mean
             score -= mean * my_mean
             score *= my_scale
-            score /= np.sqrt(np.maximum(square, _LEAST_VARIANCE))
-            score[mean < _REACHES_OUT] = -1
+            score /= np.sqrt(np.maximum(square, _MIN_VARIANCE))
+            score[mean < _INVALID_MEAN] = -1
             total += score
         return total
 
@@ -257,7 +259,7 @@ class _View:
         np.multiply(image, self._grey, out=self._moments[2])
 
     def _means(self, side: int) -> np.ndarray:
-        """[3, H, W] the moments in windows of that side."""
+        """Return the means of the moments in windows, [3, H, W]."""
         tall = self._moments.reshape(-1, self._grey.shape[1])
         window, border = (side, side), opencv().BORDER_REFLECT
         means = opencv().boxFilter(tall, -1, window, borderType=border)
@@ -265,13 +267,15 @@ class _View:
 
 
 def _with_margin(image: np.ndarray) -> np.ndarray:
-    """Above and below as much more as a window reaches out, mirrored."""
+    """Extend an image above and below by the reach of a window, mirrored."""
     cv2 = opencv()
     return cv2.copyMakeBorder(image, _MARGIN, _MARGIN, 0, 0, cv2.BORDER_REFLECT)
 
 
-def _chosen(scores: np.ndarray, inverses: np.ndarray, usable: np.ndarray) -> DepthMap:
-    """The best of scores [D, H, W]; none where that is the first or last depth."""
+def _best_depths(
+    scores: np.ndarray, inverses: np.ndarray, usable: np.ndarray
+) -> DepthMap:
+    """Return the maxima of scores [D, H, W]; those at either end of D are rejected."""
     count = len(inverses)
     best = np.argmax(scores, axis=0)
     middle = np.clip(best, 1, count - 2)
