@@ -1,5 +1,7 @@
 """Small datasets made by code, for the tests of their readers."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -7,9 +9,11 @@ import numpy as np
 import pytest
 
 from gsjax.cameras.camera import look_at
+from gsjax.data.colmap_writer import write_colmap
 from gsjax.data.types import Dataset, View
 
 SIZE = (32, 24)
+PIXELS = {"fl_x": 40.0, "fl_y": 42.0, "cx": 15.5, "cy": 12.25, "w": 32, "h": 24}
 
 
 def save_photo(path: Path, pixels: np.ndarray | None = None) -> Path:
@@ -27,8 +31,8 @@ def save_photo(path: Path, pixels: np.ndarray | None = None) -> Path:
     return path
 
 
-def scene_of_views(count: int = 5, points: int = 40, seed: int = 0, at=(0, 0, 0)):
-    """A scene of general poses around ``at``, two cameras, no files."""
+def dataset_of_views(count: int = 5, points: int = 40, seed: int = 0, at=(0, 0, 0)):
+    """A dataset of general poses around ``at``, two cameras, no files."""
     rng = np.random.default_rng(seed)
     views = []
     for index in range(count):
@@ -42,9 +46,74 @@ def scene_of_views(count: int = 5, points: int = 40, seed: int = 0, at=(0, 0, 0)
     return Dataset(Path("made"), "made", tuple(views), xyz, colors)
 
 
+def with_names(dataset: Dataset, names) -> Dataset:
+    """The same dataset with other names of its views."""
+    views = [replace(view, name=name) for view, name in zip(dataset.views, names)]
+    return replace(dataset, views=tuple(views))
+
+
+def colmap_dataset(folder: Path, dataset: Dataset | None = None, place="sparse/0"):
+    """Write a dataset as a COLMAP model with photographs."""
+    dataset = dataset_of_views() if dataset is None else dataset
+    write_colmap(folder / place, dataset)
+    for view in dataset.views:
+        save_photo(folder / "images" / view.name)
+    return dataset
+
+
 def to_opengl(viewmat: np.ndarray) -> np.ndarray:
     """Camera → world in OpenGL axes of an OpenCV world → camera matrix."""
     return np.linalg.inv(viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def frames_of(dataset: Dataset, form="images/{}.png", **more) -> list[dict]:
+    """Frames of a transforms.json whose file_path is ``form`` of the view's index."""
+    return [
+        {
+            "file_path": form.format(index),
+            "transform_matrix": to_opengl(view.viewmat).tolist(),
+            **more,
+        }
+        for index, view in enumerate(dataset.views)
+    ]
+
+
+def write_transforms(folder: Path, frames, name="transforms.json", **content) -> Path:
+    """Write a transforms.json."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / name
+    path.write_text(json.dumps({**content, "frames": frames}))
+    return path
+
+
+def nerfstudio_dataset(folder: Path, count=4, **content) -> Dataset:
+    """Write a dataset as ns-process-data does, with photographs."""
+    dataset = dataset_of_views(count)
+    frames = content.pop("frames", frames_of(dataset, "images/frame_{}.png"))
+    for frame in frames:
+        save_photo(folder / frame["file_path"])
+    write_transforms(folder, frames, **{**PIXELS, "camera_model": "OPENCV", **content})
+    return dataset
+
+
+def llff_rows(dataset: Dataset, size=SIZE, focal=40.0) -> np.ndarray:
+    """[N, 17] rows of a poses_bounds.npy, by the definition of the format."""
+    rows = []
+    for view in dataset.views:
+        right, down, forward = view.viewmat[:3, :3]
+        intrinsics = np.asarray([size[1], size[0], focal])
+        matrix = np.stack([down, right, -forward, view.centre, intrinsics], -1)
+        rows.append([*matrix.ravel(), 1.5, 20.0])
+    return np.asarray(rows)
+
+
+def llff_dataset(folder: Path, count=4, **more) -> Dataset:
+    """Write a dataset of LLFF with photographs."""
+    dataset = dataset_of_views(count)
+    np.save(folder / "poses_bounds.npy", llff_rows(dataset, **more))
+    for index in range(count):
+        save_photo(folder / "images" / f"IMG_{9 - index}.JPG")
+    return dataset
 
 
 def synthetic_model(folder: Path) -> Path:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from captures import save_photo, scene_of_views, to_opengl
+from captures import dataset_of_views, save_photo, to_opengl
 
 import gsjax
 from gsjax.data import colmap_binary
@@ -23,12 +23,12 @@ from gsjax.init.gaussians import init_gaussians
 from gsjax.io.point_cloud import read_point_cloud
 from gsjax.runs.checkpoint import load_checkpoint, save_checkpoint
 from gsjax.runs.folder import RunSettings, load_settings, save_settings
-from gsjax.runs.refined_cameras import save_cameras, with_cameras
+from gsjax.runs.refined_cameras import load_cameras, save_cameras
 from gsjax.runs.run_info import describe_run
 from gsjax.train.config import TrainConfig
 from gsjax.train.state import init_state
 
-SCENE = scene_of_views(count=2, points=4)
+SCENE = dataset_of_views(count=2, points=4)
 MODEL = ("cameras", "images", "points3D")
 STEP, META = "checkpoints/step_000000007.npz", "meta.json.npy"
 
@@ -39,7 +39,7 @@ def photo(path: Path, mask: Path | None = None):
 
 def nerf(path: Path):
     load_transforms(path, size=(8, 6))
-    return load_nerf([path])
+    return load_nerf(path)
 
 
 READ: dict[str, Callable[[Path], object]] = {
@@ -58,7 +58,7 @@ READ: dict[str, Callable[[Path], object]] = {
     STEP: load_checkpoint,
     "config.json": lambda path: load_settings(path.parent),
     "eval.json": lambda path: describe_run(path.parent),
-    "cameras.json": lambda path: with_cameras(SCENE, path),
+    "cameras.json": lambda path: load_cameras(SCENE, path),
 }
 # A prefix of text may be another, shorter file: it is warned of where it can be told.
 TEXT = (

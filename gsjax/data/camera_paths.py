@@ -1,10 +1,8 @@
-"""Paths of a camera through a captured scene: an orbit, a spiral, a flight along.
+"""Camera paths through a captured scene: orbit, spiral, interpolation of the cameras.
 
-Axis legend: B cameras that are given, F frames of the path, S dense samples of it.
-
-World → camera matrices [·, 4, 4] in and out, float64, OpenCV axes. No input is
-degenerate to the point of NaN: one camera, equal cameras and parallel ones fall back
-to what each docstring says.
+World → camera matrices [·, 4, 4] in and out, float64, OpenCV axes. Degenerate input
+(one camera, equal or parallel cameras) never gives NaN; each docstring names the
+fallback. Axes: B given cameras, F frames of the path, S dense samples of it.
 """
 
 from collections import Counter
@@ -18,16 +16,16 @@ from gsjax.cameras.camera import look_at
 from gsjax.data.types import View
 from gsjax.errors import InputError
 
-# Least eigenvalue, the mean squared sine between the optical axes and the direction
-# that they agree on most, at which they say how far the scene is: spread over 2°.
+# Minimum of the least eigenvalue, the mean squared sine between the optical axes and
+# their common direction, at which the axes locate the scene: a spread of 2°.
 _PARALLEL = np.sin(np.radians(2.0)) ** 2
 _STEEPEST = np.radians(85.0)
-_ALIKE = np.cos(np.radians(45.0))  # of directions that face one side of a scene
-_SAMPLES = 512  # of a path between two keyframes, to measure its length
+_ALIKE = np.cos(np.radians(45.0))  # between directions that face one side of a scene
+_SAMPLES = 512  # between two keyframes, to measure the length of a path
 
 
 class Intrinsics(NamedTuple):
-    """Intrinsics K [3, 3] in px, for an image of width × height."""
+    """Intrinsics K [3, 3] in px of an image of width × height."""
 
     K: np.ndarray
     width: int
@@ -35,13 +33,15 @@ class Intrinsics(NamedTuple):
 
 
 def median_intrinsics(views: Sequence[View]) -> Intrinsics:
-    """What the views have in common: the commonest size, and the median K for it.
+    """Return the most common image size of the views, and the median K for it.
 
     Raises:
       InputError: if there is no view.
     """
     if not views:
-        raise InputError("no views; a path needs the intrinsics of at least one")
+        raise InputError(
+            "views: expected at least one, got none; pass the views of a dataset"
+        )
     sizes = Counter((view.width, view.height) for view in views)
     width, height = max(sizes, key=lambda size: (sizes[size], size))
     scaled = [
@@ -51,17 +51,17 @@ def median_intrinsics(views: Sequence[View]) -> Intrinsics:
 
 
 def focus_point(viewmats, depth: float | None = None) -> np.ndarray:
-    """[3] the point that the cameras look at: nearest to all their optical axes.
+    """Return the point [3] that is nearest to the optical axes of all cameras.
 
-    Where they do not look at one (a single camera, axes within about 2°, or apart, as
-    from inside out), it is straight ahead of the middle of them.
+    If the cameras do not look at one point (a single camera, axes within about 2°, or
+    diverging axes), it is straight ahead of their mean position.
 
     Args:
       viewmats: [B, 4, 4].
-      depth: how far ahead then; None takes the spread of the cameras, or 1.
+      depth: distance ahead in that case; None takes the spread of the cameras, or 1.
 
     Raises:
-      InputError: on a wrong shape, no camera, or values that are not finite.
+      InputError: if the shape is wrong, there is no camera, or a value is not finite.
     """
     centres, axes = _centres_and_axes(viewmats)
     ahead = axes[:, 2]
@@ -78,10 +78,10 @@ def focus_point(viewmats, depth: float | None = None) -> np.ndarray:
 
 
 def up_direction(viewmats) -> np.ndarray:
-    """[3] unit: the up of the scene, at right angles to the cameras' horizontals.
+    """Return the up direction [3] of the scene, orthogonal to the cameras' x axes.
 
-    Cameras are held level more often than they look level. Where all horizontals are
-    parallel, or cameras were turned about their axes, it is the mean of their ups.
+    Cameras are held level more often than they look level. If all x axes are parallel,
+    or cameras were rolled, it is the mean of their up directions.
 
     Raises:
       InputError: as `focus_point`.
@@ -95,11 +95,11 @@ def up_direction(viewmats) -> np.ndarray:
 
 
 def orbit(viewmats, frames: int, *, depth: float | None = None) -> np.ndarray:
-    """[F, 4, 4]: once around `focus_point` about `up_direction`, and closed.
+    """Return a closed circular path [F, 4, 4] around `focus_point`.
 
-    At the median distance and the mean elevation of the cameras (at most 85°), from
-    where the first of them stands on. A camera that stands on the focus or below the
-    zenith of it has no azimuth: the orbit then starts anywhere.
+    Its axis is `up_direction`, its radius and elevation are the median distance and the
+    mean elevation of the cameras (at most 85°), and it starts at the azimuth of the
+    first camera, or anywhere if that has none.
 
     Args:
       viewmats: [B, 4, 4].
@@ -131,9 +131,9 @@ def orbit(viewmats, frames: int, *, depth: float | None = None) -> np.ndarray:
 
 
 def unseen_angle(viewmats, *, depth: float | None = None) -> float:
-    """Degrees of an `orbit` between those cameras that stand farthest apart on it.
+    """Return the largest angle in degrees of an `orbit` without a camera.
 
-    360 where all stand in one direction, as a single camera does.
+    It is 360 if all cameras have one azimuth, as a single one does.
 
     Raises:
       InputError: as `focus_point`.
@@ -150,17 +150,17 @@ def unseen_angle(viewmats, *, depth: float | None = None) -> float:
 def spiral(
     viewmats, frames: int, *, turns: int = 2, depth: float | None = None
 ) -> np.ndarray:
-    """[F, 4, 4]: a closed spiral before a scene that all cameras face (LLFF, 2019).
+    """Return a closed spiral [F, 4, 4] that looks at the focus of the cameras.
 
-    About the mean pose, as wide as 90 % of the cameras are off it (at least 3 % of
-    the distance of the focus, which is what one camera or equal ones get), looking at
-    the focus. Cameras all around a scene have no mean pose: of those the ones count
-    that look as the first does, within 45°.
+    It is centred on the mean pose and as wide as the 90th percentile of the cameras'
+    offsets, at least 3 % of the distance of the focus. If the cameras surround the
+    scene, only those within 45° of the first one's direction count. Mildenhall et al.,
+    "Local Light Field Fusion", 2019.
 
     Args:
       viewmats: [B, 4, 4].
       frames: F; frame F would be frame 0.
-      turns: how often around, while once to and fro.
+      turns: number of turns during one movement back and forth.
       depth: as `focus_point`.
 
     Raises:
@@ -169,7 +169,7 @@ def spiral(
     _check_frames(frames)
     viewmats = np.asarray(viewmats, np.float64)
     centres, axes = _centres_and_axes(viewmats)
-    # Of a ring that looks down the mean is straight down, and so is that of the ups.
+    # For a ring that looks down, the mean direction and the mean up are parallel.
     upward = _mean_direction(-axes[:, 1]) @ _mean_direction(axes[:, 2])
     if np.linalg.norm(axes[:, 2].mean(axis=0)) < _ALIKE or abs(upward) > _ALIKE:
         alike = axes[:, 2] @ axes[0, 2] >= _ALIKE
@@ -181,7 +181,7 @@ def spiral(
     pose = look_at(middle, middle + ahead, _mean_direction(-axes[:, 1]))[:3, :3]
     reach = np.percentile(np.abs((centres - middle) @ pose.T), 90, axis=0)
     reach = np.maximum(reach, distance * np.asarray([0.03, 0.03, 0]))
-    # Not through what is looked at.
+    # Keeps the path in front of the focus.
     reach[2] = min(reach[2], 0.5 * distance)
     phase = 2 * np.pi * np.arange(frames) / frames
     steps = [np.cos(turns * phase), np.sin(turns * phase), np.sin(phase)]
@@ -193,18 +193,18 @@ def spiral(
 def interpolate(
     viewmats, frames: int, *, closed: bool = False, depth: float | None = None
 ) -> np.ndarray:
-    """[F, 4, 4]: a smooth flight through all the cameras, in their order.
+    """Return a smooth path [F, 4, 4] through all the cameras, in their order.
 
-    Centripetal Catmull–Rom (Yuksel et al. 2011) of positions and of quaternions,
-    these normalised; so the path and its first derivative are continuous. Frames are
-    at equal steps of sqrt(movement² + (distance of the focus · turn)²), about how far
-    the picture moves. Equal cameras in a row count once; one camera stands still.
+    Centripetal Catmull–Rom splines (Yuksel et al. 2011) of positions and quaternions,
+    normalised, so the path and its first derivative are continuous. Frames are at equal
+    steps of sqrt(movement² + (distance of the focus · rotation)²), about the movement
+    of the image. Consecutive equal cameras count once; a single camera stands still.
 
     Args:
       viewmats: [B, 4, 4].
       frames: F; the first and the last are the first and the last camera, unless
         ``closed``: then frame F would be frame 0.
-      closed: whether to fly back to the first camera.
+      closed: return to the first camera.
       depth: as `focus_point`.
 
     Raises:
@@ -231,41 +231,43 @@ def interpolate(
     dense = np.interp(places, np.arange(pieces + 1), knots)
     lengths = _steps(path(dense), scale)
     lengths = np.concatenate([[0], np.cumsum(lengths)])
-    wanted = np.linspace(0, lengths[-1], frames, endpoint=not closed)
-    return _matrices(path(np.interp(wanted, lengths, dense)))
+    even = np.linspace(0, lengths[-1], frames, endpoint=not closed)
+    return _matrices(path(np.interp(even, lengths, dense)))
 
 
 def _check_frames(frames: int) -> None:
     if frames < 1:
-        raise InputError(f"frames is {frames}; a path has at least 1")
+        raise InputError(
+            f"frames: expected at least 1, got {frames}; pass 60, for instance"
+        )
 
 
 def _centres_and_axes(viewmats) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [B, 3], and rotations [B, 3, 3]: rows right, down, ahead."""
+    """Return positions [B, 3] and rotations [B, 3, 3], rows right, down, ahead."""
     viewmats = np.asarray(viewmats, np.float64)
     if viewmats.ndim != 3 or viewmats.shape[1:] != (4, 4) or len(viewmats) == 0:
         raise InputError(
-            f"viewmats have shape {viewmats.shape}; [B, 4, 4] of at least one camera "
-            "is wanted"
+            "viewmats: expected shape [B, 4, 4] with at least one camera, got "
+            f"{viewmats.shape}; stack the matrices"
         )
     if not np.isfinite(viewmats).all():
-        raise InputError("viewmats have a value that is not finite")
+        raise InputError("viewmats: expected finite values; remove the damaged cameras")
     axes = viewmats[:, :3, :3]
     return -np.einsum("bij,bi->bj", axes, viewmats[:, :3, 3]), axes
 
 
 def _mean_direction(directions: np.ndarray) -> np.ndarray:
-    """[3] unit; the first of them where they cancel."""
+    """Return the mean unit direction [3], or the first direction if they cancel."""
     mean = directions.mean(axis=0)
     length = np.linalg.norm(mean)
     return mean / length if length > 1e-3 else directions[0]
 
 
-# --- keyframes: [·, 7], position and quaternion ---
+# Keyframes: [·, 7], position and quaternion.
 
 
 def _aligned(keys: np.ndarray) -> np.ndarray:
-    """Quaternions with signs such that neighbours are less than half a turn apart."""
+    """Flip quaternions so that neighbours are less than half a turn apart."""
     keys = keys.copy()
     for before, key in pairwise(keys):
         if before[3:] @ key[3:] < 0:
@@ -274,25 +276,26 @@ def _aligned(keys: np.ndarray) -> np.ndarray:
 
 
 def _steps(keys: np.ndarray, scale: float) -> np.ndarray:
-    """How far neighbours are apart; a turn counts as moving ``scale`` away."""
+    """Return the distances of neighbours; an angle counts as a length of ``scale``."""
     moved = np.linalg.norm(np.diff(keys[:, :3], axis=0), axis=1)
     quats = keys[:, 3:] / np.linalg.norm(keys[:, 3:], axis=1, keepdims=True)
-    # Of unit quaternions: the chord is 2 sin(turn / 4).
+    # The chord of unit quaternions is 2 sin(angle / 4).
     chord = np.linalg.norm(np.diff(quats, axis=0), axis=1)
     return np.hypot(moved, scale * 4 * np.arcsin(np.minimum(chord / 2, 1)))
 
 
 def _tangents(keys: np.ndarray, knots: np.ndarray, closed: bool) -> np.ndarray:
-    """Derivatives at the keyframes: of the parabola through each and its neighbours.
+    """Return the derivatives at the keyframes.
 
-    At the ends of an open path, of the one through the three keyframes there.
+    They are those of the parabola through each keyframe and its neighbours, at the ends
+    of an open path through the three keyframes there.
     """
     gaps = np.diff(knots)[:, None]
     slopes = np.diff(keys, axis=0) / gaps
     tangents = np.empty_like(keys)
     tangents[1:-1] = _between(slopes[:-1], slopes[1:], gaps[:-1], gaps[1:])
     if closed:
-        # The last keyframe is the first one; its quaternion may have the other sign.
+        # The last keyframe equals the first; its quaternion may have the other sign.
         sign = np.ones(7)
         sign[3:] = np.sign(keys[0, 3:] @ keys[-1, 3:])
         tangents[0] = _between(sign * slopes[-1], slopes[0], gaps[-1], gaps[0])
@@ -310,7 +313,7 @@ def _between(before, after, gap_before, gap_after):
 
 
 def _matrices(keys: np.ndarray) -> np.ndarray:
-    """viewmats [S, 4, 4] of keys."""
+    """Return the view matrices [S, 4, 4] of keyframes."""
     from scipy.spatial.transform import Rotation
 
     viewmats = np.tile(np.eye(4), (len(keys), 1, 1))

@@ -1,11 +1,10 @@
-"""COLMAP models as scenes: cameras, poses and points of a structure from motion.
+"""COLMAP models as datasets: cameras, poses and points of structure from motion.
 
-The files are read by us, not by pycolmap: that hangs on, or silently accepts, files
-that are truncated (measured with 4.2.1).
+The files are parsed here, not by pycolmap, which hangs on or silently accepts truncated
+files.
 """
 
 import warnings
-from os import PathLike
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -26,14 +25,15 @@ from gsjax.data.image_files import (
     inside,
     last_parts,
 )
-from gsjax.data.types import Dataset, View
+from gsjax.data.types import Dataset, Reader, ReadOptions, View
 from gsjax.errors import InputError
 
-_PLACES = ("sparse/0", "sparse", ".", "colmap/sparse/0")  # the last is nerfstudio's
+_PLACES = ("sparse/0", "sparse", ".")
+_NERFSTUDIO = "colmap/sparse/0"
 
 
 class ColmapModel(NamedTuple):
-    """A model as it stands in its files; rigs.bin and frames.bin are not needed."""
+    """The content of a model's files; rigs.bin and frames.bin are not needed."""
 
     cameras: dict[int, ColmapCamera]
     images: list[ColmapImage]
@@ -41,51 +41,56 @@ class ColmapModel(NamedTuple):
 
 
 def find_colmap(folder: Path) -> Path | None:
-    """Where the model of a dataset lies: sparse/0, sparse, the folder itself, or
-    nerfstudio's colmap/sparse/0."""
-    for place in _PLACES:
-        if any(
-            (folder / place / f"cameras.{form}").exists() for form in ("bin", "txt")
-        ):
-            return folder / place if place != "." else folder
-    return None
+    """Return the folder of a dataset's model, if it has one.
+
+    It is sparse/0, sparse, the folder itself, or nerfstudio's colmap/sparse/0.
+    """
+    return next(
+        filter(None, (_model_in(folder, p) for p in (*_PLACES, _NERFSTUDIO))), None
+    )
+
+
+def _model_in(folder: Path, place: str) -> Path | None:
+    path = folder / place
+    forms = (path / f"cameras.{suffix}" for suffix in ("bin", "txt"))
+    return path if any(form.exists() for form in forms) else None
 
 
 def read_colmap(folder: Path) -> ColmapModel:
-    """Read the cameras, images and points3D files of a folder, .bin before .txt.
+    """Read the cameras, images and points3D files of a folder; .bin precedes .txt.
 
     Raises:
-      InputError: on a missing, truncated or damaged file, on values that cannot be,
-        or on an image of a camera that is not there. A missing points3D is warned of.
+      InputError: if a file is missing, truncated or damaged, a value is impossible, or
+        an image refers to a missing camera. A missing points3D gives a warning.
     """
-    path, reader = _file(folder, "cameras")
-    cameras = reader.read_cameras(path)
-    path, reader = _file(folder, "images")
-    images = reader.read_images(path)
+    path, parser = _file(folder, "cameras")
+    cameras = parser.read_cameras(path)
+    path, parser = _file(folder, "images")
+    images = parser.read_images(path)
     if not images:
         raise InputError(f"{path}: the model has no image; choose another one")
     for image in images:
         if image.camera not in cameras:
             raise InputError(
-                f"{path}: image {image.name!r} is of camera {image.camera}, which the "
-                f"{len(cameras)} cameras of {folder} do not have; the files are not of "
+                f"{path}: image {image.name!r} refers to camera {image.camera}, which "
+                f"is not among the {len(cameras)} cameras of {folder}; use files of "
                 "one model"
             )
     try:
-        path, reader = _file(folder, "points3D")
+        path, parser = _file(folder, "points3D")
     except InputError as error:
-        warnings.warn(f"{error}; the scene has no points", UserWarning, stacklevel=2)
+        warnings.warn(f"{error}; the dataset has no points", UserWarning, stacklevel=2)
         return ColmapModel(cameras, images, _no_points())
-    return ColmapModel(cameras, images, reader.read_points(path))
+    return ColmapModel(cameras, images, parser.read_points(path))
 
 
 def _file(folder: Path, name: str) -> tuple[Path, ModuleType]:
-    for suffix, reader in ((".bin", colmap_binary), (".txt", colmap_text)):
+    for suffix, parser in ((".bin", colmap_binary), (".txt", colmap_text)):
         path = folder / (name + suffix)
         if path.exists():
-            return path, reader
+            return path, parser
     raise InputError(
-        f"{folder}: neither {name}.bin nor {name}.txt is there; a COLMAP model has "
+        f"{folder}: expected {name}.bin or {name}.txt, got neither; a COLMAP model has "
         "cameras, images and points3D"
     )
 
@@ -101,23 +106,25 @@ def _no_points() -> ColmapPoints:
 
 
 def _warn_of_larger(place: Path, count: int) -> None:
-    """Tell of another model beside the one that is read, if it has more images: COLMAP
-    writes several where it could not join them."""
+    """Warn if another model beside this one has more images.
+
+    COLMAP writes several models if it could not join them, in no particular order.
+    """
     if place.name != "0":
         return
     counts = {path: _declared(path) for path in place.parent.glob("*/images.bin")}
     path = max(counts, key=lambda path: counts[path], default=place)
     if counts.get(path, 0) > count:
         warnings.warn(
-            f"{place}: {count} images are in this model, and {counts[path]} in "
-            f"{path.parent}; to take that, put it in the place of the first",
+            f"{place}: this model has {count} images, that of {path.parent} "
+            f"{counts[path]}; to use the larger one, exchange the two folders",
             UserWarning,
             stacklevel=3,
         )
 
 
 def _declared(path: Path) -> int:
-    """How many images an images.bin says it has; 0 if there is no room for so many."""
+    """Return the number of images that an images.bin declares; 0 if they cannot fit."""
     try:
         with path.open("rb") as file:
             count = int.from_bytes(file.read(8), "little")
@@ -127,10 +134,11 @@ def _declared(path: Path) -> int:
 
 
 def _path(place: Path, listed: str, root: Path, moved: bool) -> str:
-    """Where a photograph lies in ``root``, by its name in the model.
+    """Return the path of a photograph relative to ``root``, from its name in the model.
 
-    Of one that was ``moved`` to another folder, the end of it that does not lead out;
-    and some models are of the folder above, and name that of the photographs, too.
+    For photographs ``moved`` to another folder it is the last part of the name that
+    does not leave the folder. Names of some models are relative to the folder above and
+    start with ``images``.
     """
     if moved:
         listed = last_parts(listed) or listed
@@ -142,41 +150,36 @@ def _path(place: Path, listed: str, root: Path, moved: bool) -> str:
 
 
 def _name(root: Path, path: str, found: dict[str, Path]) -> str | None:
-    """What a photograph is called: where it was looked for, or where it was found in
-    another folder; None if it is missing."""
+    """Return the name of a view; None if its photograph is missing.
+
+    It is the path that was searched, or the path of the file if found elsewhere.
+    """
     file = found.get(path)
     if file is None or file.parent == (root / path).parent:
         return None if file is None else path
     return file.relative_to(root).as_posix()
 
 
-def load_colmap(
-    folder: Path,
-    *,
-    images: str | PathLike[str] | None = None,
-    skip_missing: bool = False,
-    factor: int | None = None,
-    poses_only: bool = False,
-) -> Dataset:
-    """The scene of a dataset that has a COLMAP model; see `load_dataset`."""
+def load_colmap(folder: Path, options: ReadOptions | None = None) -> Dataset:
+    """Read the dataset of a folder that contains a COLMAP model; see `load_dataset`."""
+    options = options or ReadOptions()
     place = find_colmap(folder)
     if place is None:
-        raise InputError(f"{folder}: no cameras.bin or cameras.txt in {_PLACES}")
+        raise InputError(
+            f"{folder}: expected cameras.bin or cameras.txt in one of "
+            f"{', '.join((*_PLACES, _NERFSTUDIO))}; pass the folder of a dataset"
+        )
     model = read_colmap(place)
     _warn_of_larger(place, len(model.images))
-    root = image_folder(folder, images, factor, poses_only=poses_only)
-    moved = images is not None or poses_only
+    root = image_folder(folder, options)
+    moved = options.images is not None or options.poses_only
     paths = {i.name: _path(place, i.name, root, moved) for i in model.images}
     found = find_files(
-        *(place, root, paths.values()),
-        skip_missing=skip_missing,
-        elsewhere=images is not None,
-        factor=factor,
-        poses_only=poses_only,
+        place, root, paths.values(), options, elsewhere=options.images is not None
     )
     names = {listed: _name(root, path, found) for listed, path in paths.items()}
     called = list(filter(None, names.values()))
-    masks = {} if poses_only else find_masks(folder / "masks", called)
+    masks = {} if options.poses_only else find_masks(folder / "masks", called)
     views = []
     for image in model.images:
         name, camera = names[image.name], model.cameras[image.camera]
@@ -195,3 +198,15 @@ def load_colmap(
         views.append(view)
     points = model.points
     return Dataset(place, "colmap", tuple(views), points.xyz, points.colors)
+
+
+COLMAP = Reader(
+    "COLMAP",
+    lambda path: any(_model_in(path, place) for place in _PLACES),
+    load_colmap,
+)
+NERFSTUDIO_COLMAP = Reader(
+    "COLMAP of nerfstudio",
+    lambda path: _model_in(path, _NERFSTUDIO) is not None,
+    load_colmap,
+)

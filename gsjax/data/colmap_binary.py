@@ -1,7 +1,7 @@
-"""COLMAP's binary files, read strictly: cameras.bin, images.bin, points3D.bin.
+"""Strict parser of COLMAP's binary files: cameras.bin, images.bin, points3D.bin.
 
-Little-endian, without padding. What a file declares is held against its size before
-anything is allocated, and a file is used whole or not at all.
+They are little-endian without padding. Declared sizes are checked against the file size
+before any allocation, and a file must be consumed completely.
 """
 
 import struct
@@ -14,11 +14,11 @@ from gsjax.data.colmap_model import (
     ColmapCamera,
     ColmapImage,
     ColmapPoints,
+    duplicate_id,
     kind_of,
     make_colmap_camera,
     make_colmap_image,
     sorted_points,
-    twice,
 )
 from gsjax.errors import InputError
 from gsjax.runtime.files import read_bytes
@@ -32,12 +32,13 @@ _FIELDS = (
     *(("error", "<f8"), ("n", "<u8")),
 )
 _POINT = np.dtype([*_FIELDS])
-_PIECE = 1 << 12  # records gathered at a time
+_CHUNK = 1 << 12  # records gathered at a time
 _TRACK_BYTES = 8  # image and index of the observation, uint32 each
+_REMEDY = "the file is truncated or damaged: export or copy it again"
 
 
 class _Data:
-    """The bytes of a file and how far they are read."""
+    """The bytes of a file and the read position."""
 
     def __init__(self, path: Path, least: int, records: str):
         self.bytes = read_bytes(path, "a file of COLMAP")
@@ -47,8 +48,7 @@ class _Data:
         if self.count * least > self.size - self.offset:
             raise InputError(
                 f"{path}: byte 0: the count says {self.count} {records} of at least "
-                f"{least} bytes each, {self.size - self.offset} bytes follow; the file "
-                "is truncated or damaged: export or copy it again"
+                f"{least} bytes each, got {self.size - self.offset} bytes; {_REMEDY}"
             )
 
     def take(self, form: struct.Struct, what: str) -> tuple:
@@ -63,9 +63,8 @@ class _Data:
 
     def truncated(self, size: int, what: str) -> InputError:
         return InputError(
-            f"{self.path}: byte {self.offset}: {what} takes {size} bytes, "
-            f"{self.size - self.offset} are left of {self.size}; the file is truncated "
-            "or damaged: export or copy it again"
+            f"{self.path}: byte {self.offset}: expected {size} bytes for {what}, got "
+            f"{self.size - self.offset} of {self.size}; {_REMEDY}"
         )
 
     def finish(self, records: str) -> None:
@@ -78,7 +77,7 @@ class _Data:
 
 
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
-    """Cameras of a cameras.bin, by id."""
+    """Return the cameras of a cameras.bin by id."""
     data = _Data(path, _CAMERA.size, "cameras")
     cameras: dict[int, ColmapCamera] = {}
     for index in range(data.count):
@@ -88,14 +87,14 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
         form = struct.Struct(f"<{kind.size}d")
         params = data.take(form, f"{kind.name} camera {index}")
         if identity in cameras:
-            raise twice(where, identity, "camera")
+            raise duplicate_id(where, identity, "camera")
         cameras[identity] = make_colmap_camera(where, kind, (size[0], size[1]), params)
     data.finish("cameras")
     return cameras
 
 
 def read_images(path: Path) -> list[ColmapImage]:
-    """Images of an images.bin, in its order; their 2D points are skipped."""
+    """Return the images of an images.bin in file order; 2D points are skipped."""
     data = _Data(path, _IMAGE.size + 1 + _COUNT.size, "images")
     images: list[ColmapImage] = []
     identities: set[int] = set()
@@ -106,7 +105,7 @@ def read_images(path: Path) -> list[ColmapImage]:
         (points,) = data.take(_COUNT, f"the number of 2D points of image {index}")
         data.skip(points * _POINT_2D_BYTES, f"the {points} 2D points of image {index}")
         if identity in identities:
-            raise twice(where, identity, "image")
+            raise duplicate_id(where, identity, "image")
         identities.add(identity)
         images.append(make_colmap_image(where, name, camera, tuple(pose)))
     data.finish("images")
@@ -118,9 +117,8 @@ def _name(data: _Data, where: str) -> str:
     end = data.bytes.find(b"\0", data.offset, limit)
     if end < 0:
         raise InputError(
-            f"{where}: its name (byte {data.offset}) has no end within "
-            f"{MAX_NAME_BYTES} bytes; the file is truncated or damaged: export or copy "
-            "it again"
+            f"{where}: the name (byte {data.offset}) has no end within "
+            f"{MAX_NAME_BYTES} bytes; {_REMEDY}"
         )
     raw = data.bytes[data.offset : end]
     data.offset = end + 1
@@ -128,40 +126,41 @@ def _name(data: _Data, where: str) -> str:
         return raw.decode()
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{where}: its name {raw[:80]!r} is not UTF-8; the file is damaged, or the "
-            "photograph is to be renamed"
+            f"{where}: the name {raw[:80]!r} is not UTF-8; rename the photograph, or "
+            "export the file again"
         ) from error
 
 
 def read_points(path: Path) -> ColmapPoints:
-    """Points of a points3D.bin, sorted by id; of the tracks only the length."""
+    """Return the points of a points3D.bin sorted by id; of tracks only the length."""
     data = _Data(path, _POINT.itemsize, "points")
     raw = np.frombuffer(data.bytes, np.uint8)
     fields = {name: np.empty((data.count, *s), kind) for name, kind, *s in _FIELDS}
-    for first in range(0, data.count, _PIECE):
-        piece = range(first, min(first + _PIECE, data.count))
-        starts = _point_starts(data, piece)
+    for first in range(0, data.count, _CHUNK):
+        chunk = range(first, min(first + _CHUNK, data.count))
+        starts = _point_starts(data, chunk)
         # A gather of the fixed part of records: [·, 51] bytes.
         rows = raw[starts[:, None] + np.arange(_POINT.itemsize)].view(_POINT)[:, 0]
         for name, field in fields.items():
-            field[piece.start : piece.stop] = rows[name]
+            field[chunk.start : chunk.stop] = rows[name]
     data.finish("points")
-    # Sorting copies: what was read must not be held as well.
+    # Sorting copies; free the file's bytes first.
     del data, raw
     identities, xyz, rgb, errors, lengths = fields.values()
     lengths = lengths.view(np.int64)
     return sorted_points(str(path), ColmapPoints(identities, xyz, rgb, errors, lengths))
 
 
-def _point_starts(data: _Data, piece: range) -> np.ndarray:
-    """Where each record of a piece starts, which follows those read before: a chain of
-    lengths, walked in plain Python.
+def _point_starts(data: _Data, chunk: range) -> np.ndarray:
+    """Return the byte offsets of the records of a chunk and advance past them.
+
+    Each offset depends on the track length before it, hence the loop.
     """
     content, size = data.bytes, data.size
     unpack, fixed, length_at = _COUNT.unpack_from, _POINT.itemsize, _POINT.itemsize - 8
     starts = []
     at = data.offset
-    for index in piece:
+    for index in chunk:
         starts.append(at)
         end = at + fixed
         if end <= size:

@@ -1,7 +1,7 @@
-"""What a COLMAP model holds, and the checks that both of its file forms share.
+"""Content of a COLMAP model, and the checks that both file forms share.
 
-Poses are world → camera, quaternions wxyz; pixel centres at + 0.5. The models of
-cameras and their numbers are those of COLMAP's `src/colmap/sensor/models.h`.
+Poses are world → camera, quaternions wxyz, pixel centres at + 0.5. Camera models and
+their numbers are those of COLMAP's `src/colmap/sensor/models.h`.
 """
 
 import math
@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsjax.data.types import Distortion, intrinsic_matrix
+from gsjax.cameras.distortion import Distortion
+from gsjax.data.types import intrinsic_matrix
 from gsjax.errors import InputError
 
 MAX_NAME_BYTES = 1024
 MAX_SIDE = 1 << 20
-# Coordinates are bounded so that products stay finite and float32 holds the result.
+# Keeps products of coordinates finite, and their results within float32.
 MAX_COORDINATE = 1e30
 
 
@@ -24,10 +25,11 @@ class CameraKind(NamedTuple):
     Attributes:
       name: as in cameras.txt.
       number: as in cameras.bin.
-      size: how many parameters it has.
+      size: number of parameters.
       focals: how many of them are focal lengths (1: fx = fy); cx and cy follow.
-      lens: kind of `Distortion` of what is left, "" if nothing is; None if unsupported.
-      order: where each left-over parameter stands in the coefficients of the lens.
+      lens: model of the `Distortion` that the remaining parameters describe, "" if
+        there is none; None if unsupported.
+      order: index of each remaining parameter in the distortion's coefficients.
     """
 
     name: str
@@ -38,7 +40,7 @@ class CameraKind(NamedTuple):
     order: tuple[int, ...] = ()
 
 
-_RADIAL, _FISHEYE = "radial_tangential", "fisheye"
+_RADIAL, _FISHEYE = "opencv", "fisheye"
 CAMERA_KINDS = (
     CameraKind("SIMPLE_PINHOLE", 0, 3, 1, ""),
     CameraKind("PINHOLE", 1, 4, 2, ""),
@@ -61,10 +63,11 @@ CAMERA_KINDS = (
 )
 KIND_OF_NUMBER = {kind.number: kind for kind in CAMERA_KINDS}
 KIND_OF_NAME = {kind.name: kind for kind in CAMERA_KINDS}
+_SUPPORTED = ", ".join(kind.name for kind in CAMERA_KINDS if kind.lens is not None)
 
 
 class ColmapCamera(NamedTuple):
-    """Intrinsics: [3, 3] in px of an image of width × height, and the lens."""
+    """Intrinsics [3, 3] in px of an image of width × height, and the distortion."""
 
     width: int
     height: int
@@ -73,7 +76,7 @@ class ColmapCamera(NamedTuple):
 
 
 class ColmapImage(NamedTuple):
-    """A registered image: world → camera as [4] unit wxyz and [3]."""
+    """A registered image: world → camera as [4] unit quaternion wxyz and [3]."""
 
     name: str
     camera: int
@@ -82,14 +85,14 @@ class ColmapImage(NamedTuple):
 
 
 class ColmapPoints(NamedTuple):
-    """Points sorted by their number.
+    """Points sorted by id.
 
     Attributes:
       ids: [M] uint64.
       xyz: [M, 3] float64.
       colors: [M, 3] uint8.
-      errors: [M] mean reprojection error, px; negative or NaN where unknown.
-      track_lengths: [M] int64, in how many images each point was seen.
+      errors: [M] mean reprojection error, px; negative or NaN if unknown.
+      track_lengths: [M] int64, number of images that observed each point.
     """
 
     ids: np.ndarray
@@ -100,13 +103,12 @@ class ColmapPoints(NamedTuple):
 
 
 def kind_of(where: str, key: int | str) -> CameraKind:
-    """The camera model of a number or name, known to us or not supported."""
+    """Return the camera model of a number or name, supported or not."""
     kind = KIND_OF_NUMBER.get(key) if isinstance(key, int) else KIND_OF_NAME.get(key)
     if kind is None:
         raise InputError(
-            f"{where}: camera model {key!r} is unknown; the file is damaged, or newer "
-            "than this reader: export it again, with a model of "
-            f"{', '.join(k.name for k in CAMERA_KINDS if k.lens is not None)}"
+            f"{where}: unknown camera model {key!r}; the file is damaged or newer than "
+            f"this reader: export it again, with one of {_SUPPORTED}"
         )
     return kind
 
@@ -114,31 +116,29 @@ def kind_of(where: str, key: int | str) -> CameraKind:
 def make_colmap_camera(
     where: str, kind: CameraKind, size: tuple[int, int], params: tuple[float, ...]
 ) -> ColmapCamera:
-    """Check the values of a camera and put them into our terms."""
+    """Check the values of a camera and convert them to K and distortion."""
     if kind.lens is None:
         raise InputError(
             f"{where}: camera model {kind.name} is not supported; undistort the images "
-            "with `colmap image_undistorter`, or estimate the cameras anew with "
-            "`gsjax sfm`; supported: "
-            + ", ".join(k.name for k in CAMERA_KINDS if k.lens is not None)
+            "with `colmap image_undistorter`, or estimate the cameras again with "
+            f"`gsjax sfm`; supported: {_SUPPORTED}"
         )
     if not all(1 <= side <= MAX_SIDE for side in size):
         raise InputError(
-            f"{where}: image size {size[0]} × {size[1]}; 1 to {MAX_SIDE} px a side is "
-            "wanted; the file is damaged: export or copy it again"
+            f"{where}: expected an image size of 1 to {MAX_SIDE} px a side, got "
+            f"{size[0]} × {size[1]}; the file is damaged: export or copy it again"
         )
     if not all(math.isfinite(p) and abs(p) < MAX_COORDINATE for p in params):
         raise InputError(
-            f"{where}: parameters {params}; finite numbers are wanted: estimate the "
-            "camera again"
+            f"{where}: expected finite parameters, got {params}; estimate the camera "
+            "again"
         )
     cx, cy = params[kind.focals : kind.focals + 2]
     K = intrinsic_matrix(where, (params[0], params[kind.focals - 1]), (cx, cy))
-    rest = params[kind.focals + 2 :]
-    return ColmapCamera(*size, K, _lens(kind, rest))
+    return ColmapCamera(*size, K, _distortion(kind, params[kind.focals + 2 :]))
 
 
-def _lens(kind: CameraKind, rest: tuple[float, ...]) -> Distortion | None:
+def _distortion(kind: CameraKind, rest: tuple[float, ...]) -> Distortion | None:
     # A fisheye of zero coefficients is equidistant, not a pinhole.
     if not kind.lens or (kind.lens == _RADIAL and not any(rest)):
         return None
@@ -155,28 +155,27 @@ def make_colmap_image(
     values = np.asarray(pose, np.float64)
     if not (np.abs(values) < MAX_COORDINATE).all():
         raise InputError(
-            f"{where}: pose {values.tolist()} of {name!r}; finite numbers are wanted; "
-            "remove the image from the model"
+            f"{where}: expected a pose of finite numbers for {name!r}, got "
+            f"{values.tolist()}; remove the image from the model"
         )
     quat = values[:4]
-    largest = np.abs(quat).max()
-    if largest < 1e-30:
+    if np.abs(quat).max() < 1e-30:
         raise InputError(
-            f"{where}: the quaternion of {name!r} is zero; a rotation is wanted; "
-            "remove the image from the model"
+            f"{where}: the quaternion of {name!r} is zero; remove the image from the "
+            "model"
         )
     if not name:
         raise InputError(
             f"{where}: the name of the image is empty; remove it from the model"
         )
     norm = np.linalg.norm(quat)
-    # A norm that is 1 but for rounding is left alone: the pose is then the file's.
+    # Keeps the bits of the file if the norm is 1 up to rounding.
     quat = quat if abs(norm - 1) < 1e-12 else quat / norm
     return ColmapImage(name, camera, quat, values[4:])
 
 
-def twice(where: str, identity: int, what: str) -> InputError:
-    """The error of an id that another camera or image has."""
+def duplicate_id(where: str, identity: int, what: str) -> InputError:
+    """Return the error for an id that another camera or image has."""
     return InputError(
         f"{where}: the id {identity} is that of another {what}; the file is damaged: "
         "export or copy it again"
@@ -184,9 +183,9 @@ def twice(where: str, identity: int, what: str) -> InputError:
 
 
 def sorted_points(where: str, points: ColmapPoints) -> ColmapPoints:
-    """Points in the order of their ids, which are checked, as are the coordinates.
+    """Return points sorted by id, after a check of ids and coordinates.
 
-    They are put in order where they are, field by field: no copy is made of all.
+    The arrays are sorted in place, one at a time, to bound the memory.
     """
     if (points.ids[1:] < points.ids[:-1]).any():
         order = np.argsort(points.ids, kind="stable")
@@ -195,7 +194,7 @@ def sorted_points(where: str, points: ColmapPoints) -> ColmapPoints:
     again = np.flatnonzero(points.ids[1:] == points.ids[:-1])
     if len(again):
         raise InputError(
-            f"{where}: {len(again)} points have an id that another one has, the first: "
+            f"{where}: {len(again)} points have the id of another point, the first: "
             f"{points.ids[again[:5]].tolist()}; the file is damaged: export or copy it "
             "again"
         )
@@ -203,14 +202,14 @@ def sorted_points(where: str, points: ColmapPoints) -> ColmapPoints:
     if wild.any():
         raise InputError(
             f"{where}: {wild.sum()} of {len(points.xyz)} points have coordinates that "
-            f"are no finite numbers, the first: point {points.ids[wild][:5].tolist()}; "
-            "remove them from the model"
+            f"are not finite, the first: point {points.ids[wild][:5].tolist()}; remove "
+            "them from the model"
         )
     return points
 
 
 def viewmat_of(quat: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """World → camera [4, 4] of a unit quaternion wxyz and a translation."""
+    """Return the [4, 4] world → camera matrix of a unit quaternion wxyz and [3]."""
     w, x, y, z = quat
     viewmat = np.eye(4)
     viewmat[:3, :3] = [
@@ -220,20 +219,3 @@ def viewmat_of(quat: np.ndarray, translation: np.ndarray) -> np.ndarray:
     ]
     viewmat[:3, 3] = translation
     return viewmat
-
-
-def quat_of(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion wxyz, w ≥ 0, of a rotation matrix [3, 3]."""
-    # The eigenvector of the largest eigenvalue of a symmetric 4 × 4 matrix (Bar-Itzhack
-    # 2000): no branches, and the nearest rotation if the matrix is slightly off.
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    symmetric = np.asarray(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, b + d, c + g],
-            [c - g, b + d, e - a - i, f + h],
-            [d - b, c + g, f + h, i - a - e],
-        ]
-    )
-    quat = np.linalg.eigh(symmetric)[1][:, -1]
-    return -quat if quat[0] < 0 else quat

@@ -1,7 +1,8 @@
-"""COLMAP's text files, read strictly: cameras.txt, images.txt, points3D.txt."""
+"""Strict parser of COLMAP's text files: cameras.txt, images.txt, points3D.txt."""
 
 import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,13 @@ from gsjax.data.colmap_model import (
     ColmapCamera,
     ColmapImage,
     ColmapPoints,
+    duplicate_id,
     kind_of,
     make_colmap_camera,
     make_colmap_image,
     sorted_points,
-    twice,
 )
-from gsjax.data.text_file import TextFile, open_text
+from gsjax.data.text_file import blocks, lines, read_text, too_long
 from gsjax.errors import InputError
 from gsjax.io.numerals import (
     find_words,
@@ -27,26 +28,42 @@ from gsjax.io.numerals import (
 )
 
 _UINT32, _UINT64 = (1 << 32) - 1, (1 << 64) - 1
-# Characters of a line: of a camera or an image; and of a point, whose track then has
-# room for some 70 000 photographs.
+# Bytes of a line: of a camera or an image; and of a point, which leaves space for
+# a track of some 70 000 photographs.
 _LONGEST, _LONGEST_POINT = 1 << 14, 1 << 20
-_WANTED = "a file of COLMAP"
-# Of a point without a track: "1 0 0 0 0 0 0 0" and its end.
+_EXPECTED = "a file of COLMAP"
+# Bytes of a point without a track: "1 0 0 0 0 0 0 0" and the line end.
 _LEAST_POINT = 16
+_REMEDY = "the file is truncated or damaged: export or copy it again"
 _SPACE = np.uint8(32)
+_COMMENT = re.compile(rb"(?m)^[ \t]*(#.*)$")
 _FIELDS = {"ids": ("<u8",), "xyz": ("<f8", 3), "colors": ("u1", 3)}
 _FIELDS |= {"errors": ("<f8",), "track_lengths": ("<i8",)}
 
 
-def _is_record(line: str) -> bool:
-    return bool(line) and not line.startswith("#")
+def _records(
+    text: Iterator[tuple[str, bytes]], declared: list[int], name: str
+) -> Iterator[tuple[str, str]]:
+    """Yield the places and contents of lines that are neither blank nor comments.
+
+    The number of records that a comment states is appended to ``declared``.
+    """
+    for where, line in text:
+        if len(line) > _LONGEST:
+            raise too_long(where, _LONGEST)
+        record = line.decode().strip()
+        if record and not record.startswith("#"):
+            yield where, record
+        else:
+            declared += _declared(record, name)
 
 
 def _whole(where: str, what: str, text: str, most: int) -> int:
     if re.fullmatch("[0-9]{1,20}", text) and int(text) <= most:
         return int(text)
     raise InputError(
-        f"{where}: {what} is {text[:40]!r}; a whole number from 0 to {most} is wanted"
+        f"{where}: expected a whole number from 0 to {most} as {what}, got "
+        f"{text[:40]!r}; export or copy the file again"
     )
 
 
@@ -54,32 +71,31 @@ def _floats(where: str, texts: list[str]) -> tuple[float, ...]:
     try:
         return tuple(parse_number(text) for text in texts)
     except ValueError as error:
-        raise InputError(f"{where}: {str(error)[:80]}; pass numbers") from error
+        raise InputError(
+            f"{where}: expected numbers, {str(error)[:80]}; export or copy the "
+            "file again"
+        ) from error
 
 
-def _words(where: str, line: str, least: int, wanted: str, split: int = -1):
+def _words(where: str, line: str, least: int, expected: str, split: int = -1):
     words = line.split(maxsplit=split)
     if len(words) < least:
         raise InputError(
-            f"{where}: found {len(words)} values, {wanted} is wanted; the file is "
-            "truncated or damaged: export or copy it again"
+            f"{where}: expected {expected}, got {len(words)} values; {_REMEDY}"
         )
     return words
 
 
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
-    """Cameras of a cameras.txt, by id."""
+    """Return the cameras of a cameras.txt by id."""
     cameras: dict[int, ColmapCamera] = {}
-    declared = None
-    with open_text(path, _WANTED) as text:
-        for line in text.lines(_LONGEST):
-            if not _is_record(line):
-                declared = _declared(line, "cameras", declared)
-                continue
-            identity, camera = _camera(text.where(), line)
-            if identity in cameras:
-                raise twice(text.where(), identity, "camera")
-            cameras[identity] = camera
+    declared: list[int] = []
+    text = lines(path, read_text(path, _EXPECTED))
+    for where, record in _records(text, declared, "cameras"):
+        identity, camera = _camera(where, record)
+        if identity in cameras:
+            raise duplicate_id(where, identity, "camera")
+        cameras[identity] = camera
     _compare(path, "cameras", len(cameras), declared)
     return cameras
 
@@ -95,103 +111,94 @@ def _camera(where: str, line: str) -> tuple[int, ColmapCamera]:
     params = _floats(where, words[4:])
     if len(params) != kind.size:
         raise InputError(
-            f"{where}: found {len(params)} parameters, {kind.name} has {kind.size}; "
-            "the file is truncated or damaged: export it again"
+            f"{where}: expected {kind.size} parameters of {kind.name}, got "
+            f"{len(params)}; {_REMEDY}"
         )
     return identity, make_colmap_camera(where, kind, size, params)
 
 
 def read_images(path: Path) -> list[ColmapImage]:
-    """Images of an images.txt, in its order; their 2D points are skipped."""
+    """Return the images of an images.txt in file order; 2D points are skipped."""
     images: list[ColmapImage] = []
     identities: set[int] = set()
-    declared, whole = None, True
-    with open_text(path, _WANTED) as text:
-        for line in text.lines(_LONGEST):
-            if not _is_record(line):
-                declared = _declared(line, "images", declared)
-                continue
-            identity, image = _image(text.where(), line)
-            if identity in identities:
-                raise twice(text.where(), identity, "image")
-            identities.add(identity)
-            images.append(image)
-            # A line of its own after each image, which may be empty.
-            whole = _pass_observations(text)
+    declared: list[int] = []
+    text, observations = lines(path, read_text(path, _EXPECTED)), ("", b"")
+    for where, record in _records(text, declared, "images"):
+        identity, image = _image(where, record)
+        if identity in identities:
+            raise duplicate_id(where, identity, "image")
+        identities.add(identity)
+        images.append(image)
+        # Each image is followed by a line of 2D points, which may be empty.
+        observations = next(text, None)
+        if observations is not None:
+            _check_observations(*observations)
     _compare(path, "images", len(images), declared)
-    if not whole:
+    if observations is None:
         warnings.warn(
-            f"{path}: the line of 2D points (which may be empty) of the last image is "
-            "missing; the file may be truncated: export or copy it again",
+            f"{path}: the last image has no line of 2D points (it may be empty); the "
+            "file may be truncated: export or copy it again",
             UserWarning,
             stacklevel=2,
         )
     return images
 
 
-def _pass_observations(text: TextFile) -> bool:
-    """Pass a line that may be the 2D points of an image; False if there is no line.
-
-    Raises:
-      InputError: if it is something else; as where it was left out, and the next image
-        stands there.
-    """
-    found = text.pass_line()
-    if found is None:
-        return False
-    count, last = found
-    number = last.removeprefix("-") or "0"
+def _check_observations(where: str, line: bytes) -> None:
+    """Raise unless a line may be the 2D points of an image, and not the next image."""
+    ink = np.frombuffer(b" " + line, np.uint8) > _SPACE
+    count = np.count_nonzero(ink[1:] & ~ink[:-1])  # words
+    last = (line[-80:].decode(errors="replace").split() or ["0"])[-1][-40:]
+    number = last.removeprefix("-")
     if count % 3 or not (number.isascii() and number.isdecimal()):
         raise InputError(
-            f"{text.where()}: {count} values, the last {last!r}; X Y POINT3D_ID of "
-            "each 2D point, or an empty line, is wanted after an image"
+            f"{where}: expected X Y POINT3D_ID of each 2D point or an empty line after "
+            f"an image, got {count} values, the last {last!r}; export or copy the file "
+            "again"
         )
-    return True
 
 
 def _image(where: str, line: str) -> tuple[int, ColmapImage]:
-    wanted = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-    words = _words(where, line, 10, wanted, 9)
+    expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+    words = _words(where, line, 10, expected, 9)
     identity = _whole(where, "the image id", words[0], _UINT32)
     camera = _whole(where, "the camera id", words[8], _UINT32)
     if len(words[9].encode()) > MAX_NAME_BYTES:
         raise InputError(
-            f"{where}: a name of more than {MAX_NAME_BYTES} bytes; rename it"
+            f"{where}: expected a name of at most {MAX_NAME_BYTES} bytes; rename the "
+            "photograph"
         )
     pose = _floats(where, words[1:8])
     return identity, make_colmap_image(where, words[9], camera, pose)
 
 
 def read_points(path: Path) -> ColmapPoints:
-    """Points of a points3D.txt, sorted by id; of the tracks only the length.
+    """Return the points of a points3D.txt sorted by id; of tracks only the length.
 
-    Whether the images of a track are there is not looked at: the points of a model
-    from which images were taken off are still good to start from.
+    A track may refer to images that were removed from the model.
     """
-    count, declared = 0, None
-    with open_text(path, _WANTED) as text:
-        most = text.most_lines(_LEAST_POINT)
-        fields = {
-            key: np.empty((most, *s), kind) for key, (kind, *s) in _FIELDS.items()
-        }
-        for block in text.blocks(_LONGEST_POINT):
-            if "#" in block:
-                for comment in re.findall("(?m)^[ \t]*(#.*)$", block):
-                    declared = _declared(comment, "points", declared)
-                block = re.sub("(?m)^[ \t]*#.*$", "", block)
-            rows = _points(block)
-            if rows is None:
-                raise _bad_block(path, text.number, block)
-            size = len(rows["ids"])
-            if count + size > most:
-                raise InputError(f"{path}: grew while it was read; wait for its end")
-            for name, field in fields.items():
-                field[count : count + size] = rows[name]
-            count += size
+    count = 0
+    declared: list[int] = []
+    text = read_text(path, _EXPECTED)
+    most = min(text.count(b"\n"), len(text) // _LEAST_POINT) + 1
+    fields = {key: np.empty((most, *s), kind) for key, (kind, *s) in _FIELDS.items()}
+    for number, block in blocks(path, text, _LONGEST_POINT):
+        if b"#" in block:
+            for comment in _COMMENT.findall(block):
+                declared += _declared(comment.decode(), "points")
+            block = _COMMENT.sub(b"", block)
+        rows = _points(block)
+        if rows is None:
+            raise _bad_block(path, number, block)
+        size = len(rows["ids"])
+        for name, field in fields.items():
+            field[count : count + size] = rows[name]
+        count += size
+    del text
     _compare(path, "points", count, declared)
     if not count:
         warnings.warn(
-            f"{path}: no points are in it; the scene has none to start from",
+            f"{path}: the file has no points to start from",
             UserWarning,
             stacklevel=2,
         )
@@ -199,16 +206,16 @@ def read_points(path: Path) -> ColmapPoints:
     return sorted_points(str(path), points)
 
 
-def _points(block: str) -> dict[str, np.ndarray] | None:
-    """The fields of the points of whole lines; None if a line is none, nor blank."""
-    raw = np.frombuffer(block.encode(), np.uint8)
+def _points(block: bytes) -> dict[str, np.ndarray] | None:
+    """Return the fields of the points in whole lines; None if a line is malformed."""
+    raw = np.frombuffer(block, np.uint8)
     starts, first, counts, ends = find_words(raw)
     first, counts, ends = (values[counts > 0] for values in (first, counts, ends))
     if not len(counts):
         return {name: np.empty((0, *s), kind) for name, (kind, *s) in _FIELDS.items()}
     if (counts < 8).any() or (counts % 2).any():
         return None
-    # Where the ids end, and the tracks begin: both are of digits alone.
+    # Ends of the ids and starts of the tracks: both consist of digits only.
     second = starts[first + 1]
     tracks = np.where(counts > 8, np.append(starts, len(raw))[first + 8], ends)
     other = other_than_digits(raw)
@@ -240,12 +247,12 @@ def _points(block: str) -> dict[str, np.ndarray] | None:
 
 
 def _identities(
-    block: str, values: np.ndarray, starts: np.ndarray, ends: np.ndarray
+    block: bytes, values: np.ndarray, starts: np.ndarray, ends: np.ndarray
 ) -> np.ndarray | None:
-    """Whole numbers, of which ``values`` hold what float64 can; None if too large."""
-    long = ends - starts > 15  # digits, all of which float64 still has
+    """Return ids as uint64, re-reading those that float64 rounds; None if too large."""
+    long = ends - starts > 15  # digits that float64 represents exactly
     ids = np.where(long, 0, values).astype(np.uint64)
-    for row in np.flatnonzero(long):  # of plain ASCII: bytes are characters
+    for row in np.flatnonzero(long):
         value = int(block[starts[row] : ends[row]])
         if value > _UINT64:
             return None
@@ -253,25 +260,27 @@ def _identities(
     return ids
 
 
-def _bad_block(path: Path, number: int, block: str) -> InputError:
-    """What is wrong with the first bad one of the lines after ``number``."""
-    for row, line in enumerate(block.split("\n"), number + 1):
+def _bad_block(path: Path, number: int, block: bytes) -> InputError:
+    """Return the error of the first malformed line after ``number``."""
+    for row, line in enumerate(block.decode().split("\n"), number + 1):
         words = line.split()
         error = _bad_point(f"{path}: line {row}", words) if words else None
         if error is not None:
             return error
     return InputError(
-        f"{path}: after line {number}: characters that are of no text of numbers; the "
+        f"{path}: after line {number}: expected numbers, got other characters; the "
         "file is damaged: export or copy it again"
     )
 
 
 def _bad_point(where: str, words: list[str]) -> InputError | None:
-    """What is wrong with a line of points3D.txt, if anything is."""
+    """Return the error of a line of points3D.txt, if it is malformed."""
     try:
         if len(words) < 8:
-            wanted = "POINT3D_ID X Y Z R G B ERROR TRACK is wanted; export it again"
-            return InputError(f"{where}: found {len(words)} values, {wanted}")
+            expected = "expected POINT3D_ID X Y Z R G B ERROR TRACK"
+            return InputError(
+                f"{where}: {expected}, got {len(words)} values; {_REMEDY}"
+            )
         _whole(where, "the point id", words[0], _UINT64)
         values = _floats(where, words[1:8])
         for word in words[8:]:
@@ -280,29 +289,29 @@ def _bad_point(where: str, words: list[str]) -> InputError | None:
         return error
     if len(words) % 2:
         return InputError(
-            f"{where}: the track has {len(words) - 8} values; pairs of IMAGE_ID "
-            "POINT2D_IDX are wanted; the file is truncated or damaged: export or copy "
-            "it again"
+            f"{where}: expected a track of pairs IMAGE_ID POINT2D_IDX, got "
+            f"{len(words) - 8} values; {_REMEDY}"
         )
     colors = values[3:6]
     if not all(0 <= color <= 255 and color % 1 == 0 for color in colors):
         return InputError(
-            f"{where}: colour {[*colors]}; whole numbers from 0 to 255 are wanted"
+            f"{where}: expected a colour of whole numbers from 0 to 255, got "
+            f"{[*colors]}; export or copy the file again"
         )
     return None
 
 
-def _declared(line: str, records: str, before: int | None) -> int | None:
-    """The number of records that a comment of COLMAP states."""
+def _declared(line: str, records: str) -> list[int]:
+    """Return the number of records that a comment of COLMAP states, if it does."""
     found = re.match(rf"# *Number of {records}: *([0-9]{{1,18}})", line)
-    return int(found[1]) if found else before
+    return [int(found[1])] if found else []
 
 
-def _compare(path: Path, records: str, found: int, declared: int | None) -> None:
-    # A warning only: files edited by hand keep their first comment.
-    if declared is not None and declared != found:
+def _compare(path: Path, records: str, found: int, declared: list[int]) -> None:
+    # Only a warning: files edited by hand keep their first comment.
+    if declared and declared[-1] != found:
         warnings.warn(
-            f"{path}: a comment says {declared} {records}, {found} are there; the file "
+            f"{path}: a comment says {declared[-1]} {records}, got {found}; the file "
             "may be truncated",
             UserWarning,
             stacklevel=3,

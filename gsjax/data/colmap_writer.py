@@ -1,4 +1,4 @@
-"""Scenes to COLMAP's binary files, as `gsjax.data.colmap` and COLMAP read them."""
+"""Writer of datasets as COLMAP's binary files."""
 
 import struct
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsjax.data.colmap_model import KIND_OF_NAME, MAX_NAME_BYTES, quat_of
+from gsjax.data.colmap_model import KIND_OF_NAME, MAX_NAME_BYTES
 from gsjax.data.types import Dataset, View
 from gsjax.errors import InputError
 from gsjax.runtime.files import make_folder, refuse_existing, write_file
@@ -16,28 +16,28 @@ _UNKNOWN_ERROR = -1.0
 
 
 def write_colmap(
-    folder: str | PathLike[str], scene: Dataset, *, overwrite: bool = False
+    folder: str | PathLike[str], dataset: Dataset, *, overwrite: bool = False
 ) -> None:
     """Write cameras.bin, images.bin and points3D.bin, in the coordinates of the files.
 
-    Cameras that are equal become one. Points have no track and an unknown error; ids
-    count from 1 in the order of views and points. Photographs are not copied.
+    Equal cameras are written once. Points have no track and an unknown error; ids count
+    from 1 in the order of views and points. Photographs are not copied.
 
     Args:
-      folder: of the model (``sparse/0`` of a dataset); made if it is missing.
-      scene: whose `origin` is added to coordinates.
-      overwrite: whether existing files may be replaced.
+      folder: folder of the model (``sparse/0`` of a dataset), created if missing.
+      dataset: the dataset; its `origin` is added to the coordinates.
+      overwrite: replace existing files.
 
     Raises:
-      InputError: if a file exists and ``overwrite`` is not set, if one cannot be
-        written, or on a name that COLMAP's files cannot hold.
+      InputError: if a file exists and ``overwrite`` is not set, a file cannot be
+        written, or a name is one that COLMAP's files cannot hold.
     """
     folder = Path(folder)
-    cameras, numbers = _cameras(scene.views)
+    cameras, numbers = _cameras(dataset.views)
     content = {
         "cameras.bin": cameras,
-        "images.bin": _images(scene, numbers),
-        "points3D.bin": _points(scene),
+        "images.bin": _images(dataset, numbers),
+        "points3D.bin": _points(dataset),
     }
     refuse_existing([folder / name for name in content], overwrite)
     make_folder(folder)
@@ -46,7 +46,7 @@ def write_colmap(
 
 
 def _cameras(views: Sequence[View]) -> tuple[bytes, list[int]]:
-    """The file, and the number of the camera of each view."""
+    """Return the content of cameras.bin and the camera id of each view."""
     records: dict[bytes, int] = {}
     numbers = [records.setdefault(_camera(view), len(records) + 1) for view in views]
     rows = [struct.pack("<I", number) + row for row, number in records.items()]
@@ -54,7 +54,7 @@ def _cameras(views: Sequence[View]) -> tuple[bytes, list[int]]:
 
 
 def _camera(view: View) -> bytes:
-    """A record of cameras.bin without its id."""
+    """Return a record of cameras.bin without its id."""
     name, rest = "PINHOLE", ()
     if view.lens is not None:
         rest = view.lens.coefficients
@@ -70,28 +70,35 @@ def _camera(view: View) -> bytes:
     return head + struct.pack(f"<{kind.size}d", *params)
 
 
-def _images(scene: Dataset, numbers: Sequence[int]) -> bytes:
-    parts = [struct.pack("<Q", len(scene.views))]
-    for index, (view, camera) in enumerate(zip(scene.views, numbers), 1):
+def _images(dataset: Dataset, numbers: Sequence[int]) -> bytes:
+    parts = [struct.pack("<Q", len(dataset.views))]
+    for index, (view, camera) in enumerate(zip(dataset.views, numbers), 1):
         name = view.name.encode()
         if not name or b"\0" in name or len(name) > MAX_NAME_BYTES:
             raise InputError(
-                f"view {view.name[:80]!r}: a name of 1 to {MAX_NAME_BYTES} bytes "
-                "without NUL is wanted"
+                f"view {view.name[:80]!r}: expected a name of 1 to {MAX_NAME_BYTES} "
+                "bytes without NUL; rename the photograph"
             )
         rotation = view.viewmat[:3, :3]
-        translation = view.viewmat[:3, 3] - rotation @ scene.origin
-        pose = *quat_of(rotation), *translation
+        translation = view.viewmat[:3, 3] - rotation @ dataset.origin
+        pose = *_quat_of(rotation), *translation
         parts.append(struct.pack("<I7dI", index, *pose, camera) + name + b"\0")
         parts.append(struct.pack("<Q", 0))  # no 2D points
     return b"".join(parts)
 
 
-def _points(scene: Dataset) -> bytes:
+def _quat_of(rotation: np.ndarray) -> np.ndarray:
+    """Return the unit quaternion wxyz, w ≥ 0, of a rotation matrix [3, 3]."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_quat(canonical=True)[[3, 0, 1, 2]]
+
+
+def _points(dataset: Dataset) -> bytes:
     kinds = [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")]
-    table = np.zeros(len(scene.points), np.dtype([*kinds, ("track", "<u8")]))
+    table = np.zeros(len(dataset.points), np.dtype([*kinds, ("track", "<u8")]))
     table["id"] = np.arange(1, len(table) + 1)
-    table["xyz"] = scene.points + scene.origin
-    table["rgb"] = scene.colors
+    table["xyz"] = dataset.points + dataset.origin
+    table["rgb"] = dataset.colors
     table["error"] = _UNKNOWN_ERROR
     return struct.pack("<Q", len(table)) + table.tobytes()

@@ -1,28 +1,26 @@
-"""Datasets: photographs with known cameras, whatever program wrote them."""
+"""Loading of datasets: photographs with known cameras, in any registered format."""
 
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from gsjax.data.colmap import find_colmap, load_colmap
-from gsjax.data.extent import in_one_place, least_extent, near_plane
-from gsjax.data.llff import load_llff
-from gsjax.data.nerf import find_transforms, load_nerf
+from gsjax.data.extent import cameras_coincide, least_extent, near_plane
+from gsjax.data.readers import READERS
 from gsjax.data.rebase import rebase
-from gsjax.data.types import Dataset
+from gsjax.data.types import Dataset, Reader, ReadOptions
 from gsjax.errors import InputError
 
-# How far one camera may stand from the middle of all, times the next; a heuristic. From
-# the other on, the next stand in one place, as those of one tripod, but for rounding.
-_MOST_APART, _ROUNDING = 1e6, 1e12
-# Coordinates of cameras: in float64 a tenth of the unit is left there, and products of
-# two are finite in float32.
-_FARTHEST = 1e15
+# A camera is an outlier if its distance from the median position exceeds this multiple
+# of the second largest distance (a heuristic). Beyond the second multiple, all other
+# cameras coincide except for rounding, as on a tripod.
+_OUTLIER_RATIO, _ROUNDING_RATIO = 1e6, 1e12
+# At this distance float64 resolves a tenth of a unit, and products of two coordinates
+# are finite in float32.
+_MAX_DISTANCE = 1e15
 
 
 def load_dataset(
@@ -32,149 +30,137 @@ def load_dataset(
     skip_missing: bool = False,
     factor: int | None = None,
     poses_only: bool = False,
+    readers: Sequence[Reader] = READERS,
 ) -> Dataset:
-    """Read cameras, points and the names of the photographs of a dataset.
+    """Read the cameras, points and photograph names of a dataset.
 
-    What it is follows from what is there, in this order:
+    The first reader that detects its format reads the dataset. The default readers are,
+    in this order:
 
     - a COLMAP model, .bin or .txt, in ``sparse/0``, ``sparse`` or the folder itself;
-      photographs in ``images``, masks (0 is left out) in ``masks``;
-    - ``transforms.json`` of nerfstudio or instant-ngp;
-    - ``transforms_train.json`` and ``transforms_test.json``, in its absence
-      ``transforms_val.json``, of NeRF's synthetic scenes; another list is read where
-      ``path`` is the file;
+      photographs in ``images``, masks (0 excludes a pixel) in ``masks``;
+    - ``transforms.json`` of nerfstudio or instant-ngp, or ``transforms_train.json`` and
+      ``transforms_test.json`` (if absent, ``transforms_val.json``) of NeRF's synthetic
+      scenes; another camera list is read if ``path`` is the .json file;
+    - a COLMAP model in ``colmap/sparse/0``, as nerfstudio stores it;
     - ``poses_bounds.npy`` of LLFF.
 
-    Photographs themselves are read by `gsjax.data.photos`. A scene that lies far out
-    is moved near the origin of coordinates, see `gsjax.data.rebase`.
+    `load_photos` reads the photographs themselves. A dataset far from the origin is
+    translated towards it, see `gsjax.data.rebase`.
 
     Args:
       path: folder of the dataset, or its .json or .npy file.
-      images: name of the folder of the photographs in the dataset, or a path; None for
-        ``images``, for a .json the folders in it. In another folder, or one of smaller
-        copies, the first folders of a .json's names may be left out; names that lead
-        out of the dataset are looked for in ``images`` alone, by their ends.
-      skip_missing: leave out photographs that are listed but not there, with a
-        warning, instead of raising.
+      images: folder of the photographs: a name in the dataset or a path. The default is
+        ``images``; for a .json, the paths that it lists. In another folder, or for a
+        smaller copy, leading folders of a listed name may be missing; a listed name
+        that leaves the dataset is searched by its last parts in ``images`` only.
+      skip_missing: omit listed photographs that do not exist, with a warning.
       factor: read the smaller copies in ``images_2``, ``images_4``, …
-      poses_only: cameras and points are all that is wanted: photographs need not be
-        there, masks are left out, and a `View.image` may be no file.
+      poses_only: read cameras and points only. Photographs need not exist, masks are
+        ignored, and a `View.image` may not be a file.
+      readers: the formats, in order of precedence; append a `Reader` of your own with
+        ``(*READERS, reader)``, `READERS` being in `gsjax.data.readers`.
 
     Returns:
-      Views sorted by name.
+      The dataset, with views sorted by name.
 
     Raises:
-      InputError: if nothing of this is there, or a file is missing, truncated,
-        damaged or not supported; the message names the file, what was found in it
-        and what to do.
+      InputError: if no format is detected, or a file is missing, truncated, damaged or
+        unsupported. The message names the file, what was found in it and the remedy.
     """
-    path = Path(path)
+    path, options = Path(path), ReadOptions(images, factor, skip_missing, poses_only)
     try:
-        return _finished(
-            _read(path, images, skip_missing, factor, poses_only=poses_only)
-        )
-    except OSError as error:  # of names that the system does not take, say
+        return finish_dataset(_reader_of(path, readers).load(path, options))
+    except OSError as error:  # a name that is too long, for instance
         raise InputError(
             f"{str(error.filename or path)[:200]}: {error.strerror or error}; check "
             "the path and its permissions"
         ) from error
 
 
-def _read(
-    path: Path,
-    images: str | PathLike[str] | None,
-    skip_missing: bool,
-    factor: int | None,
-    *,
-    poses_only: bool,
-) -> Dataset:
-    """What is there, as its reader gives it."""
-    where: dict[str, Any] = {
-        "images": images,
-        "factor": factor,
-        "poses_only": poses_only,
-    }
-    nerf = partial(load_nerf, skip_missing=skip_missing, **where)
-    llff = partial(load_llff, **where)
+def is_dataset(path: Path, readers: Sequence[Reader] = READERS) -> bool:
+    """Return whether `load_dataset` detects a dataset at an existing path."""
+    return any(reader.detect(path) for reader in readers)
+
+
+def _reader_of(path: Path, readers: Sequence[Reader]) -> Reader:
     if not path.exists():
         raise InputError(f"{path}: does not exist; pass the folder of a dataset")
+    for reader in readers:
+        if reader.detect(path):
+            return reader
     if not path.is_dir():
-        if path.suffix.lower() == ".json":
-            return nerf([path])
-        if path.suffix.lower() == ".npy":
-            return llff(path)
-        raise InputError(f"{path}: pass the folder of a dataset, a .json or a .npy")
-    model, lists = find_colmap(path), find_transforms(path)
-    # Of nerfstudio's two, its list has what was done to the poses afterwards.
-    if model is not None and not (lists and model.parent.parent.name == "colmap"):
-        return load_colmap(path, skip_missing=skip_missing, **where)
-    if lists:
-        return nerf(lists)
-    if (path / "poses_bounds.npy").exists():
-        return llff(path / "poses_bounds.npy")
-    names = sorted(entry.name for entry in path.iterdir())
+        raise InputError(
+            f"{path}: expected a dataset; pass the folder of a dataset, a .json or a "
+            ".npy"
+        )
+    names = sorted(entry.name for entry in path.iterdir())[:12]
     raise InputError(
-        f"{path}: no dataset is known by its content ({', '.join(names[:12]) or 'none'}"
-        "); sparse/0 of COLMAP, transforms.json, transforms_train.json or "
-        "poses_bounds.npy is wanted; for photographs alone run `gsjax sfm` first"
+        f"{path}: expected sparse/0 of COLMAP, transforms.json, transforms_train.json "
+        f"or poses_bounds.npy, got {', '.join(names) or 'an empty folder'}; for "
+        "photographs without cameras run `gsjax sfm` first"
     )
 
 
-def _finished(scene: Dataset) -> Dataset:
-    """Views sorted, names unique, a near plane that suits, coordinates near 0."""
-    views = sorted(scene.views, key=lambda view: view.name)
+def finish_dataset(dataset: Dataset) -> Dataset:
+    """Return a dataset with sorted views, near planes and coordinates near the origin.
+
+    Raises:
+      InputError: if there is no view, two have one name, or a position is unusable.
+    """
+    views = sorted(dataset.views, key=lambda view: view.name)
     if not views:
-        raise InputError(f"{scene.source}: no view is left; at least 1 is wanted")
+        raise InputError(
+            f"{dataset.source}: expected at least 1 view, got none; add photographs"
+        )
     for before, after in pairwise(views):
         if before.name == after.name:
             raise InputError(
-                f"{scene.source}: the photograph {after.name!r} is listed more than "
+                f"{dataset.source}: the photograph {after.name!r} is listed more than "
                 "once; remove all but one"
             )
     centres = np.stack([view.centre for view in views])
-    _check_places(scene, [view.name for view in views], centres)
-    near = near_plane(centres, least_extent(scene))
+    _check_positions(dataset, [view.name for view in views], centres)
+    near = near_plane(centres, least_extent(dataset))
     views = tuple(replace(view, near=near) for view in views)
-    scene = rebase(replace(scene, views=views))
-    return _together(scene) if in_one_place(centres) else scene
+    dataset = rebase(replace(dataset, views=views))
+    return _with_one_position(dataset) if cameras_coincide(centres) else dataset
 
 
-def _together(scene: Dataset) -> Dataset:
-    """With all cameras where the first is; what they were apart was rounding, which may
-    be all that is left of their coordinates by now."""
-    centre, moved = scene.views[0].centre, []
-    for view in scene.views:
+def _with_one_position(dataset: Dataset) -> Dataset:
+    """Return the dataset with every camera at the position of the first.
+
+    Their differences were rounding, which `rebase` may have made the largest part of
+    the coordinates.
+    """
+    centre, moved = dataset.views[0].centre, []
+    for view in dataset.views:
         viewmat = view.viewmat.copy()
         viewmat[:3, 3] = -viewmat[:3, :3] @ centre
         moved.append(replace(view, viewmat=viewmat))
-    return replace(scene, views=tuple(moved))
+    return replace(dataset, views=tuple(moved))
 
 
-def _check_places(scene: Dataset, names: list[str], centres: np.ndarray) -> None:
-    """Refuse cameras that stand where nothing could be learnt with them.
+def _check_positions(dataset: Dataset, names: list[str], centres: np.ndarray) -> None:
+    """Raise on a camera that is too far away or an extreme outlier.
 
-    One alone at the end of the world makes the extent of the scene, by which all is
-    measured, that of the world.
+    A single outlier would set the extent, which every length of a training scales with.
     """
-    apart = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
-    worst = int(np.argmax(apart))
-    others = float(np.max(np.delete(apart, worst), initial=0))
-    if _MOST_APART * others < apart[worst] < _ROUNDING * others:
+    distances = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    worst = int(np.argmax(distances))
+    others = float(np.max(np.delete(distances, worst), initial=0))
+    if _OUTLIER_RATIO * others < distances[worst] < _ROUNDING_RATIO * others:
         raise InputError(
-            f"{scene.source}: the camera of {names[worst]!r} stands {apart[worst]:.3g} "
-            f"from the middle of all, the others within {others:.3g}; its pose is "
-            "damaged: remove the photograph, or estimate the cameras again"
+            f"{dataset.source}: the camera of {names[worst]!r} is "
+            f"{distances[worst]:.3g} from the median position, all others within "
+            f"{others:.3g}; its pose is damaged: remove the photograph, or estimate "
+            "the cameras again"
         )
     worst = int(np.argmax(np.abs(centres).max(axis=1)))
-    if np.abs(centres[worst]).max() > _FARTHEST:
-        where = ", ".join(f"{value:.3g}" for value in centres[worst])
+    if np.abs(centres[worst]).max() > _MAX_DISTANCE:
+        position = ", ".join(f"{value:.3g}" for value in centres[worst])
         raise InputError(
-            f"{scene.source}: the camera of {names[worst]!r} stands at {where}; at "
-            f"most {_FARTHEST:g} from the origin is wanted: estimate the cameras again"
+            f"{dataset.source}: the camera of {names[worst]!r} is at {position}; "
+            f"expected at most {_MAX_DISTANCE:g} from the origin: estimate the cameras "
+            "again"
         )
-
-
-def is_dataset(path: Path) -> bool:
-    """Whether a folder has what `load_dataset` knows a dataset by."""
-    known = find_colmap(path) is not None or bool(find_transforms(path))
-    return known or (path / "poses_bounds.npy").exists()

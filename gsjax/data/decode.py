@@ -1,7 +1,7 @@
-"""Image files → pixels as they are stored; what is damaged is refused, or told of.
+"""Decoding of image files with OpenCV, with errors and warnings for damaged ones.
 
-OpenCV decodes and is loaded when first needed. Its decoders return what they could
-make of a damaged JPEG or TIFF and tell of it on stderr only, without the file's name.
+OpenCV is imported on first use. For a damaged JPEG or TIFF its decoders return what
+they could read and report that on stderr only, without the file's name.
 """
 
 import os
@@ -27,131 +27,131 @@ from gsjax.errors import InputError
 from gsjax.io.images import opencv
 from gsjax.runtime.files import read_bytes
 
-# What libjpeg, libpng and, through OpenCV, libtiff say of pixels that are not as they
-# were; the rest of libpng's warnings are of colour profiles and the like.
+# Messages of libjpeg, libpng and (through OpenCV) libtiff about damaged pixels. The
+# other warnings of libpng concern colour profiles and the like.
 _DAMAGE = re.compile(
     "(?:Corrupt JPEG data|Premature end of JPEG file|libpng warning: IDAT).*"
     "|(?<=TIFF_Error ).*"
 )
 _HARMLESS = "libpng warning: "
 _SHOWN = 3
-_MOST_HEARD = 2**20
-_stderr_lock = threading.RLock()  # that of the process, which others must not swap too
+_MAX_STDERR = 2**20
+_stderr_lock = threading.RLock()  # stderr belongs to the whole process
 
 
 def decode(
     path: Path, flags: int, check: Callable[[int, int], object] | None = None
 ) -> np.ndarray:
-    """Pixels of an image file, in OpenCV's order of channels.
+    """Return the pixels of an image file, in OpenCV's order of channels.
 
     Args:
-      path: the file; its own bytes are checked before anything is decoded.
-      flags: of cv2.imdecode.
-      check: given the width and height in px that its header declares, before memory
-        is taken for them; raises if they are not what is wanted.
+      path: the file; its header is checked before anything is decoded.
+      flags: flags of cv2.imdecode.
+      check: called with the declared width and height in px before their allocation;
+        raises to reject them.
 
     Raises:
-      InputError: as ``check``; if the file cannot be read, is no image, is truncated,
-        declares more pixels than any camera makes, or is a TIFF of half-transparent
-        pixels, or of grey and another sample.
+      InputError: as ``check``; if the file cannot be read, is not an image, is
+        truncated or declares more than `MAX_PIXELS`; or if it is a TIFF of partly
+        transparent pixels, or of grey and another sample.
     """
     data = read_bytes(path, "a photograph")
     size = check_image(path, data)
     if check is not None:
         check(*size)
-    if has_two_samples(data):  # of which OpenCV drops one, or reads 16 bits as zeros
+    if has_two_samples(data):  # OpenCV drops one, or reads 16 bits as zeros
         raise InputError(
-            f"{path}: a TIFF of two samples a pixel, grey and transparency, which "
-            "cannot be read; convert it to PNG"
+            f"{path}: a TIFF of two samples a pixel, grey and transparency, cannot be "
+            "read; convert it to PNG"
         )
     cv2 = opencv()
-    if flags & cv2.IMREAD_IGNORE_ORIENTATION:  # IMREAD_UNCHANGED is among them
-        data = tiff_as_stored(data)  # of which OpenCV takes no notice in a TIFF
+    if flags & cv2.IMREAD_IGNORE_ORIENTATION:  # IMREAD_UNCHANGED includes it
+        data = tiff_as_stored(data)  # OpenCV ignores the flag in a TIFF
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         raise InputError(f"{path}: cannot be decoded: {str(error)[:120]}") from error
     if pixels is None:
         raise InputError(
-            f"{path}: cannot be decoded: the image is truncated, damaged or of a kind "
-            "that OpenCV does not read; convert it to PNG or JPEG"
+            f"{path}: cannot be decoded: the image is truncated, damaged or not "
+            "supported by OpenCV; convert it to PNG or JPEG"
         )
     most = 65535 if pixels.dtype == np.uint16 else 255
-    # OpenCV 5.0 multiplies colours of 8 bits that were not, leaves what was as it is,
-    # and does not say so.
+    # OpenCV 5.0 multiplies straight colours of 8 bits by alpha and keeps premultiplied
+    # ones, without telling which.
     if pixels.ndim == 3 and pixels.shape[2] == 4 and has_tiff_alpha(data):
         alpha = pixels[..., 3]
         if ((alpha > 0) & (alpha < most)).any():
             raise InputError(
-                f"{path}: a TIFF with pixels that are transparent in part, whose "
-                "colours cannot be told from black mixed into them; convert it to PNG"
+                f"{path}: a TIFF with partly transparent pixels, whose colours may be "
+                "mixed with black, cannot be read; convert it to PNG"
             )
     grey = clear_grey(data) if flags == cv2.IMREAD_UNCHANGED else None
-    if grey is not None and pixels.ndim == 2:  # OpenCV heeds it in colours alone
+    if grey is not None and pixels.ndim == 2:  # OpenCV only handles it in colour images
         alpha = np.where(pixels == round(grey * most), 0, most).astype(pixels.dtype)
         pixels = np.stack([pixels, alpha], -1)
     return pixels
 
 
 @contextmanager
-def telling_of_damage(files: Sequence[Path]) -> Iterator[None]:
-    """Within, ``files`` are decoded; those that OpenCV's decoders mend are warned of.
+def warn_of_damage(files: Sequence[Path]) -> Iterator[None]:
+    """Context for decoding ``files`` that warns of those that OpenCV had to repair.
 
-    Threads decode at once and share one stderr. So if damage is heard of, which files
-    it is of is found by decoding them again, in turn.
+    Threads decode at the same time and share one stderr. If it reports damage, the
+    files are decoded again one by one to find the damaged ones.
     """
-    with libraries_heard() as heard:
+    with captured_stderr() as lines:
         yield
-    if any(map(_DAMAGE.search, heard)):
-        _warn_of_damage(files)
-    for line in heard:
+    if any(map(_DAMAGE.search, lines)):
+        _warn_of_each(files)
+    for line in lines:
         if not (_DAMAGE.search(line) or line.startswith(_HARMLESS)):
             os.write(2, f"{line}\n".encode())
 
 
-def _warn_of_damage(files: Sequence[Path]) -> None:
-    told = {}
+def _warn_of_each(files: Sequence[Path]) -> None:
+    damage = {}
     for path in files:
-        with libraries_heard() as heard:
+        with captured_stderr() as lines:
             decode(path, opencv().IMREAD_GRAYSCALE)
-        found = [match for match in map(_DAMAGE.search, heard) if match]
+        found = [match for match in map(_DAMAGE.search, lines) if match]
         if found:
-            told[path] = found[0][0]
-    if told:
-        some = "; ".join(f"{path}: {why}" for path, why in [*told.items()][:_SHOWN])
-        more = f"; and {len(told) - _SHOWN} more" if len(told) > _SHOWN else ""
+            damage[path] = found[0][0]
+    if damage:
+        some = "; ".join(f"{path}: {why}" for path, why in [*damage.items()][:_SHOWN])
+        more = f"; and {len(damage) - _SHOWN} more" if len(damage) > _SHOWN else ""
         warnings.warn(
-            f"photographs that are damaged are read as far as they could be: {some}"
-            f"{more}; copy or export them again, or remove them",
+            f"damaged photographs are read as far as possible: {some}{more}; copy or "
+            "export them again, or remove them",
             UserWarning,
             stacklevel=4,
         )
 
 
 @contextmanager
-def libraries_heard() -> Iterator[list[str]]:
-    """Within, nothing reaches stderr; afterwards the list holds its lines.
+def captured_stderr() -> Iterator[list[str]]:
+    """Context in which nothing reaches stderr; afterwards the list holds its lines.
 
-    C libraries write there, past Python. Another thread's use of this waits.
+    C libraries write to the file descriptor, past Python. Other threads wait for it.
     """
-    heard: list[str] = []
+    captured: list[str] = []
     with _stderr_lock, _scratch() as scratch:
         if sys.stderr is not None:
             sys.stderr.flush()
         kept = os.dup(2)
         try:
             os.dup2(scratch.fileno(), 2)
-            yield heard
+            yield captured
         finally:
             os.dup2(kept, 2)
             os.close(kept)
             scratch.seek(0)
-            text = scratch.read(_MOST_HEARD).decode(errors="replace")
-            heard += [line for line in text.splitlines() if line.strip()]
+            text = scratch.read(_MAX_STDERR).decode(errors="replace")
+            captured += [line for line in text.splitlines() if line.strip()]
 
 
 def _scratch():
-    """A file without a name; in memory where there is such a thing."""
+    """Return an anonymous file, in memory if the system has such files."""
     if hasattr(os, "memfd_create"):
         return os.fdopen(os.memfd_create("stderr"), "w+b")
     return tempfile.TemporaryFile()

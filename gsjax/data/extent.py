@@ -1,4 +1,4 @@
-"""How large a captured scene is: its extent, its near plane and its usable points."""
+"""Extent, near plane and usable points of a dataset."""
 
 import numpy as np
 
@@ -6,87 +6,92 @@ from gsjax.cameras.camera import NEAR, USUAL_EXTENT
 from gsjax.data.types import Dataset
 from gsjax.errors import InputError
 
-# Cameras no farther apart than this share of their coordinates stand in one place.
+# Cameras whose distances are below this share of their coordinates coincide.
 _ROUNDING = 1e-12
-_LEAST_EXTENT, _SAMPLED = 0.1, 5000  # share of the distance of points; points sampled
+_LEAST_EXTENT = 0.1  # share of the distance of the points
+_SAMPLED = 5000  # points
 
 
-def in_one_place(centres: np.ndarray) -> bool:
-    """Whether cameras at ``centres`` [V, 3] are apart by rounding at most."""
+def cameras_coincide(centres: np.ndarray) -> bool:
+    """Return whether camera positions [V, 3] differ by rounding at most."""
     apart = np.abs(centres - centres.mean(0)).max()
     return bool(apart <= _ROUNDING * np.abs(centres).max())
 
 
 def scene_extent(centres: np.ndarray) -> float:
-    """1.1 times the largest distance of a camera from their mean (Kerbl et al. 2023).
+    """Return 1.1 times the largest distance of a camera from the mean position.
+
+    Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", 2023.
 
     Args:
-      centres: [V, 3] where the cameras stand.
+      centres: [V, 3] camera positions.
 
     Returns:
-      The extent, above 0; 1 where all cameras stand in one place.
+      The extent, above 0; 1 if all cameras coincide.
     """
-    if in_one_place(centres):
+    if cameras_coincide(centres):
         return 1.0
     return float(1.1 * np.linalg.norm(centres - centres.mean(0), axis=1).max())
 
 
-def extent_of(scene: Dataset) -> float:
-    """The extent by which a scene is trained, above 0.
+def extent_of(dataset: Dataset) -> float:
+    """Return the extent that a training of the dataset scales its lengths with.
 
-    That of its cameras, see `scene_extent`; where they stand nearly in one place, that
-    of its points, see `least_extent`.
+    It is the `scene_extent` of the cameras and at least the `least_extent` of the
+    points, which replaces it if the cameras coincide.
     """
-    centres = np.stack([view.centre for view in scene.views])
-    least = least_extent(scene)
-    if least > 0 and in_one_place(centres):
+    centres = np.stack([view.centre for view in dataset.views])
+    least = least_extent(dataset)
+    if least > 0 and cameras_coincide(centres):
         return least
     return max(scene_extent(centres), least)
 
 
-def least_extent(scene: Dataset) -> float:
-    """A tenth of the median distance of the points from the cameras that they lie
-    before, along their axes; 0 of no such points."""
-    points = scene.points[finite_points(scene)]
+def least_extent(dataset: Dataset) -> float:
+    """Return a tenth of the median depth of the points in front of the cameras.
+
+    The result is 0 if there are no such points.
+    """
+    points = dataset.points[finite_points(dataset)]
     points = points[:: max(1, len(points) // _SAMPLED)]
-    axes = np.stack([view.viewmat[2] for view in scene.views])
+    axes = np.stack([view.viewmat[2] for view in dataset.views])
     depths = points @ axes[:, :3].T + axes[:, 3]
     before = depths[depths > 0]
     return _LEAST_EXTENT * float(np.median(before)) if before.size else 0.0
 
 
 def near_plane(centres: np.ndarray, least: float = 0.0) -> float:
-    """How near a camera Gaussians are drawn: `NEAR`, less in a scene of a small unit.
+    """Return the near plane of cameras: `NEAR`, or less in a scene of small extent.
 
     Args:
-      centres: [V, 3] where the cameras stand.
-      least: that the extent is at least, see `least_extent`.
+      centres: [V, 3] camera positions.
+      least: lower bound of the extent, see `least_extent`.
 
     Returns:
-      The same share of the extent in any unit, at most `NEAR`, which is also that of
-      cameras in one place without anything before them.
+      A fixed share of the extent, at most `NEAR`. `NEAR` if all cameras coincide and
+      there is no bound.
     """
-    if in_one_place(centres):
+    if cameras_coincide(centres):
         extent = least or USUAL_EXTENT
     else:
         extent = max(scene_extent(centres), least)
     return NEAR * min(1.0, extent / USUAL_EXTENT)
 
 
-def finite_points(scene: Dataset) -> np.ndarray:
-    """[M] bool, which of its points are."""
-    return np.asarray(np.isfinite(scene.points).all(1))
+def finite_points(dataset: Dataset) -> np.ndarray:
+    """Return [M] bool: which points have finite coordinates."""
+    return np.asarray(np.isfinite(dataset.points).all(1))
 
 
-def has_points(scene: Dataset) -> bool:
-    """Whether there are any to start from."""
-    return bool(finite_points(scene).any())
+def has_points(dataset: Dataset) -> bool:
+    """Return whether any point has finite coordinates."""
+    return bool(finite_points(dataset).any())
 
 
-def require_points(scene: Dataset) -> None:
-    """Raise unless there are points to start from."""
-    if not has_points(scene):
+def require_points(dataset: Dataset) -> None:
+    """Raise `InputError` if the dataset has no usable points."""
+    if not has_points(dataset):
         raise InputError(
-            f"{scene.source}: no points to start from; start from random ones "
+            f"{dataset.source}: no points to start from; start from random ones "
             "(--initial random)"
         )

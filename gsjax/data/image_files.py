@@ -1,13 +1,13 @@
-"""Where the photographs of a dataset lie: folders, names, and what is missing."""
+"""Paths of photographs and masks: folders, names, and reports of missing files."""
 
 import re
 import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
-from os import PathLike
 from pathlib import Path, PurePosixPath
 
+from gsjax.data.types import ReadOptions
 from gsjax.errors import InputError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
@@ -16,37 +16,30 @@ _MAX_NAME, _MAX_PART = 1024, 251  # bytes; masks have ".png" appended
 _ENDING = re.compile(f"({'|'.join(map(re.escape, SUFFIXES))})+$", re.IGNORECASE)
 
 
-def image_folder(
-    folder: Path,
-    images: str | PathLike[str] | None,
-    factor: int | None,
-    *,
-    poses_only: bool = False,
-) -> Path:
-    """The folder of the photographs: ``images``, or ``images_4`` for factor 4.
+def image_folder(folder: Path, options: ReadOptions) -> Path:
+    """Return the folder of the photographs, ``images_4`` for factor 4.
 
     Args:
-      folder: of the dataset.
-      images: its name in the dataset, or a path of its own; None for "images".
-      factor: by how much the photographs were made smaller; None or 1 for not.
-      poses_only: the folder need not be there.
+      folder: folder of the dataset.
+      options: ``images`` is its name in the dataset or a path, by default "images";
+        with ``poses_only`` it need not exist.
 
     Raises:
-      InputError: if there is no such folder; the message offers a factor that is there.
+      InputError: if there is no such folder; the message offers a factor that exists.
     """
-    check_factor(factor)
-    suffix = f"_{factor}" if factor is not None and factor > 1 else ""
-    whole = folder / ("images" if images is None else images)
-    found = Path(f"{whole}{suffix}")
-    if found.is_dir() or poses_only:
+    check_factor(options.factor)
+    suffix = f"_{options.factor}" if _is_scaled(options) else ""
+    original = folder / ("images" if options.images is None else options.images)
+    found = Path(f"{original}{suffix}")
+    if found.is_dir() or options.poses_only:
         return found
     names = sorted(entry.name for entry in folder.iterdir() if entry.is_dir())
     remedy = "pass images=, the folder of the photographs (--images)"
     if suffix:
         remedy = "leave the factor out (photographs are scaled on load), or make it"
-    factors = _factors(whole)
+    factors = _factors(original)
     if factors:
-        copies, least = f"{whole.name}_{factors[0]}", factors[0]
+        copies, least = f"{original.name}_{factors[0]}", factors[0]
         remedy = (
             f"pass factor={least} (--factor {least}), as {copies} is there; or {remedy}"
         )
@@ -56,11 +49,22 @@ def image_folder(
     )
 
 
-def _factors(whole: Path) -> list[int]:
-    """By how much the copies beside a folder of photographs are smaller: its _2, _4."""
-    beside = whole.parent.iterdir() if whole.parent.is_dir() else ()
+def _is_scaled(options: ReadOptions) -> bool:
+    return options.factor is not None and options.factor > 1
+
+
+def original_folder(root: Path, options: ReadOptions) -> Path | None:
+    """Return the folder of the originals if ``root`` has smaller copies, else None."""
+    if not _is_scaled(options):
+        return None
+    return root.with_name(root.name.removesuffix(f"_{options.factor}"))
+
+
+def _factors(original: Path) -> list[int]:
+    """Return the factors of the smaller copies beside a folder, such as its _2, _4."""
+    beside = original.parent.iterdir() if original.parent.is_dir() else ()
     names = [entry.name for entry in beside if entry.is_dir()]
-    form = re.escape(whole.name) + "_([2-9]|[1-9][0-9]{1,3})"
+    form = re.escape(original.name) + "_([2-9]|[1-9][0-9]{1,3})"
     found = [re.fullmatch(form, name) for name in names]
     return sorted(int(match[1]) for match in found if match)
 
@@ -68,34 +72,44 @@ def _factors(whole: Path) -> list[int]:
 def check_factor(factor: int | None) -> None:
     """Raise unless ``factor`` is None or a whole number of at least 1."""
     if factor is not None and not (isinstance(factor, int) and factor >= 1):
-        raise InputError(f"factor {factor!r}: a whole number ≥ 1 is wanted")
+        raise InputError(
+            f"factor: expected a whole number ≥ 1, got {factor!r}; pass 2, 4 or 8"
+        )
 
 
 def inside(where: str, name: str, remedy: str = "") -> PurePosixPath:
-    """A relative path that stays in its folder; raises on one that would leave it, and
-    offers a ``remedy`` besides copying the file."""
+    """Return a listed name as a relative path that stays in its folder.
+
+    Args:
+      where: source of the name, for messages.
+      name: the name as listed.
+      remedy: another remedy besides copying the file.
+
+    Raises:
+      InputError: if the path is absolute, leaves the folder, or is not a usable name.
+    """
     path = PurePosixPath(name.replace("\\", "/"))
     absolute = path.is_absolute() or re.match("[A-Za-z]:", name)
-    strange = "\0" in name or any("\ud800" <= letter <= "\udfff" for letter in name)
-    if absolute or ".." in path.parts or strange or not path.parts:
+    invalid = "\0" in name or any("\ud800" <= letter <= "\udfff" for letter in name)
+    if absolute or ".." in path.parts or invalid or not path.parts:
         raise InputError(
-            f"{where}: the name {name[:120]!r} is not that of a file within the "
-            "dataset's folder; copy the file there and name it relative to the folder"
+            f"{where}: expected the name of a file within the dataset's folder, got "
+            f"{name[:120]!r}; copy the file there and name it relative to the folder"
             f"{remedy}"
         )
-    # Longer ones the system refuses, with an error of its own that names no remedy.
+    # The system would reject longer ones with an error that names no remedy.
     sizes = [len(part.encode()) for part in path.parts]
     if max(sizes) > _MAX_PART or sum(sizes) > _MAX_NAME:
         raise InputError(
-            f"{where}: the name {name[:120]!r}… has {sum(sizes)} bytes, {max(sizes)} "
-            f"in one part; at most {_MAX_NAME} and {_MAX_PART} are wanted: rename the "
-            "file"
+            f"{where}: expected a name of at most {_MAX_NAME} bytes and "
+            f"{_MAX_PART} a part, got {name[:120]!r}… of {sum(sizes)} and "
+            f"{max(sizes)}; rename the file"
         )
     return path
 
 
 def last_parts(name: str) -> str:
-    """What follows the root or the last ".." of a path, for another folder than its."""
+    """Return the part of a path after its root and its last ".."."""
     path = PurePosixPath(re.sub("^[A-Za-z]:", "/", name.replace("\\", "/")))
     parts = path.parts[1:] if path.is_absolute() else path.parts
     ups = [index for index, part in enumerate(parts) if part == ".."]
@@ -106,76 +120,82 @@ def find_files(
     source: Path,
     root: Path,
     names: Iterable[str],
+    options: ReadOptions,
     *,
-    skip_missing: bool = False,
     elsewhere: bool = False,
-    factor: int | None = None,
-    poses_only: bool = False,
 ) -> dict[str, Path]:
-    """Files of photographs, by name; a name with no file is missing.
+    """Return the files of photographs by name, without the missing ones.
 
-    A file of another suffix than its name stands in for it: smaller copies are often
-    of another type, and NeRF's lists leave suffixes out; and one whose letters are
-    composed otherwise, as after a copy to or from macOS. Copies of which none is called
-    like its original, as in the scenes of LLFF, go with the originals in the order of
-    their names, if they are as many; a warning says so.
+    A file with another suffix than its name is accepted, because smaller copies often
+    have another type and NeRF's lists omit suffixes; so is another Unicode composition,
+    as after a copy to or from macOS. Smaller copies of which none has a listed name, as
+    in LLFF's scenes, are matched with the originals by their order, with a warning, if
+    the two folders have equally many photographs.
 
     Args:
       source: the file that lists the names, for messages.
-      root: the folder that they are relative to.
-      names: as listed.
-      skip_missing: leave out names without a file, with a warning.
-      elsewhere: ``root`` is not the folder that the names are of. Then the longest end
-        of a name that has a file there counts: of ``images/left/1.png`` all, then
-        ``left/1.png``, then ``1.png``.
-      factor: above 1, ``root`` is ``images_4``, of the copies of ``images``.
-      poses_only: nothing is missing; a name without a file has the path of one.
+      root: folder that the names are relative to.
+      names: names as listed.
+      options: with ``skip_missing``, missing files only give a warning; with
+        ``poses_only``, nothing is missing and a name without a file has the path where
+        it would be; a ``factor`` above 1 says that ``root`` has smaller copies.
+      elsewhere: ``root`` is another folder than the names refer to. Then the longest
+        end of a name that exists there counts: of ``images/left/1.png`` the whole,
+        then ``left/1.png``, then ``1.png``.
 
     Raises:
-      InputError: on missing files, unless ``skip_missing``; on all files missing; on
-        two names of one file; on a name that leads out of ``root``.
+      InputError: if files are missing without ``skip_missing``, all are missing, two
+        names refer to one file, or a name leaves ``root``.
     """
     names = list(names)
-    found = _called(source, root, names, elsewhere)
-    if poses_only:
+    found = _find(source, root, names, elsewhere)
+    if options.poses_only:
         return {name: found.get(name, root / name) for name in names}
-    if not found and factor is not None and factor > 1:
-        whole = root.with_name(root.name.removesuffix(f"_{factor}"))
-        found = _in_order(whole, root, _called(source, whole, names, elsewhere))
-    missing = [name for name in names if name not in found]
+    original = original_folder(root, options)
+    if not found and original is not None:
+        there = _find(source, original, names, elsewhere)
+        found = _match_by_order(original, root, there)
     owner: dict[Path, str] = {}
     for name, path in found.items():
         if owner.setdefault(path, name) != name:
             raise InputError(
                 f"{source}: {owner[path]} and {name} are one photograph in {root}, "
-                f"{path.name}; put there what is missing, or take one off the list"
+                f"{path.name}; put the missing one there, or remove one from the list"
             )
+    missing = [name for name in names if name not in found]
     if missing:
-        message = (
-            f"{source}: {len(missing)} of {len(missing) + len(found)} photographs are "
-            f"missing in {root}"
-        )
-        if not found:
-            there = ", ".join(path.name for path in _photographs(root)[:_SHOWN])
-            raise InputError(
-                f"{message}, the first: {', '.join(missing[:_SHOWN])}, where there are "
-                f"{there or 'none'}; put them there, or pass images=, the folder that "
-                "they are in (--images)"
-            )
-        if not skip_missing:
-            raise InputError(
-                f"{message}, the first: {', '.join(missing[:_SHOWN])}; put them there, "
-                "or leave them out with skip_missing=True (--skip-missing)"
-            )
-        left = f"{message} and left out: {', '.join(missing)}"
-        warnings.warn(left, UserWarning, stacklevel=3)
+        _report_missing(source, root, missing, len(found), options.skip_missing)
     return found
 
 
-def _called(
+def _report_missing(
+    source: Path, root: Path, missing: list[str], found: int, skip: bool
+) -> None:
+    """Warn of missing photographs if they may be skipped, else raise."""
+    message = (
+        f"{source}: {len(missing)} of {len(missing) + found} photographs are missing "
+        f"in {root}"
+    )
+    if not found:
+        there = ", ".join(path.name for path in _photographs(root)[:_SHOWN])
+        raise InputError(
+            f"{message}, the first: {', '.join(missing[:_SHOWN])}; the folder has "
+            f"{there or 'none'}; put them there, or pass images=, the folder that they "
+            "are in (--images)"
+        )
+    if not skip:
+        raise InputError(
+            f"{message}, the first: {', '.join(missing[:_SHOWN])}; put them there, or "
+            "leave them out with skip_missing=True (--skip-missing)"
+        )
+    left = f"{message} and left out: {', '.join(missing)}"
+    warnings.warn(left, UserWarning, stacklevel=4)
+
+
+def _find(
     source: Path, root: Path, names: Sequence[str], elsewhere: bool
 ) -> dict[str, Path]:
-    """Those of ``names`` that have a file in ``root``, see `find_files`."""
+    """Return the files of those ``names`` that exist in ``root``, see `find_files`."""
     found: dict[str, Path] = {}
     stems = cache(_stems)
     for name in names:
@@ -188,10 +208,14 @@ def _called(
     return found
 
 
-def _in_order(whole: Path, root: Path, found: dict[str, Path]) -> dict[str, Path]:
-    """For files ``found`` in ``whole`` the copies in ``root`` of the same place in the
-    order of all; none where the photographs of the two are not as many."""
-    originals, copies = _photographs(whole), _photographs(root)
+def _match_by_order(
+    original: Path, root: Path, found: dict[str, Path]
+) -> dict[str, Path]:
+    """Return the copies in ``root`` at the same position as the files ``found``.
+
+    The result is empty if the two folders have different numbers of photographs.
+    """
+    originals, copies = _photographs(original), _photographs(root)
     if len(originals) != len(copies):
         return {}
     copy_of = dict(zip(originals, copies))
@@ -199,9 +223,9 @@ def _in_order(whole: Path, root: Path, found: dict[str, Path]) -> dict[str, Path
     if paired:
         name = min(paired)
         warnings.warn(
-            f"{root}: none of the {len(copies)} photographs is called as in {whole}; "
-            f"they are taken in the order of their names: {paired[name].name} is "
-            f"{name}",
+            f"{root}: none of the {len(copies)} photographs has a name as in "
+            f"{original}; they are matched in the order of their names: "
+            f"{paired[name].name} is {name}",
             UserWarning,
             stacklevel=4,
         )
@@ -209,19 +233,21 @@ def _in_order(whole: Path, root: Path, found: dict[str, Path]) -> dict[str, Path
 
 
 def _photographs(folder: Path) -> list[Path]:
-    """All photographs in a folder and in those within, in the order of their names."""
+    """Return all photographs in a folder and its subfolders, sorted by name."""
     files = [p for p in folder.rglob("*") if is_photograph(p)]
     return sorted(files, key=lambda path: path.relative_to(folder).as_posix())
 
 
 def is_photograph(path: Path) -> bool:
-    """By its name; what is hidden, as macOS has it beside each file, is none."""
+    """Return whether a file name is that of a photograph and not hidden.
+
+    macOS puts a hidden file beside each one that it copies to a foreign disk.
+    """
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
 
 
 def find_file(root: Path, name: str) -> Path | None:
-    """The photograph ``name`` of a list in ``root``, if it is there, see
-    `find_files`; what leads out of it is not."""
+    """Return the photograph of a listed name if it exists within ``root``."""
     path = PurePosixPath(name.replace("\\", "/"))
     if path.is_absolute() or ".." in path.parts:
         return None
@@ -229,7 +255,7 @@ def find_file(root: Path, name: str) -> Path | None:
 
 
 def _file_at(path: Path, stems: Callable[[Path], dict[str, Path]]) -> Path | None:
-    """The file there, or the photograph that is called so but for its suffix."""
+    """Return the file at a path, or the photograph of that name but for its suffix."""
     if path.is_file():
         return path
     names = _composed(path.name), _composed(path.stem)
@@ -237,64 +263,59 @@ def _file_at(path: Path, stems: Callable[[Path], dict[str, Path]]) -> Path | Non
 
 
 def _stems(folder: Path) -> dict[str, Path]:
-    """Photographs of a folder by their names, `_composed`, whole and without suffix."""
+    """Return the photographs of a folder by composed name, with and without suffix."""
     files = [p for p in folder.iterdir() if p.is_file()] if folder.is_dir() else []
     rank = {suffix: index for index, suffix in enumerate(reversed(SUFFIXES))}
     files = [p for p in files if p.suffix.lower() in rank]
     files.sort(key=lambda p: (rank[p.suffix.lower()], p.name))
-    whole = {_composed(p.name): p for p in files}
-    return {_composed(p.stem): p for p in files} | whole
+    by_name = {_composed(p.name): p for p in files}
+    return {_composed(p.stem): p for p in files} | by_name
 
 
 def _composed(name: str) -> str:
-    """A name with its letters and accents composed, which macOS has apart: in Unicode's
-    form C."""
+    """Return a name in Unicode's form C; macOS stores accents as separate letters."""
     return unicodedata.normalize("NFC", name)
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Of photographs: without suffixes, unless two of them then had one name."""
+    """Return names without suffixes, or unchanged if two of them would become equal."""
     short = [PurePosixPath(name).with_suffix("").as_posix() for name in names]
-    clear = len({name.casefold() for name in short}) == len(short)
-    return short if clear else list(names)
+    unique = len({name.casefold() for name in short}) == len(short)
+    return short if unique else list(names)
 
 
 def natural_order(name: str) -> tuple[list[str | int], str]:
-    """By which to sort names as people count: IMG_2 before IMG_10."""
-    # Words stand at even places and numbers at odd ones, so that like meets like.
+    """Return a sort key that orders numbers by value: IMG_2 before IMG_10."""
+    # Words have even indices and numbers odd ones, so equal types are compared.
     parts = re.split("([0-9]+)", name)
     return [int(p) if k % 2 else p for k, p in enumerate(parts)], name
 
 
 def check_name(path: Path) -> None:
-    """See that the name of a file is UTF-8, in which datasets hold it.
-
-    Raises:
-      InputError: if it is not.
-    """
+    """Raise `InputError` unless a file name can be encoded as UTF-8."""
     try:
         path.name.encode()
     except UnicodeEncodeError as error:
         raise InputError(
-            f"{path.parent}: the name of {path.name!r} is not UTF-8; rename the file"
+            f"{path.parent}: the name {path.name!r} is not UTF-8; rename the file"
         ) from error
 
 
 def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """The masks of photographs, by name, as `find_mask` knows them.
+    """Return the masks of photographs by name, as `find_mask` finds them.
 
-    Photographs without one are warned of, unless there is no such folder.
+    Warns of photographs without one, unless the folder does not exist.
     """
     if not folder.is_dir():
         return {}
-    listing = cache(by_suffix_of_either_case)
+    listing = cache(files_by_lowered_suffix)
     masks = {name: find_mask(folder, name, listing) for name in names}
     found = {name: mask for name, mask in masks.items() if mask is not None}
     lacking = [name for name in masks if name not in found]
     if lacking:
         warnings.warn(
-            f"{folder}: {len(lacking)} of {len(masks)} photographs have no mask there, "
-            f"the first: {', '.join(lacking[:_SHOWN])}; nothing of them is left out (a "
+            f"{folder}: {len(lacking)} of {len(masks)} photographs have no mask, the "
+            f"first: {', '.join(lacking[:_SHOWN])}; all of their pixels are used (a "
             f"mask would be {PurePosixPath(lacking[0]).with_suffix('.png')})",
             UserWarning,
             stacklevel=3,
@@ -303,13 +324,12 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 def _lowered(name: str) -> str:
-    """A name, `_composed`, with the suffixes of photographs that it ends with in lower
-    case."""
+    """Return a composed name with the suffixes of photographs in lower case."""
     return _ENDING.sub(lambda ending: ending[0].lower(), _composed(name))
 
 
-def by_suffix_of_either_case(folder: Path) -> dict[str, Path]:
-    """What is in a folder, which need not exist, by `_lowered` names."""
+def files_by_lowered_suffix(folder: Path) -> dict[str, Path]:
+    """Return the entries of a folder, which need not exist, by `_lowered` name."""
     entries = sorted(folder.iterdir()) if folder.is_dir() else ()
     return {_lowered(entry.name): entry for entry in entries}
 
@@ -317,23 +337,24 @@ def by_suffix_of_either_case(folder: Path) -> dict[str, Path]:
 def find_mask(
     folder: Path,
     name: str,
-    listing: Callable[[Path], dict[str, Path]] = by_suffix_of_either_case,
+    listing: Callable[[Path], dict[str, Path]] = files_by_lowered_suffix,
 ) -> Path | None:
-    """The mask of a photograph, if there is one.
+    """Return the mask of a photograph, or None.
 
     Args:
-      folder: of the masks; it need not exist.
-      name: of the photograph: masks are called the same, or have ``.png`` appended
-        (COLMAP) or in place of the suffix. Suffixes may be of either case, and letters
-        composed or not.
-      listing: what is in a folder, by `_lowered` names.
+      folder: folder of the masks; it need not exist.
+      name: name of the photograph. A mask has the same name, or ``.png`` appended
+        (COLMAP) or as its suffix. Upper and lower case of suffixes and the Unicode
+        composition may differ.
+      listing: returns the entries of a folder by `_lowered` name.
     """
     path = folder / inside(str(folder), name)
-    called = (path.name, path.name + ".png", path.stem + ".png")
-    exact = [path.with_name(mask) for mask in called]
+    candidates = (path.name, path.name + ".png", path.stem + ".png")
+    exact = [path.with_name(mask) for mask in candidates]
     found = next((mask for mask in exact if mask.is_file()), None)
     if found is None:
         files = listing(path.parent)
-        loose = [files[_lowered(mask)] for mask in called if _lowered(mask) in files]
+        keys = [_lowered(mask) for mask in candidates]
+        loose = [files[key] for key in keys if key in files]
         found = next((mask for mask in loose if mask.is_file()), None)
     return found

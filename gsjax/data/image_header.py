@@ -1,8 +1,8 @@
-"""Size and completeness of an image file from its own bytes, before it is decoded.
+"""Size and completeness of an image file, from its bytes, before it is decoded.
 
-A decoder allocates what the header declares: a few hundred bytes may ask for
-gigabytes. So sizes are bounded here first, and truncated files, of which some
-decoders return the upper part, are refused.
+A decoder allocates what a header declares, so a few hundred bytes may request
+gigabytes: sizes are bounded here first. Truncated files are rejected, because some
+decoders return their upper part without an error. OpenCV has no call for either.
 """
 
 import mmap
@@ -16,26 +16,25 @@ Buffer = bytes | mmap.mmap
 
 # 268 MP: above any camera; 0.8 GB as RGB.
 MAX_PIXELS = 1 << 28
-# Deflate shrinks by 1032 at most, so that a smaller PNG cannot be complete.
-_MAX_DEFLATE = 1032
-# LZW, the other of TIFF's, by less than 1400: 12 bits for 4096 bytes at most.
-_MAX_TIFF = 1400
+# Maximum compression ratios; a smaller file cannot be complete. A code of LZW has 12
+# bits for at most 4096 bytes.
+_MAX_DEFLATE, _MAX_LZW = 1032, 1400
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _REMEDY = "copy or export it again"
-# Tags of TIFF: width, height, bits of a sample, compression, how it is turned, samples
-# of a pixel, what those are that are no colours.
+# Tags of TIFF: width, height, bits per sample, compression, orientation, samples per
+# pixel, extra samples.
 _ORIENTATION = 274
 _TIFF_TAGS = (256, 257, 258, 259, _ORIENTATION, 277, 338)
-# Markers of JPEG without a length, and those that carry the size of the image.
+# Markers of JPEG without a length, and those with the size of the image.
 _JPEG_BARE = {0x01, *range(0xD0, 0xD9)}
 _JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file in px, without decoding it.
+    """Return the width and height in px of an image file, without decoding it.
 
     Raises:
-      InputError: as `check_image`, and if the file cannot be read.
+      InputError: as `check_image`, or if the file cannot be read.
     """
     with opened(path, "a photograph") as file:
         if not file.read(1):
@@ -45,9 +44,9 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def check_image(path: Path, data: Buffer) -> tuple[int, int]:
-    """Width and height of an image in px, as the photograph's own bytes have it.
+    """Return the width and height in px that the bytes of an image file declare.
 
-    Orientation as in EXIF is ignored.
+    EXIF orientation is ignored.
 
     Raises:
       InputError: if the file is empty, of an unknown format, truncated, or larger
@@ -58,29 +57,29 @@ def check_image(path: Path, data: Buffer) -> tuple[int, int]:
     reader = _reader(data[:12])
     if reader is None:
         raise InputError(
-            f"{path}: starts with {data[:8]!r}, which is no PNG, JPEG, WebP, TIFF or "
-            "BMP; convert the photograph to PNG or JPEG"
+            f"{path}: expected a PNG, JPEG, WebP, TIFF or BMP, got a file that starts "
+            f"with {data[:8]!r}; convert the photograph to PNG or JPEG"
         )
     try:
         width, height = reader(data)
     except (struct.error, IndexError, _Truncated) as error:
         detail = f" ({error})" if isinstance(error, _Truncated) else ""
         raise InputError(
-            f"{path}: the image is truncated or damaged{detail}, {len(data)} bytes are "
-            f"there; {_REMEDY}"
+            f"{path}: the image is truncated or damaged{detail}, got {len(data)} "
+            f"bytes; {_REMEDY}"
         ) from error
     if width < 1 or height < 1:
-        raise InputError(f"{path}: an image of {width} × {height} px; {_REMEDY}")
+        raise InputError(f"{path}: got an image of {width} × {height} px; {_REMEDY}")
     if width * height > MAX_PIXELS:
         raise InputError(
-            f"{path}: declares {width} × {height} px; at most {MAX_PIXELS} pixels are "
-            "read: make it smaller"
+            f"{path}: expected at most {MAX_PIXELS} pixels, got {width} × {height} px; "
+            "make it smaller"
         )
     return width, height
 
 
 class _Truncated(Exception):
-    """What is missing of a file."""
+    """Names the missing part of a file."""
 
 
 def _reader(head: bytes):
@@ -131,10 +130,10 @@ def _jpeg(data: Buffer) -> tuple[int, int]:
             height, width = struct.unpack_from(">HH", data, at + 5)
             size, arithmetic = (width, height), code > 0xC8
         at += 2 + struct.unpack_from(">H", data, at + 2)[0]
-    # Huffman codes take a bit or more for each block of 8 × 8.
+    # Huffman codes take at least a bit for each block of 8 × 8.
     if not arithmetic and -(-size[0] // 8) * -(-size[1] // 8) > 8 * len(data):
         raise _Truncated(f"{size[0]} × {size[1]} px cannot fit in it")
-    # Within compressed data FF is followed by 00 or a restart, so this is the end.
+    # In compressed data FF is followed by 00 or a restart, so this is the end.
     if data.find(b"\xff\xd9", at) < 0:
         raise _Truncated("no end-of-image marker")
     return size
@@ -159,20 +158,22 @@ def _webp(data: Buffer) -> tuple[int, int]:
 
 
 def has_tiff_alpha(data: Buffer) -> bool:
-    """Whether an image, which `check_image` has seen, is a TIFF that says what its
-    fourth sample is: opacity, that colours were multiplied by (1) or not (2).
+    """Return whether a checked image is a TIFF whose extra sample is opacity.
+
+    Colours may have been multiplied by it (1) or not (2).
     """
     return _reader(data[:12]) is _tiff and _tiff_tags(data).get(338) in (1, 2)
 
 
 def has_two_samples(data: Buffer) -> bool:
-    """Whether an image, which `check_image` has seen, is a TIFF of grey and alpha."""
+    """Return whether a checked image is a TIFF of grey and alpha."""
     return _reader(data[:12]) is _tiff and _tiff_tags(data).get(277) == 2
 
 
 def clear_grey(data: Buffer) -> float | None:
-    """Of an image, which `check_image` has seen: the grey, of 1, that is transparent in
-    a PNG without other transparency (its tRNS chunk); else None.
+    """Return the grey, in [0, 1], that a checked PNG declares transparent, else None.
+
+    It is in the tRNS chunk of a PNG without other transparency.
     """
     if _reader(data[:12]) is not _png or data[25] != 0:
         return None
@@ -186,7 +187,7 @@ def clear_grey(data: Buffer) -> float | None:
 
 
 def tiff_as_stored(data: bytes) -> bytes:
-    """An image, which `check_image` has seen; a TIFF, without an orientation."""
+    """Return the bytes of a checked image, without the orientation of a TIFF."""
     places = _tiff_places(data) if _reader(data[:12]) is _tiff else {}
     if _ORIENTATION not in places:
         return data
@@ -202,7 +203,7 @@ def _tiff_tags(data: Buffer) -> dict[int, int]:
 
 
 def _tiff_places(data: Buffer) -> dict[int, tuple[str, int]]:
-    """Form and offset of the first value of each of `_TIFF_TAGS` that is there."""
+    """Return the format and offset of the first value of each of `_TIFF_TAGS`."""
     order = "<" if data[:2] == b"II" else ">"
     (at,) = struct.unpack_from(f"{order}I", data, 4)
     (count,) = struct.unpack_from(f"{order}H", data, at)
@@ -212,7 +213,7 @@ def _tiff_places(data: Buffer) -> dict[int, tuple[str, int]]:
         form = {1: "B", 3: "H", 4: "I"}.get(kind)
         if tag in _TIFF_TAGS and form:
             at = entry + 8
-            if values * struct.calcsize(form) > 4:  # of several the first, elsewhere
+            if values * struct.calcsize(form) > 4:  # stored elsewhere
                 (at,) = struct.unpack_from(f"{order}I", data, at)
             found[tag] = order + form, at
     return found
@@ -223,10 +224,10 @@ def _tiff(data: Buffer) -> tuple[int, int]:
     if not {256, 257} <= set(found):
         raise _Truncated("no image size")
     width, height = found[256], found[257]
-    # Of one sample: others may be fewer than the pixels, as in YCbCr.
+    # One sample: others may be subsampled, as in YCbCr.
     bits = width * height * found.get(258, 1)
-    ratio = {1: 1, 5: _MAX_TIFF, 8: _MAX_DEFLATE, 32946: _MAX_DEFLATE}
-    shrunk = ratio.get(found.get(259, 1))  # others, as of fax, have no such bound
+    ratio = {1: 1, 5: _MAX_LZW, 8: _MAX_DEFLATE, 32946: _MAX_DEFLATE}
+    shrunk = ratio.get(found.get(259, 1))  # other compressions have no such bound
     if width * height <= MAX_PIXELS and shrunk and bits > 8 * shrunk * len(data):
         raise _Truncated(f"{width} × {height} px cannot fit in it")
     return width, height

@@ -1,16 +1,17 @@
-"""`transforms.json` as a scene: NeRF's synthetic scenes, instant-ngp and nerfstudio.
+"""Reader of `transforms.json`: NeRF's synthetic scenes, instant-ngp and nerfstudio.
 
-``applied_transform`` is not undone: as nerfstudio has it, it tells what was done to
-poses and points already, so that both are in one frame as they stand.
+nerfstudio's ``applied_transform`` is not undone: poses and points of the files are
+already in one frame.
 """
 
 import os
 import warnings
-from os import PathLike
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from gsjax.cameras.distortion import Distortion
 from gsjax.data.image_files import (
     check_factor,
     find_file,
@@ -18,6 +19,7 @@ from gsjax.data.image_files import (
     image_folder,
     inside,
     last_parts,
+    original_folder,
 )
 from gsjax.data.image_header import image_size
 from gsjax.data.transforms_fields import (
@@ -32,13 +34,19 @@ from gsjax.data.transforms_fields import (
     text_of,
     warn_of_scaled,
 )
-from gsjax.data.types import Dataset, Distortion, View, intrinsic_matrix
+from gsjax.data.types import (
+    Dataset,
+    Reader,
+    ReadOptions,
+    View,
+    intrinsic_matrix,
+)
 from gsjax.errors import InputError
 from gsjax.io.point_cloud import read_point_cloud
 
 _PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
-# The order of nerfstudio's distortion_params, which a frame may have.
+# In the order of nerfstudio's distortion_params.
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _IN_PIXELS = ("fl_x", "fl_y", "cx", "cy")
 _UNUSED = "unused"
@@ -46,10 +54,9 @@ _SPLITS = {"transforms_train": "train", "transforms_test": "test"}
 
 
 def find_transforms(folder: Path) -> list[Path]:
-    """The camera lists of a folder: one for all, or NeRF's train and test lists.
+    """Return the camera lists of a folder: one for all, or NeRF's train and test lists.
 
-    As with nerfstudio's names, validation views stand in for test views where there
-    are none.
+    Without test views, the validation views replace them.
     """
     if (folder / "transforms.json").exists():
         return [folder / "transforms.json"]
@@ -60,34 +67,30 @@ def find_transforms(folder: Path) -> list[Path]:
     return [path for path in (train, held_out) if path.exists()]
 
 
-def load_nerf(
-    paths: list[Path],
-    *,
-    images: str | PathLike[str] | None = None,
-    skip_missing: bool = False,
-    factor: int | None = None,
-    poses_only: bool = False,
-) -> Dataset:
-    """The scene of camera lists in one folder; see `load_dataset`."""
-    check_factor(factor)
+def load_nerf(path: Path, options: ReadOptions | None = None) -> Dataset:
+    """Read the dataset of a camera list, or of the lists in a folder.
+
+    Raises:
+      InputError: see `load_dataset`.
+    """
+    options = options or ReadOptions()
+    check_factor(options.factor)
+    paths = find_transforms(path) if path.is_dir() else [path]
+    if not paths:
+        raise InputError(
+            f"{path}: expected a transforms.json, got none; pass its folder"
+        )
     folder = root = paths[0].parent
-    elsewhere = images is not None or (factor is not None and factor > 1)
-    if elsewhere:
-        # As nerfstudio: smaller copies lie in a folder of their own, images_4.
-        root = image_folder(folder, images, factor, poses_only=poses_only)
+    elsewhere = options.images is not None or (options.factor or 1) > 1
+    if elsewhere:  # nerfstudio stores smaller copies in a folder of their own, images_4
+        root = image_folder(folder, options)
     views: list[View] = []
     lists = [read_frames(path) for path in paths]
     for path, frames in zip(paths, lists):
-        moved = images is not None or poses_only
+        moved = options.images is not None or options.poses_only
         names = [_file_path(frame, moved) for frame in frames]
-        files = find_files(
-            *(path, root, names),
-            skip_missing=skip_missing,
-            elsewhere=elsewhere,
-            factor=factor,
-            poses_only=poses_only,
-        )
-        # A second list is of what is held out, transforms_val.json too.
+        files = find_files(path, root, names, options, elsewhere=elsewhere)
+        # A second list, transforms_val.json too, is held out.
         default = _SPLITS.get(path.stem) if path == paths[0] else "test"
         splits = _splits(path, frames, default)
         scaled: list[tuple[int, float]] = []
@@ -98,13 +101,12 @@ def load_nerf(
             if scale != 1:
                 scaled.append((index, scale))
             file = files[name]
-            called = _name(file, folder, root)
-            mask = None if poses_only else _mask(frame, folder)
-            size = size_of(frame) or _size_of_file(frame, folder, root, file, factor)
-            split = splits[index]
-            views.append(_view(frame, file, called, viewmat, mask, size, split))
+            size = size_of(frame) or _size_of_file(frame, folder, root, file, options)
+            view = _view(frame, _name(file, folder, root), file, viewmat, size)
+            mask = None if options.poses_only else _mask(frame, folder)
+            views.append(replace(view, mask=mask, split=splits[index]))
         warn_of_scaled(path, scaled)
-    if not poses_only:
+    if not options.poses_only:
         _warn_of_dynamic_masks(views)
     points, colors = _points(lists[0][0], folder)
     source = paths[0] if len(paths) == 1 else folder
@@ -112,11 +114,17 @@ def load_nerf(
 
 
 def _file_path(frame: Frame, moved: bool) -> str:
-    """Where the photograph of a frame lies in the folder, by its list; of one that was
-    ``moved`` to another, the end of it that does not lead out."""
+    """Return the path of a photograph in the folder, as the list has it.
+
+    For photographs ``moved`` to another folder it is the last part of the name that
+    does not leave the folder.
+    """
     name = text_of(frame, "file_path")
     if not name:
-        raise InputError(f"{frame.where}: file_path is {shown(name)}; text is wanted")
+        raise InputError(
+            f"{frame.where}: file_path: expected text, got {shown(name)}; export the "
+            "file again"
+        )
     if moved:
         return str(inside(frame.where, last_parts(name) or name))
     offer = ", or pass images=, the folder that it is in (--images)"
@@ -124,26 +132,26 @@ def _file_path(frame: Frame, moved: bool) -> str:
 
 
 def _name(file: Path, folder: Path, root: Path) -> str:
-    """Of a photograph: its path in the dataset, or in ``root`` if that is outside."""
+    """Return the path of a file in the dataset, or in ``root`` if that is outside."""
     path, dataset = Path(os.path.abspath(file)), Path(os.path.abspath(folder))
     within = path.is_relative_to(dataset)
     return (path.relative_to(dataset) if within else file.relative_to(root)).as_posix()
 
 
 def _splits(path: Path, frames: list[Frame], default: str | None) -> list[str | None]:
-    """The split of each frame: by nerfstudio's lists of names, or that of the file.
+    """Return the split of each frame, from nerfstudio's lists of names or ``default``.
 
-    What is in two lists is held out; of what is in none, nothing is learnt where there
-    is a list to train with.
+    A frame in both lists is held out. If there is a training list, frames in no list
+    are unused.
     """
     listed = {key: _listed(path, frames, key) for key in ("val", "train", "test")}
-    # Validation views stand in for test views where there are none, else are unused.
+    # Validation views replace missing test views, else they are unused.
     held_out = listed["test"] or listed["val"]
     both = listed["train"] & held_out
     if both:
         warnings.warn(
-            f"{path}: {len(both)} of {len(frames)} frames are listed to train and to "
-            f"test with, {min(both)} first; they are held out",
+            f"{path}: {len(both)} of {len(frames)} frames are in the training and the "
+            f"test list, the first: {min(both)}; they are held out",
             UserWarning,
             stacklevel=3,
         )
@@ -155,8 +163,8 @@ def _splits(path: Path, frames: list[Frame], default: str | None) -> list[str | 
     if listed["train"] and others:
         default = _UNUSED
         warnings.warn(
-            f"{path}: {len(others)} of {len(names)} frames are in none of its lists, "
-            f"{others[0]} first; they are left out, as nerfstudio leaves them",
+            f"{path}: {len(others)} of {len(names)} frames are in no list, the first: "
+            f"{others[0]}; they are left out, as nerfstudio leaves them",
             UserWarning,
             stacklevel=3,
         )
@@ -164,35 +172,33 @@ def _splits(path: Path, frames: list[Frame], default: str | None) -> list[str | 
 
 
 def _listed(path: Path, frames: list[Frame], split: str) -> set[str]:
-    """The frames that a list of nerfstudio's names, each of which is one."""
+    """Return the names in a list of nerfstudio; each must be that of a frame."""
     names = frames[0].sources[1].get(f"{split}_filenames")
     if names is not None and not isinstance(names, list):
-        raise InputError(f"{path}: {split}_filenames is {shown(names)}; a list")
+        raise InputError(
+            f"{path}: {split}_filenames: expected a list, got {shown(names)}; export "
+            "the file again"
+        )
     found = {_spelt(str(name)) for name in names or ()}
     strange = found - {_spelt(str(text_of(frame, "file_path"))) for frame in frames}
     if strange:
         raise InputError(
-            f"{path}: {len(strange)} of {len(found)} names of {split}_filenames are of "
-            f"no frame, {min(strange)!r} first; file_path of the frames are wanted"
+            f"{path}: {split}_filenames: {len(strange)} of {len(found)} names are not "
+            f"the file_path of a frame, the first: {min(strange)!r}; export the file "
+            "again"
         )
     return found
 
 
 def _spelt(name: str) -> str:
-    """A path as all ways to spell it come to."""
+    """Return the canonical spelling of a path."""
     return PurePosixPath(name.replace("\\", "/")).as_posix()
 
 
 def _view(
-    frame: Frame,
-    file: Path,
-    name: str,
-    viewmat: np.ndarray,
-    mask: Path | None,
-    size: tuple[int, int],
-    split: str | None,
+    frame: Frame, name: str, file: Path, viewmat: np.ndarray, size: tuple[int, int]
 ) -> View:
-    lens = _lens(frame)
+    lens = _distortion(frame)
     width, height = size
     model = "fisheye" if lens is not None and lens.model == "fisheye" else "pinhole"
     fx, fy = focal_lengths(frame, width, height, model)
@@ -206,68 +212,66 @@ def _view(
         width=width,
         height=height,
         lens=lens,
-        mask=mask,
-        split=split,
     )
 
 
 def _size_of_file(
-    frame: Frame, folder: Path, root: Path, file: Path, factor: int | None
+    frame: Frame, folder: Path, root: Path, file: Path, options: ReadOptions
 ) -> tuple[int, int]:
-    """That of the photograph which the camera is for, where the list does not say.
+    """Return the size that a frame's intrinsics refer to, from the photograph's file.
 
-    An angle of view is one of any copy; what is in px is of the original.
+    Intrinsics in px refer to the original; an angle of view holds for any copy.
     """
     if any(first_number(frame, key) is not None for key in _IN_PIXELS):
         original = find_file(folder, str(text_of(frame, "file_path")))
-        if original is None and factor is not None and factor > 1:
-            whole = root.with_name(root.name.removesuffix(f"_{factor}"))
-            original = find_file(whole, file.relative_to(root).as_posix())
+        originals = original_folder(root, options)
+        if original is None and originals is not None:
+            original = find_file(originals, file.relative_to(root).as_posix())
             if original is None:
                 raise InputError(
                     f"{frame.where}: no image size: w and h are missing, and the "
-                    f"photograph of which {file} is a smaller copy is not there; give "
-                    "w and h in the file, of what fl_x, cx and cy are in px of"
+                    f"original of the smaller copy {file} does not exist; give w and h "
+                    "in the file, the size that fl_x, cx and cy refer to"
                 )
         file = original or file
-    if not file.exists():  # where poses are all that is wanted
+    if not file.exists():  # with poses_only
         raise InputError(
-            f"{frame.where}: no image size: w and h are missing, and {file} is not "
-            "there; give w and h in the file, or render from the file itself with a "
+            f"{frame.where}: no image size: w and h are missing, and {file} does not "
+            "exist; give w and h in the file, or render from the file itself with a "
             "size (--cameras FILE --size WxH)"
         )
     return image_size(file)
 
 
 def _mask(frame: Frame, folder: Path) -> Path | None:
-    """The file that a frame names, if it does."""
+    """Return the mask that a frame names, if any."""
     name = text_of(frame, "mask_path")
     if name is None:
         return None
     mask = folder / inside(frame.where, name)
     if not mask.is_file():
         raise InputError(
-            f"{frame.where}: mask_path {shown(name)}: no such file in {folder}"
+            f"{frame.where}: mask_path {shown(name)}: no such file in {folder}; put it "
+            "there"
         )
     return mask
 
 
 def _warn_of_dynamic_masks(views: list[View]) -> None:
-    """Tell of instant-ngp's masks, which no list names: what is not black is left out
-    there, the opposite of all others."""
+    """Warn of instant-ngp's masks: no list names them, and black means kept."""
     masks = [v.image.with_name(f"dynamic_mask_{v.image.stem}.png") for v in views]
     there = [mask for mask in masks if mask.is_file()]
     if there:
         warnings.warn(
-            f"{there[0].parent}: {len(there)} masks of instant-ngp, {there[0].name} "
-            "first, are not heeded; to leave out what they show, invert them, black "
-            "for what is left out, and name them in the list by mask_path",
+            f"{there[0].parent}: {len(there)} masks of instant-ngp are ignored, the "
+            f"first: {there[0].name}; to use them, invert them (black is excluded) and "
+            "name them in the list by mask_path",
             UserWarning,
             stacklevel=3,
         )
 
 
-def _lens(frame: Frame) -> Distortion | None:
+def _distortion(frame: Frame) -> Distortion | None:
     model = model_of(frame)
     if model not in (*_PERSPECTIVE, *_FISHEYE):
         raise InputError(
@@ -279,46 +283,59 @@ def _lens(frame: Frame) -> Distortion | None:
     if model in _FISHEYE:
         if p1 or p2:
             raise InputError(
-                f"{frame.where}: a fisheye has no p1, p2; found {p1}, {p2}"
+                f"{frame.where}: a fisheye has no p1, p2, got {p1}, {p2}; undistort "
+                "the photographs first"
             )
         return Distortion("fisheye", (k1, k2, k3, k4))
     if not any((k1, k2, k3, k4, p1, p2)):
         return None
-    # As nerfstudio and instant-ngp, which read no rational denominator.
+    # nerfstudio and instant-ngp read no rational denominator either.
     higher = {key: first_number(frame, key) for key in ("k5", "k6")} | {"k4": k4}
     if any(higher.values()):
         raise InputError(
-            f"{frame.where}: {', '.join(k for k, v in higher.items() if v)} of a lens "
-            "that is no fisheye is not supported; undistort the photographs first"
+            f"{frame.where}: {', '.join(k for k, v in higher.items() if v)} of a "
+            "perspective lens is not supported; undistort the photographs first"
         )
-    return Distortion("radial_tangential", (k1, k2, p1, p2, k3))
+    return Distortion("opencv", (k1, k2, p1, p2, k3))
 
 
 def _coefficients(frame: Frame) -> list[float]:
-    """k1 k2 k3 k4 p1 p2; those that are missing are 0."""
+    """Return k1 k2 k3 k4 p1 p2; missing ones are 0."""
     given = frame.sources[0].get("distortion_params")
     if given is None:
         return [first_number(frame, key) or 0.0 for key in _COEFFICIENTS]
     if not isinstance(given, list) or len(given) != len(_COEFFICIENTS):
         raise InputError(
-            f"{frame.where}: distortion_params is {shown(given)}; the numbers "
-            f"{' '.join(_COEFFICIENTS)} are wanted"
+            f"{frame.where}: distortion_params: expected the numbers "
+            f"{' '.join(_COEFFICIENTS)}, got {shown(given)}; export the file again"
         )
     named = Frame(frame.where, (dict(zip(_COEFFICIENTS, given)), {}))
     return [first_number(named, key) or 0.0 for key in _COEFFICIENTS]
 
 
 def _points(frame: Frame, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Points [M, 3] and colours of `ply_file_path`, if the file names one."""
+    """Return the points [M, 3] and colours of `ply_file_path`, if there is one."""
     path = frame.sources[1].get("ply_file_path")
     if path is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not isinstance(path, str):
-        raise InputError(f"{frame.where}: ply_file_path is {shown(path)}; text")
+        raise InputError(
+            f"{frame.where}: ply_file_path: expected text, got {shown(path)}; export "
+            "the file again"
+        )
     cloud = folder / inside(f"{folder}: ply_file_path", path)
     if not cloud.is_file():
         raise InputError(
             f"{frame.where}: ply_file_path {shown(path)}: no such file in {folder}; "
-            "put it there, or take ply_file_path off the list to go without points"
+            "put it there, or remove ply_file_path from the list to go without points"
         )
     return read_point_cloud(cloud)
+
+
+def _detect(path: Path) -> bool:
+    if path.is_dir():
+        return bool(find_transforms(path))
+    return path.suffix.lower() == ".json"
+
+
+TRANSFORMS = Reader("transforms.json", _detect, load_nerf)

@@ -1,7 +1,7 @@
-"""Photographs: files → undistorted, scaled pixels with the camera that goes with them.
+"""Loading of photographs: undistorted, scaled pixels and the camera that fits them.
 
-OpenCV decodes and is loaded when first needed. EXIF orientation is ignored, as
-COLMAP ignores it: the camera is that of the pixels as they are stored.
+OpenCV decodes and is imported on first use. EXIF orientation is ignored, as in COLMAP:
+a camera refers to the pixels as stored.
 """
 
 import threading
@@ -14,45 +14,45 @@ from pathlib import Path
 
 import numpy as np
 
-from gsjax.cameras.distortion import undistortion_maps
-from gsjax.data.decode import decode, telling_of_damage
+from gsjax.cameras.distortion import Distortion, undistortion_maps
+from gsjax.data.decode import decode, warn_of_damage
 from gsjax.data.image_header import image_size
-from gsjax.data.types import Distortion, Photo, View
+from gsjax.data.types import Photo, View
 from gsjax.errors import InputError
 from gsjax.io.images import opencv
 from gsjax.runtime.machine import all_of, usable_cores
 
-# Sizes that differ from the camera's by rounding only: 1 px a side and this much.
+# Relative deviation of an aspect ratio, besides rounding by 1 px a side.
 _ASPECT_TOLERANCE = 0.01
-# How much longer than its camera's a side may be. Cameras are found in photographs made
-# smaller, by 8 or 16; a few bytes may declare a picture of any size.
-_MOST_LARGER = 64
-# Share of the pixels of a photograph that undoing its lens leaves; a heuristic.
-_LEAST_SEEN = 0.01
-_MAX_REMAP = 32766  # of cv2.remap
-_BATCH = 8  # photographs a thread, before anything is told of them
+# Bound of file size over camera size, a side. Cameras are often estimated from copies
+# smaller by 8 or 16; a few bytes may declare an image of any size.
+_MAX_RATIO = 64
+# Minimum share of the pixels that are valid after undistortion (a heuristic).
+_MIN_VALID = 0.01
+_MAX_REMAP = 32766  # px a side, limit of cv2.remap
+_BATCH = 8  # photographs per thread between reports
 Filter = Callable[[np.ndarray], np.ndarray]
 
 
 def load_photo(view: View, max_size: int | None = None) -> Photo:
-    """Read a photograph, undo its lens, leave out its mask, make it small enough.
+    """Read, undistort and scale a photograph, and apply its mask.
 
-    16 bits are rounded to 8, grey becomes RGB, and an alpha channel that is opaque
-    everywhere is dropped. The ideal pinhole keeps focal lengths and principal point;
-    pixels that the lens did not see are not valid, nor is any pixel to which one that
-    is masked or was not seen contributes. Damage that the decoder could mend is warned
-    of.
+    Samples of 16 bits are rounded to 8, grey becomes RGB, and an opaque alpha channel
+    is dropped. The ideal pinhole keeps focal lengths and principal point. A pixel is
+    invalid if any masked pixel, or any outside of the photograph, contributes to it.
+    Warns of damage that the decoder could repair.
 
     Args:
-      view: which photograph.
-      max_size: longest side in px; larger ones are averaged down. None for as it is.
+      view: the view to load.
+      max_size: longest side in px; larger photographs are averaged down. None keeps the
+        size.
 
     Raises:
-      InputError: if the file cannot be read, is no image, is truncated or too large,
-        has not the aspect ratio of the camera, as its header says, or is more than
-        64 times as wide; if its lens leaves nothing of it; or max_size is below 1.
+      InputError: if the file cannot be read, is not an image, is truncated or too
+        large, does not have the camera's aspect ratio or is over 64 times as wide, if
+        undistortion leaves nothing of it, or if max_size is below 1.
     """
-    with telling_of_damage(_files([view])):
+    with warn_of_damage(_files([view])):
         return _load(view, max_size)
 
 
@@ -63,8 +63,11 @@ def _files(views: Sequence[View]) -> list[Path]:
 
 def _load(view: View, max_size: int | None) -> Photo:
     if max_size is not None and max_size < 1:
-        raise InputError(f"max_size {max_size}: at least 1 px is wanted")
-    as_stored = opencv().IMREAD_UNCHANGED  # which does not rotate
+        raise InputError(
+            f"max_size: expected at least 1 px, got {max_size}; pass None to keep "
+            "the size"
+        )
+    as_stored = opencv().IMREAD_UNCHANGED  # does not rotate
     stored = decode(view.image, as_stored, partial(_ratio, view))
     pixels, alpha = _to_rgb(view.image, stored)
     height, width = pixels.shape[:2]
@@ -73,8 +76,8 @@ def _load(view: View, max_size: int | None) -> Photo:
     if view.lens is not None:
         if max(width, height) > _MAX_REMAP:
             raise InputError(
-                f"{view.image}: {width} × {height} px; at most {_MAX_REMAP} px a side "
-                "are undistorted: make it smaller"
+                f"{view.image}: expected at most {_MAX_REMAP} px a side to undistort, "
+                f"got {width} × {height}; make it smaller"
             )
         given = (pixels, alpha, invalid)
         pixels, alpha, invalid = _undistorted(view.image, view.lens, K, *given)
@@ -94,22 +97,22 @@ def load_photos(
     max_size: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Photo]:
-    """`load_photo` of all views, on all cores, in their order.
+    """Return `load_photo` of each view, in order, using all cores.
 
     Args:
-      views: which photographs.
+      views: the views to load.
       max_size: longest side in px, or None.
-      progress: called with (how many are done, how many there are) for each.
+      progress: called with (number done, total) for each photograph.
 
     Raises:
-      InputError: on the first photograph that `load_photo` refuses.
+      InputError: as `load_photo`, for the first photograph that fails.
     """
     workers = min(32, usable_cores())
     photos: list[Photo] = []
     with ThreadPoolExecutor(workers) as pool:
         for start in range(0, len(views), _BATCH * workers):
             batch = views[start : start + _BATCH * workers]
-            with telling_of_damage(_files(batch)):
+            with warn_of_damage(_files(batch)):
                 photos += all_of(pool, lambda view: _load(view, max_size), batch)
             if progress is not None:
                 for done in range(start, len(photos)):
@@ -118,14 +121,14 @@ def load_photos(
 
 
 def _to_rgb(path: Path, stored: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """RGB and alpha, both uint8; None for an alpha that lets nothing through."""
+    """Return RGB and alpha, both uint8; alpha is None if opaque."""
     if stored.dtype == np.uint16:
-        # Nearest of 255·v/65535 = v/257; 257 is odd, so that there are no ties.
+        # Rounds 255·v/65535 = v/257; 257 is odd, so there are no ties.
         stored = ((stored.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if stored.dtype != np.uint8:
         raise InputError(
-            f"{path}: pixels of {stored.dtype}; 8 or 16 bits are wanted: convert the "
-            "photograph to PNG or JPEG"
+            f"{path}: expected samples of 8 or 16 bits, got {stored.dtype}; convert "
+            "the photograph to PNG or JPEG"
         )
     channels = 1 if stored.ndim == 2 else stored.shape[2]
     if channels == 1:
@@ -134,74 +137,73 @@ def _to_rgb(path: Path, stored: np.ndarray) -> tuple[np.ndarray, np.ndarray | No
         pixels = np.repeat(stored[..., :1], 3, axis=2)
     else:
         pixels = np.ascontiguousarray(stored[..., 2::-1])
-    # Of CMYK, too, OpenCV makes four channels, the last of them opaque.
+    # OpenCV also decodes CMYK to four channels, the last of them opaque.
     clear = channels in (2, 4) and (stored[..., -1] < 255).any()
     return pixels, stored[..., -1].copy() if clear else None
 
 
 def _ratio(view: View, width: int, height: int) -> tuple[float, float]:
-    """Size of the file over the size that the camera is for."""
+    """Return the size of the file over the size that the camera refers to."""
     sx, sy = width / view.width, height / view.height
     # Rounding moves either side by up to 1 px.
     tolerance = _ASPECT_TOLERANCE + 1 / width + 1 / height
     if abs(np.log(sx / sy)) > tolerance:
         turned = abs(np.log(width / view.height * view.width / height)) <= tolerance
-        remedy = (
-            "it was rotated, or is to be by its EXIF, which is not heeded here: keep "
-            "the photographs that the cameras are of, or save it as it is shown"
-        )
+        remedy = "use the photographs that the cameras were estimated from"
+        if turned:
+            remedy = f"it was rotated, or its EXIF (ignored here) rotates it: {remedy}"
         raise InputError(
-            f"{view.image}: {width} × {height} px, but its camera is for {view.width} "
-            f"× {view.height}; "
-            + (remedy if turned else "one of the same aspect ratio is wanted")
+            f"{view.image}: expected the aspect ratio of its camera, {view.width} × "
+            f"{view.height}, got {width} × {height} px; {remedy}"
         )
-    if max(sx, sy) > _MOST_LARGER:
+    if max(sx, sy) > _MAX_RATIO:
         raise InputError(
-            f"{view.image}: {width} × {height} px, but its camera is for {view.width} "
-            f"× {view.height}; at most {_MOST_LARGER} times as many a side are read: "
+            f"{view.image}: expected at most {_MAX_RATIO} times the size of its "
+            f"camera, {view.width} × {view.height}, got {width} × {height} px; "
             "make it smaller"
         )
     return sx, sy
 
 
 def stored_size(view: View) -> tuple[int, int]:
-    """Width and height, px, of a photograph as its file has it, by the header; where
-    that is not there, as the camera is for."""
+    """Return the size in px of a photograph's file; without a file, of its camera."""
     if view.image.exists():
         return image_size(view.image)
     return view.width, view.height
 
 
 def size_within(width: int, height: int, longest: int | None) -> tuple[int, int]:
-    """Width and height, px, of a photograph whose longest side is made that long, if
-    it is longer; None for as it is."""
+    """Return the size in px of an image whose longest side is reduced to ``longest``.
+
+    The size is kept if it is smaller, or ``longest`` is None.
+    """
     ratio = 1.0 if longest is None else min(1.0, longest / max(width, height))
     return max(1, round(width * ratio)), max(1, round(height * ratio))
 
 
 def scaled_intrinsics(K: np.ndarray, sx: float, sy: float) -> np.ndarray:
-    """Intrinsics of an image whose sides are ``sx`` and ``sy`` times as long."""
+    """Return the intrinsics of an image scaled by ``sx`` and ``sy``."""
     return np.asarray(K, np.float64) * np.asarray([[sx], [sy], [1.0]])
 
 
 def _check_mask(path: Path, size: tuple[int, int], across: int, down: int) -> None:
-    """See that a mask of so many px is one of a photograph of that size."""
+    """Check the size of a mask, across × down px, against that of its photograph."""
     width, height = size
     rounding = 1 / across + 1 / down + 1 / width + 1 / height
     stretched = abs(np.log(across / width * height / down))
-    if stretched > _ASPECT_TOLERANCE + rounding or across > _MOST_LARGER * width:
+    if stretched > _ASPECT_TOLERANCE + rounding or across > _MAX_RATIO * width:
         raise InputError(
-            f"{path}: a mask of {across} × {down} px for a photograph of {width} × "
-            f"{height}; one of the same aspect ratio, at most {_MOST_LARGER} times as "
-            "wide, is wanted"
+            f"{path}: expected a mask of the aspect ratio of its photograph, {width} × "
+            f"{height} px, and at most {_MAX_RATIO} times as wide, got {across} × "
+            f"{down} px; make one of the photograph's size"
         )
 
 
 def _masked(path: Path, width: int, height: int) -> np.ndarray:
-    """[H, W] bool: where the mask is 0."""
+    """Return [H, W] bool: where the mask is 0."""
     cv2 = opencv()
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    flags |= cv2.IMREAD_ANYDEPTH  # of 16 bits, 1 is no black
+    flags |= cv2.IMREAD_ANYDEPTH  # a 1 of 16 bits is not black
     mask = decode(path, flags, partial(_check_mask, path, (width, height)))
     if mask.shape != (height, width):
         rows = (np.arange(height) + 0.5) * (mask.shape[0] / height)
@@ -213,7 +215,7 @@ def _masked(path: Path, width: int, height: int) -> np.ndarray:
 def _filtered(
     filter_: Filter, pixels: np.ndarray, alpha: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Interpolate colours, weighted by their opacity where the image has one."""
+    """Filter the colours of an image, weighted by its opacity if it has one."""
     if alpha is None:
         return filter_(pixels), None
     weight = alpha.astype(np.float32)
@@ -225,13 +227,13 @@ def _filtered(
     return clipped, np.clip(np.rint(mean[..., 0]), 0, 255).astype(np.uint8)
 
 
-_KEPT = 2  # cameras whose maps are kept: those of a photograph take several of it
+_KEPT = 2  # maps are several times as large as a photograph
 _maps_lock = threading.Lock()
 _maps_of: OrderedDict[tuple, Future] = OrderedDict()
 
 
 def _maps(lens: Distortion, K: np.ndarray, width: int, height: int):
-    """`undistortion_maps`: made by one thread of those that want the same."""
+    """Return `undistortion_maps`, computed once for all threads that need them."""
     key = (lens, tuple(K.ravel().tolist()), width, height)
     with _maps_lock:
         found = _maps_of.get(key)
@@ -261,12 +263,12 @@ def _undistorted(
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     height, width = pixels.shape[:2]
     map_x, map_y, seen = _maps(lens, K, width, height)
-    if seen.mean() < _LEAST_SEEN:
-        told = ", ".join(f"{value:g}" for value in lens.coefficients)
+    if seen.mean() < _MIN_VALID:
+        values = ", ".join(f"{value:g}" for value in lens.coefficients)
         raise InputError(
-            f"{path}: of its {seen.size:,} pixels {int(seen.sum())} are left when the "
-            f"lens of its camera ({lens.model}, {told}) is undone; estimate the camera "
-            "again, or remove the photograph"
+            f"{path}: {int(seen.sum())} of {seen.size:,} pixels are left after "
+            f"undistortion ({lens.model}, {values}); estimate the camera again, or "
+            "remove the photograph"
         )
     cv2 = opencv()
     remap = partial(
@@ -284,6 +286,6 @@ def _undistorted(
 
 
 def undistorted_view(view: View, photo: Photo) -> View:
-    """The view of a loaded photograph: its K and size, and no lens."""
+    """Return the view of a loaded photograph: its K and size, without distortion."""
     height, width = photo.pixels.shape[:2]
     return replace(view, K=photo.K, width=width, height=height, lens=None)

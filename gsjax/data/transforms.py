@@ -1,8 +1,8 @@
-"""Camera lists in the `transforms.json` form of NeRF, instant-ngp and nerfstudio.
+"""Cameras to render, from the `transforms.json` of NeRF, instant-ngp or nerfstudio.
 
-Their matrices are camera → world in OpenGL axes (x right, y up, z backward): columns
-1 and 2 are flipped, then the matrix is inverted, which gives our world → camera in
-OpenCV axes. Everything here is float64 on the host until `make_camera`.
+The files have camera → world matrices in OpenGL axes (x right, y up, z backward): flip
+columns 1 and 2 and invert for world → camera in OpenCV axes. Everything is float64 on
+the host until `make_camera`.
 """
 
 import re
@@ -30,7 +30,7 @@ from gsjax.data.transforms_fields import (
 )
 from gsjax.errors import InputError
 
-# `camera_model` of the file → ours. Lens distortion is not rendered.
+# `camera_model` of the file → lens of `make_camera`; distortion is not rendered.
 _MODELS = {
     **dict.fromkeys(("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"), "pinhole"),
     **dict.fromkeys(("RADIAL", "SIMPLE_RADIAL"), "pinhole"),
@@ -41,7 +41,7 @@ _MAX_NAME_BYTES = 180
 
 
 class CameraEntry(NamedTuple):
-    """A camera and the name of its output: unique, safe as a file name, no suffix."""
+    """A camera and a unique name, safe as a file name, without suffix."""
 
     name: str
     camera: Camera
@@ -50,25 +50,25 @@ class CameraEntry(NamedTuple):
 def load_transforms(
     path: str | PathLike[str], *, size: tuple[int, int] | None = None
 ) -> list[CameraEntry]:
-    """Cameras of a `transforms.json`, in the order of the file.
+    """Return the cameras of a `transforms.json`, in the order of the file.
 
-    Intrinsics stand in the frame or, for all frames, at the top: fl_x, fl_y, cx, cy,
-    w, h in pixels, or camera_angle_x and camera_angle_y in radians, or x_fov and y_fov
-    in degrees. One alone is that of both axes; a missing cx, cy is the image centre.
-    Lens distortion is not rendered: a warning says so.
+    Intrinsics are read from the frame or, for all frames, from the top level: fl_x,
+    fl_y, cx, cy, w, h in px, or camera_angle_x and camera_angle_y in radians, or x_fov
+    and y_fov in degrees. A single one holds for both axes; cx and cy default to the
+    image centre. Lens distortion is ignored, with a warning.
 
     Args:
       path: the JSON file.
-      size: (width, height) in pixels of the images to render. Intrinsics are scaled
-        from the size in the file (another aspect ratio stretches the image); where
-        the file has none, as in the NeRF synthetic scenes, this is the size.
+      size: (width, height) in px of the images to render. Intrinsics are scaled from
+        the size in the file (another aspect ratio stretches the image); if the file
+        has none, as NeRF's synthetic scenes, they refer to this size.
 
     Returns:
-      Names, from the stem of file_path or else ``frame_00012``, and cameras.
+      The cameras, named by the stem of file_path or else ``frame_00012``.
 
     Raises:
-      InputError: if the file cannot be read, is no such JSON, or a frame has no
-        rigid transform_matrix, no usable intrinsics, no size or an unknown lens.
+      InputError: if the file cannot be read or is not such a JSON file, or a frame has
+        no rigid transform_matrix, no usable intrinsics, no size or an unknown lens.
     """
     entries, _ = _load(Path(path), size, near_origin=False)
     return entries
@@ -77,11 +77,11 @@ def load_transforms(
 def load_near_transforms(
     path: str | PathLike[str], *, size: tuple[int, int] | None = None
 ) -> tuple[list[CameraEntry], np.ndarray]:
-    """As `load_transforms`, brought near the origin where float32 would be too coarse.
+    """Return the cameras of `load_transforms`, translated if float32 is too coarse.
 
     Returns:
-      The cameras, and what was subtracted from their world's coordinates [3] in
-      float64, and is to be from those of the scene; see `gsjax.data.rebase`.
+      The cameras, and the [3] float64 offset that was subtracted from their coordinates
+      and must be subtracted from those of the scene; see `gsjax.data.rebase`.
     """
     return _load(Path(path), size, near_origin=True)
 
@@ -92,7 +92,9 @@ def _load(
     if size is not None and not (
         len(size) == 2 and all(isinstance(v, int | np.integer) and v >= 1 for v in size)
     ):
-        raise InputError(f"size {size}: (width, height), whole and ≥ 1, is wanted")
+        raise InputError(
+            f"size: expected whole (width, height) ≥ 1, got {size}; pass (800, 600)"
+        )
     frames = read_frames(path)
     poses = [pose_of(frame) for frame in frames]
     centres = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose, _ in poses])
@@ -110,7 +112,7 @@ def _load(
     if distorted:
         warnings.warn(
             f"{path}: lens distortion ({', '.join(sorted(distorted))}) is ignored; "
-            "images are rendered as an ideal, undistorted lens",
+            "images are rendered without it",
             UserWarning,
             stacklevel=3,
         )
@@ -140,7 +142,7 @@ def _camera(
                 width=int(out_width),
                 height=int(out_height),
                 near=near,
-                model=model,
+                lens=model,
             )
     except InputError as error:
         raise InputError(f"{frame.where}: {error}") from error
@@ -151,14 +153,14 @@ def _model(frame: Frame) -> str:
     model = _MODELS.get(name)
     if model is None:
         raise InputError(
-            f"{frame.where}: camera_model {shown(name)} is not rendered; supported: "
-            f"{', '.join(_MODELS)}. Undistort the images to a pinhole first"
+            f"{frame.where}: camera_model {shown(name)} cannot be rendered; supported: "
+            f"{', '.join(_MODELS)}; undistort the images to a pinhole first"
         )
     return model
 
 
 def _size(frame: Frame, size: tuple[int, int] | None) -> tuple[int, int]:
-    """Width and height that the intrinsics of the file refer to."""
+    """Return the width and height that the intrinsics of the file refer to."""
     found = size_of(frame) or size
     if found is None:
         raise InputError(
@@ -169,7 +171,7 @@ def _size(frame: Frame, size: tuple[int, int] | None) -> tuple[int, int]:
 
 
 def _distortion(frame: Frame) -> list[str]:
-    """Keys of the distortion coefficients that are not zero."""
+    """Return the keys of nonzero distortion coefficients."""
     found = [key for key in _DISTORTION if first_number(frame, key)]
     coefficients = frame.get("distortion_params")  # nerfstudio, per frame
     if isinstance(coefficients, list) and any(coefficients):
@@ -181,7 +183,7 @@ def _distortion(frame: Frame) -> list[str]:
 
 
 def _unique_name(frame: Frame, index: int, used: dict[str, int]) -> str:
-    """A file name without suffix that no entry before has, in any case of letters."""
+    """Return a file name without suffix, unique even if case is ignored."""
     base = Path(
         (text_of(frame, "file_path") or "").replace("\\", "/").rpartition("/")[2]
     ).stem

@@ -1,9 +1,4 @@
-"""The JSON of a `transforms.json`: its frames, poses and focal lengths, checked.
-
-Poses are camera → world in OpenGL axes (x right, y up, z backward): columns 1 and 2
-are flipped, then the matrix is inverted, which gives our world → camera in OpenCV
-axes.
-"""
+"""Checked access to the frames, poses and focal lengths of a `transforms.json`."""
 
 import math
 import warnings
@@ -21,35 +16,36 @@ _OTHER_LENSES = ("ftheta_", "latlong", "equirectangular")
 
 
 class Frame(NamedTuple):
-    """One frame; ``where`` names file and index, ``sources`` are frame and file."""
+    """A frame; ``where`` names file and index, ``sources`` are frame and top level."""
 
     where: str
     sources: tuple[dict[str, Any], dict[str, Any]]
 
     def get(self, key: str) -> Any:
-        """The value of the frame, or else that of the file, or else None."""
+        """Return the value of the frame, else of the top level, else None."""
         values = (source.get(key) for source in self.sources)
         return next((value for value in values if value is not None), None)
 
 
 def shown(value) -> str:
-    """A value as found, for a message."""
+    """Return a found value as text for a message."""
     return "missing" if value is None else files.shown(value)
 
 
 def read_frames(path: Path) -> list[Frame]:
-    """The frames of a file, at least one."""
+    """Return the frames of a file, at least one."""
     data = files.read_json(path, "a transforms.json")
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(
-            f"{path}: 'frames' is {shown(frames)}; a list of at least one frame is "
-            "wanted: is this a transforms.json?"
+            f"{path}: 'frames': expected a list of at least one frame, got "
+            f"{shown(frames)}; pass a transforms.json"
         )
     for index, content in enumerate(frames):
         if not isinstance(content, dict):
             raise InputError(
-                f"{path}: frames[{index}] is {shown(content)}; an object is wanted"
+                f"{path}: frames[{index}]: expected an object, got {shown(content)}; "
+                "export the file again"
             )
     return [Frame(f"{path}: frames[{i}]", (f, data)) for i, f in enumerate(frames)]
 
@@ -59,7 +55,7 @@ def _is_number(value) -> bool:
 
 
 def number(frame: Frame, source: dict[str, Any], key: str) -> float | None:
-    """A finite number, or None where the key is absent or null."""
+    """Return a finite number, or None if the key is absent or null."""
     value = source.get(key)
     if value is None:
         return None
@@ -68,35 +64,42 @@ def number(frame: Frame, source: dict[str, Any], key: str) -> float | None:
             return float(value)
     except OverflowError:  # an integer beyond float64
         pass
-    raise InputError(f"{frame.where}: {key} is {shown(value)}; a number is wanted")
+    raise _unexpected(frame, key, "a number", value)
 
 
 def first_number(frame: Frame, key: str) -> float | None:
-    """The number of the frame, or else the one of the whole file."""
+    """Return the number of the frame, else of the top level, else None."""
     values = (number(frame, source, key) for source in frame.sources)
     return next((value for value in values if value is not None), None)
 
 
 def text_of(frame: Frame, key: str) -> str | None:
-    """A text of the frame itself, or None where the key is absent or null."""
+    """Return a text of the frame itself, or None if the key is absent or null."""
     value = frame.sources[0].get(key)
     if value is not None and not isinstance(value, str):
-        raise InputError(f"{frame.where}: {key} is {shown(value)}; text is wanted")
+        raise _unexpected(frame, key, "text", value)
     return value
 
 
+def _unexpected(frame: Frame, key: str, expected: str, value) -> InputError:
+    return InputError(
+        f"{frame.where}: {key}: expected {expected}, got {shown(value)}; export the "
+        "file again"
+    )
+
+
 def model_of(frame: Frame) -> str:
-    """The camera model in upper case; "PINHOLE" where the file names none.
+    """Return the camera model in upper case; "PINHOLE" if the file names none.
 
     Raises:
-      InputError: on a lens of instant-ngp that is not among ours.
+      InputError: if the file describes an unsupported lens of instant-ngp.
     """
     keys = {key for source in frame.sources for key in source}
     for key in sorted(keys):
         if key.startswith(_OTHER_LENSES) and frame.get(key) not in (None, False):
             raise InputError(
-                f"{frame.where}: {key[:40]} is {shown(frame.get(key))}, of a lens that "
-                "is not supported; undistort the photographs to a pinhole first"
+                f"{frame.where}: {key[:40]} {shown(frame.get(key))}: this lens is not "
+                "supported; undistort the photographs to a pinhole first"
             )
     if frame.get("is_fisheye") is True:  # instant-ngp
         return "OPENCV_FISHEYE"
@@ -105,7 +108,7 @@ def model_of(frame: Frame) -> str:
 
 
 def size_of(frame: Frame) -> tuple[int, int] | None:
-    """Width and height that the intrinsics refer to, or None if the file has none."""
+    """Return the width and height that the intrinsics refer to, or None."""
     width, height = first_number(frame, "w"), first_number(frame, "h")
     if width is None and height is None:
         return None
@@ -117,8 +120,8 @@ def size_of(frame: Frame) -> tuple[int, int] | None:
         )
     if not all(1 <= side <= MAX_SIDE and side % 1 == 0 for side in (width, height)):
         raise InputError(
-            f"{frame.where}: image size w {width:g}, h {height:g}; whole and ≥ 1, at "
-            f"most {MAX_SIDE}, is wanted"
+            f"{frame.where}: expected a whole image size from 1 to {MAX_SIDE}, got w "
+            f"{width:g}, h {height:g}; export the file again"
         )
     return int(width), int(height)
 
@@ -127,11 +130,11 @@ def size_of(frame: Frame) -> tuple[int, int] | None:
 
 
 def pose_of(frame: Frame) -> tuple[np.ndarray, float]:
-    """World → camera [4, 4], and the scale that was divided out (1 if none)."""
+    """Return world → camera [4, 4], and the scale that was divided out (1 if none)."""
     matrix = _matrix(frame)
     with np.errstate(all="ignore"):
-        rotation, scale = rigid(frame.where, matrix[:3, :3])
-    # OpenGL → OpenCV: y and z of the camera point the other way.
+        rotation, scale = rigid(f"{frame.where}: transform_matrix", matrix[:3, :3])
+    # OpenGL → OpenCV: flip y and z of the camera.
     rotation = rotation * np.asarray([1.0, -1.0, -1.0])
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ matrix[:3, 3]
@@ -139,7 +142,7 @@ def pose_of(frame: Frame) -> tuple[np.ndarray, float]:
 
 
 def warn_of_scaled(path: Path, scaled: list[tuple[int, float]]) -> None:
-    """Warn, on behalf of who called the caller's caller, of scales divided out."""
+    """Warn of scales that were divided out, if any."""
     if scaled:
         first = ", ".join(f"{index} (× {scale:.6g})" for index, scale in scaled[:5])
         warnings.warn(
@@ -156,7 +159,10 @@ def _matrix(frame: Frame) -> np.ndarray:
     rows = value if isinstance(value, list) else []
     shape = [len(row) for row in rows if isinstance(row, list)]
     if len(shape) != len(rows) or shape not in ([4] * 4, [4] * 3):
-        raise InputError(f"{where} is {shown(value)}; 4 rows of 4 numbers are wanted")
+        raise InputError(
+            f"{where}: expected 4 rows of 4 numbers, got {shown(value)}; export the "
+            "file again"
+        )
     matrix = np.full((len(rows), 4), np.nan)
     try:
         if all(_is_number(v) for row in rows for v in row):
@@ -165,19 +171,18 @@ def _matrix(frame: Frame) -> np.ndarray:
         pass
     if not (np.abs(matrix) < MAX_COORDINATE).all():
         raise InputError(
-            f"{where} has values that are no finite numbers: {shown(rows)}; remove the "
-            "frame"
+            f"{where}: expected finite numbers, got {shown(rows)}; remove the frame"
         )
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise InputError(
-            f"{where}: the last row is {matrix[3].tolist()}, 0 0 0 1 is wanted; "
-            "is it transposed?"
+            f"{where}: expected the last row 0 0 0 1, got {matrix[3].tolist()}; "
+            "transpose the matrix"
         )
     return matrix
 
 
 def rigid(where: str, block: np.ndarray) -> tuple[np.ndarray, float]:
-    """Nearest rotation to ``block`` [3, 3], and its scale if that is not 1."""
+    """Return the nearest rotation to ``block`` [3, 3], and its scale (1 if none)."""
     gram = block.T @ block
     square = float(np.trace(gram)) / 3
     scale = 1.0
@@ -186,16 +191,16 @@ def rigid(where: str, block: np.ndarray) -> tuple[np.ndarray, float]:
         deviation = np.abs(gram / square - np.eye(3)).max()
         if not deviation <= _RIGID_TOLERANCE:
             raise InputError(
-                f"{where}: the 3 × 3 part of transform_matrix is no rotation (nor a "
-                f"scaled one): RᵀR is off by {deviation:.3g}, {_RIGID_TOLERANCE} is "
-                "allowed; export rigid camera poses"
+                f"{where}: expected a rotation, or a scaled one, as the 3 × 3 part: "
+                f"RᵀR is off by {deviation:.3g}, more than {_RIGID_TOLERANCE}; export "
+                "rigid camera poses"
             )
     left, _, right = np.linalg.svd(block / scale)
     rotation = left @ right
     if np.linalg.det(rotation) < 0:
         raise InputError(
-            f"{where}: the 3 × 3 part of transform_matrix mirrors (determinant -1); "
-            "a rotation is wanted: flip one axis"
+            f"{where}: expected a rotation as the 3 × 3 part, got a reflection "
+            "(determinant -1); flip one axis"
         )
     return rotation, scale
 
@@ -206,12 +211,12 @@ def rigid(where: str, block: np.ndarray) -> tuple[np.ndarray, float]:
 def focal_lengths(
     frame: Frame, width: int, height: int, model: str
 ) -> tuple[float, float]:
-    """Focal lengths in pixels; those of the frame go before those of the file.
+    """Return the focal lengths in px; those of the frame precede the top level's.
 
-    One alone is that of both axes.
+    A single one holds for both axes.
 
     Raises:
-      InputError: if there is none, or one is out of its range.
+      InputError: if there is none, or one is out of range.
     """
     fx = fy = None
     for source in frame.sources:
@@ -222,10 +227,14 @@ def focal_lengths(
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     if fx is None or fy is None:
         angles = "" if model != "pinhole" else ", camera_angle_x or x_fov"
-        raise InputError(f"{frame.where}: no focal length; fl_x{angles} is wanted")
+        raise InputError(
+            f"{frame.where}: expected a focal length, fl_x{angles}, got none; export "
+            "the file again"
+        )
     if fx <= 0 or fy <= 0:
         raise InputError(
-            f"{frame.where}: focal lengths {fx:g}, {fy:g}; above 0 is wanted"
+            f"{frame.where}: expected focal lengths above 0, got {fx:g}, {fy:g}; "
+            "export the file again"
         )
     return fx, fy
 
@@ -233,12 +242,14 @@ def focal_lengths(
 def _focal(
     frame: Frame, source: dict[str, Any], axis: str, size: int, model: str
 ) -> float | None:
-    """In pixels or, of a pinhole, by the angle of view: in radians or, as instant-ngp
-    has it besides, in degrees."""
+    """Return a focal length in px, of a pinhole also from its angle of view.
+
+    The angle is in radians or, for instant-ngp, in degrees.
+    """
     focal = number(frame, source, f"fl_{axis}")
     if focal is not None or model != "pinhole":
         return focal
-    for key, wanted, unit in (
+    for key, expected, unit in (
         (f"camera_angle_{axis}", "radians between 0 and π", 1.0),
         (f"{axis}_fov", "degrees between 0 and 180", math.pi / 180),
     ):
@@ -246,6 +257,6 @@ def _focal(
         if angle is None:
             continue
         if not 1e-6 < unit * angle < math.pi:
-            raise InputError(f"{frame.where}: {key} is {angle:g}; {wanted} are wanted")
+            raise _unexpected(frame, key, expected, angle)
         return 0.5 * size / math.tan(0.5 * unit * angle)
     return None

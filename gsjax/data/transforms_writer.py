@@ -1,4 +1,4 @@
-"""Cameras to the `transforms.json` form that `gsjax.data.transforms` reads."""
+"""Writer of cameras as a `transforms.json`, see `gsjax.data.transforms`."""
 
 import json
 from collections.abc import Sequence
@@ -12,14 +12,14 @@ from gsjax.errors import InputError
 def transforms_json(
     entries: Sequence[CameraEntry], *, ply_file_path: str | None = None
 ) -> str:
-    """Text of a `transforms.json` with one frame per camera.
+    """Return the text of a `transforms.json` with one frame per camera.
 
-    What all cameras share (intrinsics, size, lens) stands at the top, the rest in the
-    frames. Near and far have no place in the format and are lost.
+    Values that all cameras share (intrinsics, size, lens) are at the top level, the
+    others in the frames. The format has no near and far planes.
 
     Args:
       entries: names and single (unbatched) cameras.
-      ply_file_path: name of a point cloud beside the file, as nerfstudio has it.
+      ply_file_path: name of a point cloud beside the file, for nerfstudio.
 
     Raises:
       InputError: if a camera is a batch.
@@ -40,7 +40,10 @@ def transforms_json(
 def _frame(entry: CameraEntry) -> dict:
     camera = entry.camera
     if camera.batched:
-        raise InputError(f"camera {entry.name!r} is a batch; pass single cameras")
+        raise InputError(
+            f"camera {entry.name!r}: expected a single camera, got a batch; pass them "
+            "one by one"
+        )
     viewmat = np.asarray(camera.viewmat, np.float64)
     matrix = np.eye(4)
     matrix[:3, :3] = viewmat[:3, :3].T
@@ -48,7 +51,7 @@ def _frame(entry: CameraEntry) -> dict:
     matrix[:3, 1:3] *= -1  # OpenCV axes to OpenGL axes
     K = np.asarray(camera.K, np.float64)
     return {
-        "camera_model": camera.model.name.upper(),
+        "camera_model": camera.lens.name.upper(),
         "w": camera.width,
         "h": camera.height,
         "fl_x": K[0, 0],

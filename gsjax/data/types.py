@@ -1,73 +1,67 @@
-"""A captured scene: what every reader of a dataset returns.
+"""Data types that every dataset reader returns.
 
 Host side, float64, OpenCV axes (x right, y down, z forward), world → camera.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from gsjax.cameras.camera import LENS_RANGE, NEAR
+from gsjax.cameras.distortion import Distortion
 from gsjax.errors import InputError
 
-# Room for a photograph to be made smaller, and its focal length with it.
-_LEAST, _MOST = LENS_RANGE[0] * 1e6, LENS_RANGE[1] / 1e6
+# Leaves a margin for the photograph, and its focal length with it, to be scaled.
+_MIN_LENGTH, _MAX_LENGTH = LENS_RANGE[0] * 1e6, LENS_RANGE[1] / 1e6
 
 
 def intrinsic_matrix(
     where: str, focals: tuple[float, float], centre: tuple[float, float]
 ) -> np.ndarray:
-    """[3, 3] of focal lengths and a principal point in px, which ``where`` names.
+    """Return the [3, 3] intrinsics of two focal lengths and a principal point, in px.
+
+    Args:
+      where: source of the numbers, for messages.
+      focals: fx and fy.
+      centre: cx and cy.
 
     Raises:
-      InputError: if nothing could be drawn with them; found here, before a training
-        whose last photograph it is.
+      InputError: if a value is outside of the range that can be rendered.
     """
     (fx, fy), (cx, cy) = focals, centre
-    if not all(_LEAST < focal < _MOST for focal in focals):
+    if not all(_MIN_LENGTH < focal < _MAX_LENGTH for focal in focals):
         raise InputError(
-            f"{where}: focal lengths {fx:g}, {fy:g} px; above {_LEAST:g} and below "
-            f"{_MOST:g} is wanted: estimate the camera again"
+            f"{where}: expected focal lengths above {_MIN_LENGTH:g} and below "
+            f"{_MAX_LENGTH:g} px, got {fx:g}, {fy:g}; estimate the camera again"
         )
-    if not all(abs(value) < _MOST for value in centre):
+    if not all(abs(value) < _MAX_LENGTH for value in centre):
         raise InputError(
-            f"{where}: principal point {cx:g}, {cy:g} px; within {_MOST:g} is wanted: "
-            "estimate the camera again"
+            f"{where}: expected a principal point within {_MAX_LENGTH:g} px, got "
+            f"{cx:g}, {cy:g}; estimate the camera again"
         )
     return np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
-class Distortion(NamedTuple):
-    """Distortion of a photograph, in OpenCV's terms.
-
-    Attributes:
-      model: "radial_tangential" (`cv2.undistort`: k1 k2 p1 p2 [k3 [k4 k5 k6]]) or
-        "fisheye" (`cv2.fisheye`: k1 k2 k3 k4, Kannala–Brandt).
-      coefficients: as many as the model takes, in OpenCV's order.
-    """
-
-    model: str
-    coefficients: tuple[float, ...]
-
-
 @dataclass(frozen=True)
 class View:
-    """One photograph and the camera that took it.
+    """A photograph and the camera that took it.
 
     Attributes:
-      name: what the dataset calls it: a path relative to its images, with suffix.
-      image: the file.
-      viewmat: [4, 4] world → camera, in the scene's coordinates.
-      K: [3, 3] intrinsics in px of an image of ``width`` × ``height``; where the
-        file is larger or smaller (``images_4/``), they are scaled on load.
-      width, height: size in px that ``K`` refers to.
-      lens: None for an ideal pinhole.
-      mask: file of a grey image of the same size, 0 where a pixel is to be left
-        out; or None.
-      split: "train" or "test" where the dataset itself says so, else None.
-      near: what is nearer than that, in units of the scene, is not drawn.
+      name: path of the photograph relative to the dataset's images, with suffix.
+      image: the image file.
+      viewmat: [4, 4] world → camera, in the dataset's coordinates.
+      K: [3, 3] intrinsics in px of an image of ``width`` × ``height``. If the file has
+        another size (``images_4/``), K is scaled on load.
+      width, height: image size in px that ``K`` refers to.
+      lens: distortion of the lens; None for an ideal pinhole.
+      mask: file of a grey image of the same size, 0 where a pixel is excluded; or None.
+      split: "train" or "test" if the dataset says so, else None.
+      near: near plane: depth below which nothing is drawn, in world units.
+      time: time of the exposure in any unit, for scene models that move.
     """
 
     name: str
@@ -80,26 +74,28 @@ class View:
     mask: Path | None = None
     split: str | None = None
     near: float = NEAR
+    time: float = 0.0
 
     @property
     def centre(self) -> np.ndarray:
-        """[3] where the camera stands."""
+        """Position [3] of the camera."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """Photographs, their cameras, and the points that are known of the scene.
+    """Photographs, their cameras, and the known points of the scene.
 
-    Coordinates are those of the files minus ``origin``, which is zero unless the
-    scene lies so far out that float32 would be too coarse for it.
+    Coordinates are those of the files minus ``origin``. The origin is zero unless the
+    coordinates are too large for float32, see `gsjax.data.rebase`.
 
     Attributes:
-      source: folder or file that was read, and ``format``, what it was.
-      views: sorted by name, names unique.
+      source: folder or file that was read.
+      format: name of its format.
+      views: views sorted by name; names are unique.
       points: [M, 3] float64; M may be 0.
       colors: [M, 3] uint8.
-      origin: [3] float64, to be added to coordinates on the way out.
+      origin: [3] float64, added to coordinates on export.
     """
 
     source: Path
@@ -110,15 +106,49 @@ class Dataset:
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
+class ReadOptions(NamedTuple):
+    """Options of `load_dataset` that every reader receives.
+
+    Attributes:
+      images: folder of the photographs: a name in the dataset or a path; None for the
+        reader's default.
+      factor: read the smaller copies in ``images_2``, ``images_4``, …
+      skip_missing: omit listed photographs that do not exist, with a warning.
+      poses_only: read cameras and points only: photographs need not exist, masks are
+        ignored.
+    """
+
+    images: str | PathLike[str] | None = None
+    factor: int | None = None
+    skip_missing: bool = False
+    poses_only: bool = False
+
+
+class Reader(NamedTuple):
+    """A dataset format, as a pair of functions.
+
+    Attributes:
+      name: name of the format.
+      detect: returns whether an existing path is a dataset of this format. It looks at
+        file names only and does not raise on damaged files.
+      load: reads the cameras and points of that path. `load_dataset` then sorts the
+        views, checks their poses and chooses near planes and origin.
+    """
+
+    name: str
+    detect: Callable[[Path], bool]
+    load: Callable[[Path, ReadOptions], Dataset]
+
+
 class Photo(NamedTuple):
-    """A photograph as loaded: undistorted and scaled, with what it then shows.
+    """An undistorted and scaled photograph with its camera.
 
     Attributes:
       pixels: [H, W, 3] uint8 RGB.
-      alpha: [H, W] uint8 opacity of the file, or None where nothing is transparent.
-      valid: [H, W] bool, False where masked or where undistortion had nothing; or
-        None where all is valid.
-      K: [3, 3] float64, for this size and an ideal pinhole.
+      alpha: [H, W] uint8 opacity, or None if every pixel is opaque.
+      valid: [H, W] bool, False where masked or outside of the undistorted image; None
+        if all pixels are valid.
+      K: [3, 3] float64 intrinsics of an ideal pinhole of this size.
     """
 
     pixels: np.ndarray
@@ -127,28 +157,32 @@ class Photo(NamedTuple):
     K: np.ndarray
 
     def require(self, name: str) -> None:
-        """See that the arrays are as above: others would be learnt as noise.
+        """Check the shapes and types of the arrays.
+
+        Args:
+          name: name of the view, for messages.
 
         Raises:
-          InputError: if one is not; ``name`` says of which view.
+          InputError: if an array does not match the attributes above.
         """
         size = np.shape(self.pixels)[:2]
-        wanted = {
+        shapes = {
             "pixels": (*size, 3) if len(size) == 2 else ("H", "W", 3),
             "alpha": size,
             "valid": size,
             "K": (3, 3),
         }
-        kinds = {"pixels": np.uint8, "alpha": np.uint8, "valid": np.bool_}
-        for part, shape in wanted.items():
-            value, kind = getattr(self, part), kinds.get(part)
+        dtypes = {"pixels": np.uint8, "alpha": np.uint8, "valid": np.bool_}
+        for part, shape in shapes.items():
+            value, dtype = getattr(self, part), dtypes.get(part)
             if value is None and part in ("alpha", "valid"):
                 continue
             array = np.asarray(value)
             wrong = array.shape != shape or array.size == 0
-            if wrong or (kind is not None and array.dtype != kind):
-                told = f" of {np.dtype(kind).name}" if kind else ""
+            if wrong or (dtype is not None and array.dtype != dtype):
+                kind = np.dtype(dtype).name if dtype else "numbers"
                 raise InputError(
-                    f"{name}: {part} of the photo has shape {array.shape} of "
-                    f"{array.dtype}; {shape}{told} is wanted"
+                    f"{name}: {part} of the photo: expected {kind} of shape {shape}, "
+                    f"got {array.dtype} of shape {array.shape}; use `load_photo` or "
+                    "`make_dataset`"
                 )

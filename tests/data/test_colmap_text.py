@@ -1,11 +1,9 @@
-"""COLMAP's points as text, block by block: what one line at a time would give."""
+"""COLMAP's text files: blocks give the same as lines, whatever their length."""
 
 import numpy as np
 import pytest
-from captures import scene_of_views
 
-from gsjax.data import colmap_binary, colmap_text
-from gsjax.data.colmap_writer import write_colmap
+from gsjax.data import colmap_text
 from gsjax.errors import InputError
 from gsjax.io.numerals import BLOCK
 
@@ -36,63 +34,49 @@ def one_by_one(lines: list[str]):
 @pytest.mark.parametrize(
     "end", ["\n", "\r\n", "\r", "\n\n \n", "\n# a note, ünïcode\n"]
 )
-def test_the_same_points_as_line_by_line(tmp_path, end):
+def test_blocks_give_the_same_points_as_lines(tmp_path, end):
     lines = random_lines(9_000)
     path = tmp_path / "points3D.txt"
     text = "".join(["# 3D points", end, *(line + end for line in lines)])
     path.write_bytes(text.encode())
     assert len(text) > 3 * BLOCK
     points = colmap_text.read_points(path)
-    for found, wanted in zip(points, one_by_one(lines), strict=True):
-        np.testing.assert_array_equal(found, wanted)
+    for found, expected in zip(points, one_by_one(lines), strict=True):
+        np.testing.assert_array_equal(found, expected)
 
 
-def test_the_line_is_named_in_any_block(tmp_path):
+def test_errors_name_the_line_in_any_block(tmp_path):
     lines = random_lines(9_000)
     path = tmp_path / "points3D.txt"
     for at in (0, 4_321, 8_999):
         bad = [*lines[:at], lines[at] + " 5", *lines[at + 1 :]]
         path.write_text("# a\n\n" + "\n".join(bad) + "\n")
         with pytest.raises(
-            InputError, match=rf"points3D\.txt: line {at + 3}: the track"
+            InputError, match=rf"points3D\.txt: line {at + 3}: expected a track"
         ):
             colmap_text.read_points(path)
         path.write_text("# a\n\n" + "\n".join([*lines[:at], "\uff11" + lines[at], ""]))
         with pytest.raises(
-            InputError, match=rf"line {at + 3}: the point id is '\uff11"
+            InputError, match=rf"line {at + 3}: .* as the point id, got '\uff11"
         ):
             colmap_text.read_points(path)
 
 
-def test_a_track_through_many_photographs(tmp_path):
+def test_a_track_of_many_photographs(tmp_path):
     path = tmp_path / "points3D.txt"
     path.write_text("7 1 2 3 4 5 6 0.5" + " 1234567 54321" * 60_000 + "\n")
     assert colmap_text.read_points(path).track_lengths.tolist() == [60_000]
 
 
-def test_many_2d_points(tmp_path):
-    """Of any length: they are passed in pieces, within words too."""
+def test_lines_of_2d_points_have_any_length(tmp_path):
     path = tmp_path / "images.txt"
     image = "{} 1 0 0 0 0 0 3 1 {}.png\n"
-    for count in (BLOCK // 8, BLOCK // 8 + 1, 200_000):
+    for count in (0, BLOCK // 8, 100_000):
         line = "1.5 2 -1" + " 3.25 41 17" * count + "\n"
         path.write_text(image.format(1, "a") + line + image.format(2, "b") + "\n")
         images = colmap_text.read_images(path)
         assert [found.name for found in images] == ["a.png", "b.png"]
         path.write_text(image.format(1, "a") + line.replace("\n", " 5\n"))
-        wanted = f"line 2: {3 * count + 4} values, the last '5'"
-        with pytest.raises(InputError, match=wanted):
+        expected = f"line 2: .* got {3 * count + 4} values, the last '5'"
+        with pytest.raises(InputError, match=expected):
             colmap_text.read_images(path)
-
-
-def test_sorting_takes_no_copy_of_all(tmp_path):
-    """Nor changes what is read: points of a binary file in another order."""
-    scene = scene_of_views(points=50)
-    write_colmap(tmp_path, scene)
-    path = tmp_path / "points3D.bin"
-    data = path.read_bytes()
-    records = [data[8 + 51 * i :][:51] for i in range(50)]
-    wanted = colmap_binary.read_points(path)
-    path.write_bytes(data[:8] + b"".join(reversed(records)))
-    for found, field in zip(colmap_binary.read_points(path), wanted, strict=True):
-        np.testing.assert_array_equal(found, field)

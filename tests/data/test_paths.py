@@ -224,16 +224,16 @@ def test_median_intrinsics():
     assert (found.width, found.height) == (80, 60)
     wanted = [[95, 0, 40], [0, 104.5, 20], [0, 0, 1]]
     np.testing.assert_allclose(found.K, wanted)
-    with pytest.raises(gsjax.InputError, match="no views"):
+    with pytest.raises(gsjax.InputError, match="views: expected"):
         camera_paths.median_intrinsics([])
 
 
 def test_bad_input():
     with pytest.raises(gsjax.InputError, match="at least one camera"):
         camera_paths.orbit(np.zeros((0, 4, 4)), 5)
-    with pytest.raises(gsjax.InputError, match=r"shape \(4, 4\)"):
+    with pytest.raises(gsjax.InputError, match=r"got \(4, 4\)"):
         camera_paths.spiral(np.eye(4), 5)
-    with pytest.raises(gsjax.InputError, match="not finite"):
+    with pytest.raises(gsjax.InputError, match="finite"):
         camera_paths.focus_point(np.full((1, 4, 4), np.nan))
     for make in MAKERS.values():
         with pytest.raises(gsjax.InputError, match="at least 1"):

@@ -1,25 +1,21 @@
-"""Photographs: pixels as stored, lenses undone, sizes, masks, and what is refused."""
+"""Photographs: pixels as stored, undistortion, sizes, masks, and damaged files."""
 
 import contextlib
 import os
 import struct
-import time
 import zlib
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from threading import Barrier
 
 import cv2
 import numpy as np
 import pytest
 from captures import save_photo
 
-import gsjax.data.photos as photos_module
-from gsjax.cameras.distortion import distort
-from gsjax.data.decode import telling_of_damage
-from gsjax.data.image_header import MAX_PIXELS, check_image, image_size
+from gsjax.cameras.distortion import Distortion, distort
+from gsjax.data.decode import warn_of_damage
+from gsjax.data.image_header import check_image, image_size
 from gsjax.data.photos import load_photo, load_photos, undistorted_view
-from gsjax.data.types import Distortion, View
+from gsjax.data.types import View
 from gsjax.errors import InputError
 from gsjax.sfm.photos import read_upright
 
@@ -69,8 +65,8 @@ def test_grey_and_16_bits(tmp_path):
     np.testing.assert_array_equal(photo.pixels, np.repeat(NOISE[..., :1], 3, 2))
     deep = np.linspace(0, 65535, 24 * 32 * 3).reshape(24, 32, 3).astype(np.uint16)
     photo = load_photo(view_of(save_photo(tmp_path / "b.png", deep)))
-    wanted = np.rint(deep / 65535 * 255).astype(np.uint8)
-    np.testing.assert_array_equal(photo.pixels, wanted)
+    expected = np.rint(deep / 65535 * 255).astype(np.uint8)
+    np.testing.assert_array_equal(photo.pixels, expected)
     assert photo.pixels.dtype == np.uint8
 
 
@@ -81,8 +77,8 @@ def test_alpha_is_kept(tmp_path):
     np.testing.assert_array_equal(photo.alpha, NOISE[..., 1])
 
 
-def test_a_tiff_that_is_transparent_in_part_is_refused(tmp_path):
-    """OpenCV reads its colours with black mixed in; all or nothing does no harm."""
+def test_a_partly_transparent_tiff_is_rejected(tmp_path):
+    """OpenCV mixes its colours with black; fully transparent pixels do no harm."""
     image = pytest.importorskip("PIL.Image", reason="Pillow is absent")
     alpha = np.where(NOISE[..., 1] > 99, 255, 0)
     rgba = np.dstack([NOISE, alpha]).astype(np.uint8)
@@ -92,13 +88,13 @@ def test_a_tiff_that_is_transparent_in_part_is_refused(tmp_path):
     np.testing.assert_array_equal(photo.pixels[alpha > 0], NOISE[alpha > 0])
     rgba[3, 5, 3] = 128
     image.fromarray(rgba, "RGBA").save(tmp_path / "a.tiff")
-    with pytest.raises(InputError, match=r"a\.tiff: a TIFF .* transparent in part"):
+    with pytest.raises(InputError, match=r"a\.tiff: a TIFF .* partly transparent"):
         load_photo(view_of(tmp_path / "a.tiff"))
 
 
 @pytest.mark.parametrize("depth", [2, 8, 16])
-def test_a_grey_that_is_transparent(tmp_path, depth):
-    """A PNG may name one instead of having an alpha channel; OpenCV takes no notice."""
+def test_a_transparent_grey_of_a_png(tmp_path, depth):
+    """The tRNS chunk instead of an alpha channel, which OpenCV ignores."""
     grey, path = NOISE[..., 0] % 4, tmp_path / "a.png"
     one = {2: 1, 8: 1, 16: 257}[depth]
     if depth == 2:
@@ -114,8 +110,8 @@ def test_a_grey_that_is_transparent(tmp_path, depth):
     np.testing.assert_array_equal(photo.pixels, np.repeat(shown[..., None], 3, 2))
 
 
-def test_a_tiff_of_grey_and_transparency_is_refused(tmp_path):
-    """OpenCV drops the one, or reads 16 bits as zeros."""
+def test_a_tiff_of_grey_and_alpha_is_rejected(tmp_path):
+    """OpenCV drops one of them, or reads 16 bits as zeros."""
     image = pytest.importorskip("PIL.Image", reason="Pillow is absent")
     both = image.fromarray(np.ascontiguousarray(NOISE[..., :2]), "LA")
     both.save(tmp_path / "a.tif")
@@ -129,8 +125,8 @@ def test_a_tiff_of_grey_and_transparency_is_refused(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])
 @pytest.mark.parametrize("one", [1, 257])
-def test_alpha_that_is_opaque_is_none(tmp_path, suffix, one):
-    """And one step of 8 bits less in one pixel is not opaque."""
+def test_an_opaque_alpha_is_none(tmp_path, suffix, one):
+    """One step of 8 bits less in one pixel is not opaque."""
     rgba = np.dstack([NOISE, np.full((24, 32), 255)])
     rgba = (rgba * one).astype(np.uint8 if one == 1 else np.uint16)
     path = save_photo(tmp_path / f"a{suffix}", rgba)
@@ -158,13 +154,13 @@ def test_orientation_is_ignored(tmp_path):
     path = save_photo(tmp_path / "a.jpg")
     plain = load_photo(view_of(path)).pixels
     path.write_bytes(with_orientation(path.read_bytes(), 6))
-    assert cv2.imread(str(path)).shape == (32, 24, 3)  # which is what must not happen
+    assert cv2.imread(str(path)).shape == (32, 24, 3)  # rotated
     np.testing.assert_array_equal(load_photo(view_of(path)).pixels, plain)
     assert image_size(path) == (32, 24)
 
 
 def tiff_turned(path: Path, orientation: int) -> None:
-    """Give a TIFF, of 8 bits and little-endian, an orientation."""
+    """Give a little-endian TIFF an orientation."""
     data = path.read_bytes()
     (at,) = struct.unpack_from("<I", data, 4)
     (count,) = struct.unpack_from("<H", data, at)
@@ -177,10 +173,10 @@ def tiff_turned(path: Path, orientation: int) -> None:
     path.write_bytes(data[:4] + struct.pack("<I", len(data)) + data[8:] + folder)
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_orientation_of_a_tiff_is_ignored(tmp_path, orientation, dtype):
-    """Of the photograph and its mask: OpenCV turns a TIFF whatever it is told."""
+    """For photograph and mask: OpenCV always rotates a TIFF."""
     path = save_photo(tmp_path / "a.tiff", NOISE.astype(dtype))
     grey = np.where(NOISE[..., 0] > 99, 255, 0).astype(np.uint8)
     mask = save_photo(tmp_path / "m.tiff", grey)
@@ -193,12 +189,11 @@ def test_orientation_of_a_tiff_is_ignored(tmp_path, orientation, dtype):
     assert image_size(path) == (32, 24)
 
 
-def test_a_lens_that_leaves_nothing_is_told(tmp_path):
-    """And not taken for a mask."""
+def test_a_lens_that_leaves_nothing_is_an_error(tmp_path):
     path = save_photo(tmp_path / "a.png", NOISE)
-    lens = Distortion("radial_tangential", (1e20, 0.0, 0.0, 0.0))
-    wanted = r"a\.png: of its 768 pixels 0 are left .* \(radial_tangential, 1e\+20, 0"
-    with pytest.raises(InputError, match=wanted):
+    lens = Distortion("opencv", (1e20, 0.0, 0.0, 0.0))
+    expected = r"a\.png: 0 of 768 pixels are left .* \(opencv, 1e\+20, 0"
+    with pytest.raises(InputError, match=expected):
         load_photo(view_of(path, lens=lens))
 
 
@@ -209,8 +204,8 @@ def test_intrinsics_follow_the_file(tmp_path):
     path = save_photo(tmp_path / "a.png", NOISE)
     K = np.asarray([[160.0, 0, 62], [0, 168.0, 49], [0, 0, 1]])
     photo = load_photo(view_of(path, 128, 97, K))  # images_4: 97 / 4 = 24.25
-    wanted = K * [[32 / 128], [24 / 97], [1]]
-    np.testing.assert_allclose(photo.K, wanted, rtol=1e-15)
+    expected = K * [[32 / 128], [24 / 97], [1]]
+    np.testing.assert_allclose(photo.K, expected, rtol=1e-15)
 
 
 def dot_image(u, v, width=120, height=90, sigma=2.0):
@@ -222,16 +217,16 @@ def dot_image(u, v, width=120, height=90, sigma=2.0):
 
 
 def centroid(image, u, v, reach=7):
-    """Of the dot near (u, v)."""
+    """Centroid of the dot near (u, v)."""
     x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in image.shape[::-1]))
     weight = image * (np.hypot(x - u, y - v) < reach).astype(float)
     return (weight * x).sum() / weight.sum(), (weight * y).sum() / weight.sum()
 
 
 def peak(image, u, v, reach=7):
-    """Of the dot near (u, v): a parabola through its logarithm.
+    """Peak of the dot near (u, v), by a parabola through its logarithm.
 
-    The lens maps a peak onto the peak, whereas it moves the centroid of what it bends.
+    A lens maps the peak onto the peak, but not the centroid onto the centroid.
     """
     x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in image.shape[::-1]))
     near = np.hypot(x - u, y - v) < reach
@@ -278,18 +273,16 @@ def test_max_size_is_checked(tmp_path):
     path = save_photo(tmp_path / "a.png", NOISE)
     assert load_photo(view_of(path), 1).pixels.shape == (1, 1, 3)
     assert load_photo(view_of(path), 32).pixels.shape == (24, 32, 3)
-    with pytest.raises(InputError, match="max_size 0: at least 1"):
+    with pytest.raises(InputError, match="max_size: expected at least 1 px, got 0"):
         load_photo(view_of(path), 0)
 
 
 # --- lenses ---
 
 LENSES = {
-    "barrel": Distortion("radial_tangential", (-0.12, 0.02, 0.003, -0.002)),
-    "pincushion": Distortion("radial_tangential", (0.15, 0.05, -0.002, 0.004, 0.01)),
-    "rational": Distortion(
-        "radial_tangential", (0.3, 0.1, 0.001, 0.002, 0.02, 0.35, 0.1, 0.01)
-    ),
+    "barrel": Distortion("opencv", (-0.12, 0.02, 0.003, -0.002)),
+    "pincushion": Distortion("opencv", (0.15, 0.05, -0.002, 0.004, 0.01)),
+    "rational": Distortion("opencv", (0.3, 0.1, 0.001, 0.002, 0.02, 0.35, 0.1, 0.01)),
     "fisheye": Distortion("fisheye", (0.05, -0.02, 0.01, -0.003)),
     "equidistant": Distortion("fisheye", (0.0, 0.0, 0.0, 0.0)),
 }
@@ -310,7 +303,7 @@ def through_lens(lens, x, y):
 
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
-def test_distortion_is_that_of_opencv(lens):
+def test_distortion_equals_that_of_opencv(lens):
     x, y = RNG.uniform(-0.9, 0.9, (2, 500))
     ours = np.stack(distort(lens, x, y), -1) * (110, 115) + (118.5, 93.25)
     np.testing.assert_allclose(ours, through_lens(lens, x, y), atol=1e-9)
@@ -319,10 +312,10 @@ def test_distortion_is_that_of_opencv(lens):
 
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
-def test_points_fall_where_a_pinhole_puts_them(tmp_path, lens, report):
-    wanted = np.stack(np.meshgrid([25.3, 80, 119, 171.7, 215], [20, 61.4, 155.2]), -1)
-    wanted = wanted.reshape(-1, 2)
-    x, y = ((wanted - WIDE[:2, 2]) / np.diag(WIDE)[:2]).T
+def test_undistorted_points_are_where_a_pinhole_projects_them(tmp_path, lens, report):
+    expected = np.stack(np.meshgrid([25.3, 80, 119, 171.7, 215], [20, 61.4, 155.2]), -1)
+    expected = expected.reshape(-1, 2)
+    x, y = ((expected - WIDE[:2, 2]) / np.diag(WIDE)[:2]).T
     seen = through_lens(lens, x, y)
     inside = (seen > 8).all(1) & (seen < np.asarray(WIDE_SIZE) - 8).all(1)
     assert inside.sum() >= 9
@@ -332,16 +325,16 @@ def test_points_fall_where_a_pinhole_puts_them(tmp_path, lens, report):
     path = save_photo(tmp_path / "a.png", image)
     photo = load_photo(view_of(path, *WIDE_SIZE, WIDE, lens=lens))
     np.testing.assert_array_equal(photo.K, WIDE)
-    found = [peak(photo.pixels[..., 0].astype(float), *p) for p in wanted[inside]]
-    error = np.hypot(*(np.asarray(found) - wanted[inside]).T).max()
-    moved = np.hypot(*(seen - wanted)[inside].T).max()
+    found = [peak(photo.pixels[..., 0].astype(float), *p) for p in expected[inside]]
+    error = np.hypot(*(np.asarray(found) - expected[inside]).T).max()
+    moved = np.hypot(*(seen - expected)[inside].T).max()
     assert moved > 3
     report("undistorted points, px", error, 0.1)
     assert error <= 0.1
 
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
-def test_valid_is_what_the_lens_saw(tmp_path, lens):
+def test_valid_pixels_are_those_that_the_lens_saw(tmp_path, lens):
     path = save_photo(tmp_path / "a.png", np.full(WIDE_SIZE[::-1], 200, np.uint8))
     photo = load_photo(view_of(path, *WIDE_SIZE, WIDE, lens=lens))
     x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in WIDE_SIZE))
@@ -357,9 +350,9 @@ def test_valid_is_what_the_lens_saw(tmp_path, lens):
 
 
 def test_past_the_fold_nothing_is_valid(tmp_path):
-    # r(1 − 0.5 r²) turns back at r = 0.816, where it reaches 0.544: all of the wider
-    # field would be shown again, mirrored.
-    lens = Distortion("radial_tangential", (-0.5, 0.0, 0.0, 0.0))
+    # r(1 − 0.5 r²) decreases from r = 0.816 on: the wider field would appear again,
+    # mirrored.
+    lens = Distortion("opencv", (-0.5, 0.0, 0.0, 0.0))
     path = save_photo(tmp_path / "a.png", np.full(WIDE_SIZE[::-1], 200, np.uint8))
     photo = load_photo(view_of(path, *WIDE_SIZE, WIDE, lens=lens))
     x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in WIDE_SIZE))
@@ -368,46 +361,6 @@ def test_past_the_fold_nothing_is_valid(tmp_path):
     fold = np.sqrt(2 / 3)
     assert photo.valid[radius < fold - 1e-3].all()
     assert not photo.valid[radius > fold + 1e-3].any()
-
-
-def made_by(lens):
-    """Its maps, of one camera."""
-    return photos_module._maps(lens, np.eye(3), 9, 7)
-
-
-def test_maps_of_cameras_are_made_at_a_time_and_each_once(monkeypatch):
-    """A camera for each photograph, as COLMAP has it unless it is asked for one, is no
-    queue; and threads that want the same wait for one of them."""
-    lenses = [Distortion("radial_tangential", (k, 0, 0, 0)) for k in (0.1, 0.2)]
-    both, made = Barrier(2, timeout=20), []
-
-    def maps(lens, *_):
-        both.wait()
-        made.append(lens)
-        return lens
-
-    monkeypatch.setattr(photos_module, "undistortion_maps", maps)
-    with ThreadPoolExecutor(8) as pool:
-        found = list(pool.map(lambda i: made_by(lenses[i % 2]), range(8)))
-    assert found == lenses * 4
-    assert sorted(made) == lenses
-
-
-def test_maps_that_failed_are_tried_again(monkeypatch):
-    lens = Distortion("radial_tangential", (0.3, 0, 0, 0))
-    for error in (MemoryError, MemoryError, None):
-
-        def maps(*_, error=error):
-            if error is not None:
-                raise error
-            return "maps"
-
-        monkeypatch.setattr(photos_module, "undistortion_maps", maps)
-        if error is None:
-            assert made_by(lens) == "maps"
-        else:
-            with pytest.raises(error):
-                made_by(lens)
 
 
 def test_lens_of_a_smaller_copy(tmp_path):
@@ -434,7 +387,7 @@ def test_undistorted_view(tmp_path):
 )
 def test_unknown_lenses(tmp_path, lens):
     path = save_photo(tmp_path / "a.png", NOISE)
-    with pytest.raises(InputError, match=r"lens '.*' with . coefficients; wanted"):
+    with pytest.raises(InputError, match=r"lens: expected .* with \d"):
         load_photo(view_of(path, lens=lens))
 
 
@@ -458,7 +411,7 @@ def test_masks(tmp_path):
     twice = save_photo(tmp_path / "m2.png", np.kron(mask, np.ones((2, 2), np.uint8)))
     photo = load_photo(view_of(path, mask=twice))
     np.testing.assert_array_equal(photo.valid, mask > 0)
-    # In 16 bits what is darker than a step of 8 bits is not black either.
+    # A 1 of 16 bits is not black either.
     deep = save_photo(tmp_path / "m16.png", (mask > 0).astype(np.uint16))
     np.testing.assert_array_equal(load_photo(view_of(path, mask=deep)).valid, mask > 0)
     white = save_photo(tmp_path / "m3.png", np.full((24, 32), 255, np.uint8))
@@ -497,17 +450,7 @@ def test_many_in_order(tmp_path):
     assert load_photos([]) == []
 
 
-# --- what is refused ---
-
-
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tiff", ".bmp"])
-def test_truncated(tmp_path, suffix):
-    path = save_photo(tmp_path / f"a{suffix}", NOISE)
-    data = path.read_bytes()
-    for length in [*range(0, len(data) - 1, 61), len(data) - 2]:
-        path.write_bytes(data[:length])
-        with pytest.raises(InputError, match=rf"a\{suffix}: "):
-            load_photo(view_of(path))
+# --- rejected files ---
 
 
 def test_thumbnail_does_not_hide_truncation(tmp_path):
@@ -520,32 +463,6 @@ def test_thumbnail_does_not_hide_truncation(tmp_path):
     path.write_bytes(data[:2] + inner + data[2:-9])
     with pytest.raises(InputError, match="no end-of-image marker"):
         load_photo(view_of(path))
-
-
-def test_bombs(tmp_path):
-    path = tmp_path / "a.png"
-    start = time.perf_counter()
-    path.write_bytes(png_of(60_000, 60_000))
-    with pytest.raises(InputError, match=rf"60000 × 60000 px; at most {MAX_PIXELS}"):
-        load_photo(view_of(path))
-    path.write_bytes(png_of(15_000, 15_000))
-    with pytest.raises(InputError, match="15000 × 15000 px cannot fit"):
-        load_photo(view_of(path))
-    path.write_bytes(png_of(0, 5))
-    with pytest.raises(InputError, match="0 × 5 px"):
-        load_photo(view_of(path))
-    assert time.perf_counter() - start < 0.5
-
-
-@pytest.mark.parametrize("data", [b"", b"GIF89a", b"hello", b"\x89PNG\r\n\x1a\n"])
-def test_no_images(tmp_path, data):
-    path = tmp_path / "a.png"
-    path.write_bytes(data)
-    for read in (image_size, lambda p: load_photo(view_of(p))):
-        with pytest.raises(InputError, match=r"a\.png: (the file is empty|starts|the)"):
-            read(path)
-    with pytest.raises(InputError, match="cannot be read"):
-        image_size(tmp_path)
 
 
 def test_damaged_bytes_do_not_crash(tmp_path):
@@ -561,12 +478,17 @@ def test_damaged_bytes_do_not_crash(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("size", "wanted"),
-    [((24, 32), "camera is for 24 × 32; it was rotated"), ((64, 24), "same aspect")],
+    ("size", "expected"),
+    [
+        ((24, 32), "its camera, 24 × 32, .*it was rotated"),
+        ((64, 24), "64 × 24, got 32 × 24"),
+    ],
 )
-def test_other_aspect_ratios(tmp_path, size, wanted):
+def test_other_aspect_ratios(tmp_path, size, expected):
     path = save_photo(tmp_path / "a.png", NOISE)
-    with pytest.raises(InputError, match=rf"a\.png: 32 × 24 px.*{wanted}"):
+    with pytest.raises(
+        InputError, match=rf"a\.png: expected the aspect ratio of .*{expected}"
+    ):
         load_photo(view_of(path, *size))
 
 
@@ -575,15 +497,15 @@ def test_float_images(tmp_path):
     done, data = cv2.imencode(".tiff", np.zeros((24, 32, 3), np.float32))
     assert done
     path.write_bytes(data.tobytes())
-    with pytest.raises(InputError, match=r"a\.tiff: pixels of float32"):
+    with pytest.raises(InputError, match=r"a\.tiff: expected samples .* got float32"):
         load_photo(view_of(path))
 
 
-# --- damaged, and read all the same ---
+# --- damaged, and read anyway ---
 
 
 def with_hole(path: Path, *encoding: int) -> Path:
-    """A photograph in whose pixels some bytes are lost; its headers are whole."""
+    """Write a photograph with some bytes of its pixels lost and intact headers."""
     pixels = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
     done, data = cv2.imencode(path.suffix, pixels, encoding)
     assert done
@@ -594,13 +516,13 @@ def with_hole(path: Path, *encoding: int) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "wanted"),
+    ("name", "expected"),
     [("a.jpg", "Corrupt JPEG data"), ("a.tiff", "LZWDecode")],
 )
-def test_holes_are_told(tmp_path, capfd, name, wanted):
+def test_holes_give_a_warning(tmp_path, capfd, name, expected):
     path = with_hole(tmp_path / name)
     good = [save_photo(tmp_path / f"{index}.png") for index in range(40)]
-    told = rf"damaged .*: \S*{name}: {wanted}[^;]*; copy or export them again"
+    told = rf"damaged .*: \S*{name}: {expected}[^;]*; copy or export them again"
     view = view_of(path, 64, 48)
     with pytest.warns(UserWarning, match=told):
         assert load_photo(view).pixels.shape == (48, 64, 3)
@@ -611,21 +533,21 @@ def test_holes_are_told(tmp_path, capfd, name, wanted):
     assert [photo.pixels.shape[0] for photo in photos] == [24] * 40 + [48]
     assert len(warned) == 1
     with pytest.warns(
-        UserWarning, match=f"{name}: {wanted}[^;]*; \\S*m_{name}: [^;]*; copy"
+        UserWarning, match=f"{name}: {expected}[^;]*; \\S*m_{name}: [^;]*; copy"
     ):
         load_photo(view_of(path, 64, 48, mask=with_hole(tmp_path / f"m_{name}")))
-    assert capfd.readouterr().err == ""  # once, by us
+    assert capfd.readouterr().err == ""
 
 
-def test_what_others_write_on_stderr_is_kept(tmp_path, capfd):
+def test_other_lines_on_stderr_are_kept(tmp_path, capfd):
     view = view_of(save_photo(tmp_path / "a.png"))
-    with telling_of_damage([view.image]):
+    with warn_of_damage([view.image]):
         os.write(2, b"of XLA\nlibpng warning: iCCP: known incorrect sRGB profile\n")
-        with telling_of_damage([view.image]):
+        with warn_of_damage([view.image]):
             load_photo(view)
             os.write(2, b"within\n")
     assert sorted(capfd.readouterr().err.splitlines()) == ["of XLA", "within"]
-    with pytest.raises(InputError), telling_of_damage([view.image]):
-        raise InputError("of which the rest is of no interest")
+    with pytest.raises(InputError), warn_of_damage([view.image]):
+        raise InputError("any")
     os.write(2, b"after\n")
     assert capfd.readouterr().err == "after\n"

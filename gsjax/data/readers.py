@@ -1,0 +1,14 @@
+"""Registry of the dataset formats.
+
+A reader from outside of the package is passed to `load_dataset` as
+``readers=(*READERS, mine)``.
+"""
+
+from gsjax.data.colmap import COLMAP, NERFSTUDIO_COLMAP
+from gsjax.data.llff import LLFF
+from gsjax.data.nerf import TRANSFORMS
+from gsjax.data.types import Reader
+
+# In order of precedence. A transforms.json of nerfstudio precedes the COLMAP model that
+# it was made from, because its poses were aligned afterwards.
+READERS: tuple[Reader, ...] = (COLMAP, TRANSFORMS, NERFSTUDIO_COLMAP, LLFF)
