@@ -34,12 +34,13 @@ import numpy as np
 import gsjax
 from gsjax.data.extent import extent_of
 from gsjax.data.photos import load_photos
-from gsjax.raster.render import count_demand
-from gsjax.runs.held_out import results_of
+from gsjax.raster.exact import count_demand
+from gsjax.runs.evaluation import evaluate_views
 from gsjax.train.capacity_policy import pairs_for
 from gsjax.train.config import Level, TrainConfig, preset
 from gsjax.train.frames import draw, make_frames
 from gsjax.train.loop import FitResult, fit, subset
+from gsjax.train.setup import make_setup
 from gsjax.train.step import make_stages, make_train_step
 from gsjax.train.visibility_pruning import prune_invisible
 
@@ -69,7 +70,7 @@ class Trained:
 
     def psnr(self, gaussians) -> float:
         """dB, mean over the held-out views."""
-        found = results_of(gaussians, self.test, self.held_out, self.config)
+        found = evaluate_views(gaussians, self.test, self.held_out, self.config)
         return float(np.mean([view.psnr for view in found]))
 
 
@@ -89,7 +90,9 @@ def of_levels(name: str, trained: Trained, result: FitResult, seconds: float) ->
 def of_unseen(name: str, trained: Trained, result: FitResult) -> dict:
     """Without the Gaussians that no photograph shows."""
     config, frames = trained.config, trained.frames
-    after, dropped = prune_invisible(result.state, frames, config, trained.extent)
+    after, dropped = prune_invisible(
+        result.state, frames, make_setup(config, trained.extent)
+    )
     raster = config.raster.replace(outputs=("rgb",))
     differ = 0
     for index in range(frames.count):
@@ -129,7 +132,7 @@ def of_masks(name: str, trained: Trained, result: FitResult, share: float) -> di
     steps = {
         skip: jax.jit(
             make_train_step(
-                config.replace(skip_masked=skip), trained.extent, raster
+                config.replace(skip_masked=skip), trained.extent, raster=raster
             )
         )
         for skip in (True, False)
@@ -138,7 +141,7 @@ def of_masks(name: str, trained: Trained, result: FitResult, share: float) -> di
     fresh = state.replace(step=jnp.int32(1))
     zero = jax.tree.map(jnp.zeros_like, state.moments)
     fresh = fresh.replace(moments=zero)
-    slopes = [steps[skip](fresh, batch)[0].moments.mu for skip in (True, False)]
+    slopes = [steps[skip](fresh, batch)[0].moments[0].mu for skip in (True, False)]
     worst = max(
         float(jnp.abs(a - b).max()) / max(float(jnp.abs(b).max()), 1e-30)
         for a, b in zip(*map(jax.tree.leaves, slopes), strict=True)
@@ -163,7 +166,7 @@ def of_occlusion(name: str, trained: Trained, result: FitResult) -> list[dict]:
         searching = raster.replace(occlusion=occlusion)
         jax.clear_caches()
         begun = time.perf_counter()
-        look = make_stages(config, trained.extent, searching).differentiate
+        look = make_stages(make_setup(config, trained.extent), searching).differentiate
         looks[occlusion] = jax.jit(look).lower(state, batch).compile()
         seconds[occlusion].append(time.perf_counter() - begun)
     seconds = {kind: float(np.mean(found)) for kind, found in seconds.items()}

@@ -21,36 +21,38 @@ import gsjax
 from gsjax.data.extent import extent_of
 from gsjax.data.photos import load_photos
 from gsjax.densify.types import apply_edit
-from gsjax.raster.render import device_count
+from gsjax.raster.tile_render import device_count
 from gsjax.runs.checkpoint import load_latest, restore
-from gsjax.runs.folder import load_data, load_settings, run_files
+from gsjax.runs.folder import load_settings, load_split, run_files
 from gsjax.train.capacity_policy import pairs_for
-from gsjax.train.frames import draw, make_frames, views_of_step
+from gsjax.train.frames import draw, make_frames, targets, views_of_step
 from gsjax.train.initialisation import empty_state
 from gsjax.train.loop import subset
-from gsjax.train.losses import photometric_spread
+from gsjax.train.losses import photometric_batch
 from gsjax.train.state import gradients_like
-from gsjax.train.step import _optimise, make_stages, targets
+from gsjax.train.setup import make_setup
+from gsjax.train.step import make_stages, optimise
 
 
 def parts(folder: Path) -> tuple[dict, dict]:
     """What the step works on, and functions that do it and its parts."""
-    settings, data = load_settings(folder), load_data(load_settings(folder))
-    config, scene = settings.config, subset(data.scene, data.train)
+    settings, split = load_settings(folder), load_split(load_settings(folder))
+    config, scene = settings.config, subset(split.dataset, split.train)
     checkpoint = load_latest(run_files(folder).checkpoints)
     extent, views = extent_of(scene), len(scene.views)
     slots = int(checkpoint.meta["capacity"])
     state = restore(checkpoint, empty_state(config, extent, views, slots))
     frames = make_frames(scene.views, load_photos(scene.views, config.max_size))
     raster = config.raster.replace(pair_capacity=pairs_for(state, frames, config))
-    densifier = config.densifier(extent)
-    raster = raster.replace(outputs=("rgb",), absgrad=densifier.absgrad)
-    stages = make_stages(config, extent, raster)
+    setup = make_setup(config, extent)
+    strategy = setup.strategy
+    raster = raster.replace(outputs=("rgb",), absgrad=strategy.absgrad)
+    stages = make_stages(setup, raster)
     view = views_of_step(config.seed, int(state.step), config.batch, frames.count)
     batch = draw(frames, view)
-    target, weight = targets(batch, jnp.zeros(3), jnp.float32)
+    target, weight = targets(batch, jnp.float32)
     probe = jnp.zeros((config.batch, slots, 2))
-    name = "abs_probe" if densifier.absgrad else "probe"
+    name = "abs_probe" if strategy.absgrad else "probe"
 
     # Two programs, as in a run; but for the state, whose memory is not taken over.
     @jax.jit
@@ -72,13 +74,13 @@ def parts(folder: Path) -> tuple[dict, dict]:
     def loss(image):
         devices = device_count(raster)
         ssim = config.ssim_weight
-        return jnp.mean(photometric_spread(image, target, weight, ssim, devices))
+        return jnp.mean(photometric_batch(image, target, weight, ssim, devices))
 
-    optimise = jax.jit(lambda state, grads: _optimise(state, grads, config, extent))
+    update = jax.jit(lambda state, grads: optimise(setup, state, grads))
 
     @jax.jit
     def edit(state):
-        plan, fresh = densifier.plan(
+        plan, fresh = strategy.plan(
             state.key, state.step, state.gaussians, state.stats
         )
         return apply_edit(plan, state.moments), fresh
@@ -89,7 +91,8 @@ def parts(folder: Path) -> tuple[dict, dict]:
     _, (slopes, _) = picture(differentiated, batch.camera, cotangent)
     grads = jax.tree.map(
         lambda a: jnp.zeros(a.shape, a.dtype), gradients_like(state, config.batch)
-    )._replace(by_params=slopes)
+    )
+    grads = grads._replace(by_slots=grads.by_slots._replace(gaussians=slopes))
     about = {
         "run": folder.name,
         "strategy": config.strategy,
@@ -102,7 +105,7 @@ def parts(folder: Path) -> tuple[dict, dict]:
         "step": lambda: advance(state, differentiate(state, frames, view)),
         "picture v+g": lambda: picture(differentiated, batch.camera, cotangent),
         "loss v+g": lambda: loss(image),
-        "optimiser": lambda: optimise(state, grads),
+        "optimiser": lambda: update(state, grads),
         "edit": lambda: edit(state),
     }
 

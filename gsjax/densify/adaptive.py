@@ -1,12 +1,9 @@
-"""Adaptive density control: clone, split, prune, reset (Kerbl et al. 2023, Sec. 5).
+"""Adaptive density control: clone, split, prune and reset opacities.
+
+Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", 2023,
+Sec. 5.
 
 Axis legend: N Gaussians (capacity), B cameras.
-
-Where the image wants to move a Gaussian, on average over the views that show it,
-there are too few of them: a small one is cloned, a large one split in two. What is
-nearly transparent goes, or too large, and of what is split its halves would be. If
-there are fewer free slots than candidates, those with the largest gradient get them,
-and the count wanted is reported, also beyond the most that there may be.
 """
 
 from dataclasses import dataclass
@@ -16,9 +13,9 @@ import jax
 import jax.numpy as jnp
 
 from gsjax.densify.penalties import mean_penalty
-from gsjax.densify.schedule import edits_between, grown, is_due
+from gsjax.densify.schedule import EditSchedule
 from gsjax.densify.slots import assign, copy_into, where_slots
-from gsjax.densify.types import Densifier, Observation, SlotEdit
+from gsjax.densify.types import Observation, SlotEdit, Strategy
 from gsjax.gaussians import Gaussians
 from gsjax.math.numerics import exp_log_scale, logit
 from gsjax.math.rotations import quaternion_to_matrix
@@ -26,39 +23,46 @@ from gsjax.runtime.settings import require_ranges, settle
 
 Array = jax.Array
 
-# Of an edit while a scene grows; what is known before is only the most there may be.
-_LIKELY_GROWTH = 1.3
+# Expected growth per edit while a scene grows. Only the upper limit is known.
+_EXPECTED_GROWTH = 1.3
 
 
 @dataclass(frozen=True)
 class AdaptiveSettings:
-    """Steps are counted from 1; the defaults are those of the paper and its code.
+    """Settings of adaptive density control; the defaults are those of Kerbl et al.
+
+    Gaussians whose mean screen-space gradient exceeds a threshold are cloned if small
+    and split in two if large. Nearly transparent and too large ones are removed. If
+    free slots run out, the largest gradients take precedence.
 
     Attributes:
-      start, stop, every: densify after every ``every``-th step in (start, stop].
-      threshold: of the mean gradient by the projected mean, in units of half the
-        image (normalised device coordinates); with ``absgrad`` 8e-4 is usual.
-      absgrad: use the sum over pixels of absolute gradients (Ye et al. 2024).
-      clone_below: largest scale, as a share of the extent, that is cloned; what is
-        larger is split.
-      shrink: what the scales of a split are divided by.
-      revised_opacity: give clones and splits 1 − √(1 − o) each (Rota Bulò et al.
-        2024), so that the pair is as opaque as the one was.
-      prune_opacity: below it a Gaussian goes.
-      prune_scale: above it, as a share of the extent, it goes, after the first reset.
-      prune_radius: above it, as a share of the longer side of the image, it goes,
-        after the first reset; None never.
-      reset_every: bring all opacities down to ``reset_opacity``, so that what is not
-        needed shows, at the first edit from every so many-th step on; 0 never. Not at
-        the last edit, which no pruning follows.
-      opacity_penalty, scale_penalty: weights of the means over all Gaussians, see
-        `gsjax.densify.penalties`; 0 in the paper.
-      max_gaussians: never more than that.
-      initial_opacity: of the Gaussians that a run starts from.
-      initial_scale: of those, times the distance to the nearest neighbours.
+      start, stop, every: edits follow the steps in (start, stop] that are multiples of
+        ``every``; steps are counted from 1.
+      threshold: densification threshold of the mean positional gradient, in normalised
+        device coordinates (half image sizes). 8e-4 is common with ``absgrad``.
+      absgrad: use sums over pixels of absolute gradients (Ye et al., "AbsGS", 2024).
+      clone_below: largest scale that is cloned, as a fraction of the extent; larger
+        Gaussians are split.
+      shrink: divisor of the scales of a split Gaussian.
+      revised_opacity: give clones and splits the opacity 1 − √(1 − o), so that the pair
+        is as opaque as the original (Rota Bulò et al., 2024).
+      prune_opacity: remove Gaussians of lower opacity.
+      prune_scale: after the first reset, remove Gaussians of larger scale, as a
+        fraction of the extent.
+      prune_radius: after the first reset, remove Gaussians of larger projected radius,
+        as a fraction of the longer image side; None keeps them.
+      reset_every: interval, in steps, of opacity resets; 0 disables them. A reset
+        coincides with the first edit of an interval and never with the last edit.
+      reset_opacity: upper limit of the opacities after a reset.
+      opacity_penalty, scale_penalty: weights in the loss of the mean opacity and the
+        mean scale; see `gsjax.densify.penalties`. 0 in the paper.
+      max_gaussians: upper limit of the number of Gaussians.
+      initial_opacity: opacity of the initial Gaussians.
+      initial_scale: scale of the initial Gaussians, as a multiple of the distance to
+        their nearest neighbours.
 
     Raises:
-      InputError: if a setting is out of its range.
+      InputError: if a setting is out of range.
     """
 
     start: int = 500
@@ -96,19 +100,24 @@ class AdaptiveSettings:
         }
         require_ranges(self, checks)
 
-    def likely(self, count: int, since: int, until: int) -> int:
-        """How many ``count`` Gaussians may be by step ``until``, from ``since`` on."""
-        edits = edits_between(since, until, self.start, self.stop, self.every)
-        return grown(count, edits, _LIKELY_GROWTH, self.max_gaussians)
+    def likely(self, count, since, until):
+        return self.schedule.expected(count, since, until)
+
+    @property
+    def schedule(self) -> EditSchedule:
+        """When edits are due, and the growth to expect."""
+        return EditSchedule(
+            self.start, self.stop, self.every, _EXPECTED_GROWTH, self.max_gaussians
+        )
 
 
 class AdaptiveStats(NamedTuple):
-    """Since the last edit.
+    """Statistics since the last edit.
 
     Attributes:
-      gradient: [N] sum of the gradients' norms.
-      views: [N] in how many views the Gaussian was seen.
-      radius: [N] largest radius, as a share of the image's longer side.
+      gradient: [N] sum of the norms of the positional gradients.
+      views: [N] number of views in which the Gaussian was visible.
+      radius: [N] largest projected radius, as a fraction of the longer image side.
     """
 
     gradient: Array
@@ -116,59 +125,58 @@ class AdaptiveStats(NamedTuple):
     radius: Array
 
 
-def adaptive(settings: AdaptiveSettings, extent: float) -> Densifier:
-    """The strategy, for `TrainConfig.densifier` and tests.
+def adaptive(settings: AdaptiveSettings, extent: float) -> Strategy:
+    """Return adaptive density control as a strategy.
 
     Args:
-      settings: see there.
-      extent: of the scene, in its units; see `gsjax.init.gaussians.scene_extent`.
+      settings: static settings.
+      extent: scene extent in world units; see `gsjax.data.extent.scene_extent`.
     """
 
     def init(gaussians: Gaussians) -> AdaptiveStats:
-        def zeros():  # each its own: a step that is donated takes no array twice
+        def zeros():  # distinct arrays: a buffer can be donated only once
             return jnp.zeros(gaussians.capacity, gaussians.params.means.dtype)
 
         return AdaptiveStats(zeros(), zeros(), zeros())
 
-    def observe(stats: AdaptiveStats, seen: Observation) -> AdaptiveStats:
-        sides = [jnp.atleast_1d(side) for side in (seen.width, seen.height)]
-        size = jnp.stack(sides, -1)[:, None]  # [B, 1, 2]; of one if all are the same
-        half = (size / 2).astype(seen.gradient.dtype)
-        norm = jnp.linalg.norm(seen.gradient * half, axis=-1)
-        visible = seen.radii > 0
-        longer = jnp.max(size, -1).astype(seen.radii.dtype)
-        share = jnp.max(seen.radii / longer, 0)
-        seen_now = AdaptiveStats(
+    def observe(stats: AdaptiveStats, observation: Observation) -> AdaptiveStats:
+        gradient, radii = observation.gradient, observation.radii
+        sides = observation.width, observation.height
+        size = jnp.stack([jnp.atleast_1d(side) for side in sides], -1)
+        size = size[:, None]  # [B or 1, 1, 2]
+        norm = jnp.linalg.norm(gradient * (size / 2).astype(gradient.dtype), axis=-1)
+        visible = radii > 0
+        longer = jnp.max(size, -1).astype(radii.dtype)
+        share = jnp.max(radii / longer, 0)
+        updated = AdaptiveStats(
             gradient=stats.gradient + jnp.sum(jnp.where(visible, norm, 0), 0),
             views=stats.views + jnp.sum(visible, 0),
             radius=jnp.maximum(stats.radius, share),
         )
-        # Cameras may be of a wider type, which is not to widen the statistics.
-        return jax.tree.map(lambda new, old: new.astype(old.dtype), seen_now, stats)
-
-    def due(step: Array) -> Array:
-        return is_due(step, settings.start, settings.stop, settings.every)
+        # Cameras may be float64 while the Gaussians are float32.
+        return jax.tree.map(lambda new, old: new.astype(old.dtype), updated, stats)
 
     def plan(key: Array, step: Array, gaussians: Gaussians, stats: AdaptiveStats):
-        dense = _densified(settings, extent, key, step, gaussians, stats)
-        return _reset(settings, step, dense), init(gaussians)
+        edit = _densify(settings, extent, key, step, gaussians, stats)
+        return _reset_opacities(settings, step, edit), init(gaussians)
 
     weights = settings.opacity_penalty, settings.scale_penalty
 
     def penalty(gaussians: Gaussians) -> Array:
         return mean_penalty(gaussians, *weights, extent)
 
-    return Densifier(
+    return Strategy(
         init=init,
         observe=observe,
-        due=due,
+        due=settings.schedule.due,
         plan=plan,
         penalty=penalty if any(weights) else None,
         absgrad=settings.absgrad,
+        schedule=settings.schedule,
     )
 
 
-def _densified(
+def _densify(
     settings: AdaptiveSettings,
     extent: float,
     key: Array,
@@ -176,6 +184,7 @@ def _densified(
     gaussians: Gaussians,
     stats: AdaptiveStats,
 ) -> SlotEdit:
+    """Plan which Gaussians are cloned, split and removed."""
     params, active = gaussians.params, gaussians.active
     scales = exp_log_scale(params.log_scales)
     opacity = jax.nn.sigmoid(params.logit_opacities)
@@ -192,15 +201,16 @@ def _densified(
     mean = stats.gradient / jnp.maximum(stats.views, 1)
     hot = mean >= settings.threshold
     large = largest > settings.clone_below * extent
-    # As big as they will be. Phrased positively: what is not a number goes too.
+    # A Gaussian about to be split is judged by its size afterwards. The comparisons
+    # are phrased so that NaN removes.
     kept = active & (opacity >= settings.prune_opacity)
     kept &= ~too_big(jnp.where(hot & large, settings.shrink, 1))
     hot &= kept
     remaining = jnp.sum(kept, dtype=jnp.int32)
-    room = jnp.maximum(settings.max_gaussians - remaining, 0)
-    new = assign(hot, mean, ~kept, room)
+    limit = jnp.maximum(settings.max_gaussians - remaining, 0)
+    new = assign(hot, mean, ~kept, limit)
     split, cloned = new.chosen & large, new.chosen & ~large
-    kept &= split | ~too_big(1)  # for which there was no room
+    kept &= split | ~too_big(1)  # too large, and no slot left to split it
 
     noise = jax.random.normal(key, (2, *scales.shape), scales.dtype)
     rotations = quaternion_to_matrix(params.quats)
@@ -226,14 +236,17 @@ def _densified(
         cleared=born | split | ~kept,
         opacities_reset=jnp.asarray(False),
         wanted=remaining + jnp.sum(hot, dtype=jnp.int32),
+        source=new.source,
     )
 
 
-def _reset(settings: AdaptiveSettings, step: Array, edit: SlotEdit) -> SlotEdit:
-    """With opacities brought down where it is time."""
+def _reset_opacities(
+    settings: AdaptiveSettings, step: Array, edit: SlotEdit
+) -> SlotEdit:
+    """Lower the opacities if a reset is due."""
     if settings.reset_every <= 0:
         return edit
-    # Edits need not fall on its multiples: at the first one after.
+    # Edits may miss the multiples of reset_every: use the first edit after each.
     now = step % settings.reset_every < settings.every
     now &= step + settings.every <= settings.stop
     opacities = edit.params.logit_opacities

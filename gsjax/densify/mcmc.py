@@ -1,11 +1,9 @@
-"""3D Gaussian splatting as Markov chain Monte Carlo (Kheradmand et al. 2024).
+"""Density control by Markov chain Monte Carlo.
+
+Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", 2024.
+Lengths are in fifths of the scene extent, so that a run does not depend on the unit.
 
 Axis legend: N Gaussians (capacity).
-
-Dead Gaussians are moved onto live ones, drawn by opacity, and the count grows to a
-cap in the same way; noise explores, and two penalties free what is not needed. The
-noise goes with the square of the scales and one penalty with them, in world units: here
-in units of a fifth of the scene's extent, so that a run does not depend on the unit.
 """
 
 import math
@@ -17,9 +15,9 @@ from jax import lax
 
 from gsjax.cameras.camera import USUAL_EXTENT
 from gsjax.densify.penalties import mean_penalty
-from gsjax.densify.schedule import edits_between, grown, is_due
+from gsjax.densify.schedule import EditSchedule
 from gsjax.densify.slots import copy_into
-from gsjax.densify.types import Densifier, SlotEdit
+from gsjax.densify.types import SlotEdit, Strategy
 from gsjax.gaussians import Gaussians
 from gsjax.math.numerics import exp_log_scale, logit
 from gsjax.math.rotations import times_covariance
@@ -27,28 +25,35 @@ from gsjax.runtime.settings import require_ranges, settle
 
 Array = jax.Array
 
-# Trapezoid of ∫ over [0, 5]; the integrand is entire, so it converges faster than
-# any power of the step: 3e-7 relative for n up to 51 (tested).
+# Trapezoidal rule on [0, 5]. The integrand is entire, so it converges faster than any
+# power of the step: relative error 3e-7 for counts up to 51 (tested).
 _NODES, _REACH = 51, 5.0
 
 
 @dataclass(frozen=True)
 class McmcSettings:
-    """Steps are counted from 1; the defaults are those of the paper and its code.
+    """Settings of MCMC density control; the defaults are those of Kheradmand et al.
+
+    Dead Gaussians move onto live ones, which are drawn by opacity. The number of
+    Gaussians grows to a limit in the same way. Noise on the means explores space, and
+    penalties on opacity and scale free Gaussians that are not needed.
 
     Attributes:
-      start, stop, every: relocate and grow after every ``every``-th step in
-        (start, stop].
-      max_gaussians: the cap.
-      growth: factor of the count at each edit; above 1, it grows by one at least.
-      dead_opacity: at or below it a Gaussian is dead.
-      noise: factor on the rate of the means.
-      opacity_penalty, scale_penalty: weights of the means over all Gaussians.
-      initial_opacity: of the Gaussians that a run starts from.
-      initial_scale: of those, times the distance to the nearest neighbours.
+      start, stop, every: edits follow the steps in (start, stop] that are multiples of
+        ``every``; steps are counted from 1.
+      max_gaussians: upper limit of the number of Gaussians.
+      growth: factor on the number of Gaussians at each edit; above 1, each edit adds at
+        least one.
+      dead_opacity: Gaussians of at most this opacity are dead.
+      noise: strength of the noise, as a multiple of the learning rate of the means.
+      opacity_penalty, scale_penalty: weights in the loss of the mean opacity and the
+        mean scale.
+      initial_opacity: opacity of the initial Gaussians.
+      initial_scale: scale of the initial Gaussians, as a multiple of the distance to
+        their nearest neighbours.
 
     Raises:
-      InputError: if a setting is out of its range.
+      InputError: if a setting is out of range.
     """
 
     start: int = 500
@@ -77,38 +82,47 @@ class McmcSettings:
         }
         require_ranges(self, checks)
 
-    def likely(self, count: int, since: int, until: int) -> int:
-        """How many ``count`` Gaussians will be by step ``until``, from ``since`` on."""
-        edits = edits_between(since, until, self.start, self.stop, self.every)
-        return grown(count, edits, self.growth, self.max_gaussians)
+    def likely(self, count, since, until):
+        return self.schedule.expected(count, since, until)
+
+    @property
+    def schedule(self) -> EditSchedule:
+        """When edits are due, and the growth to expect."""
+        return EditSchedule(
+            self.start, self.stop, self.every, self.growth, self.max_gaussians
+        )
 
 
-def mcmc(settings: McmcSettings, extent: float = USUAL_EXTENT) -> Densifier:
-    """The strategy.
+def mcmc(settings: McmcSettings, extent: float = USUAL_EXTENT) -> Strategy:
+    """Return MCMC density control as a strategy.
 
     Args:
-      settings: see there.
-      extent: of the scene, in its units; see `gsjax.init.gaussians.scene_extent`.
+      settings: static settings.
+      extent: scene extent in world units; see `gsjax.data.extent.scene_extent`.
     """
     unit = extent / USUAL_EXTENT
 
     def plan(key: Array, step: Array, gaussians: Gaussians, stats: tuple):
         del step
-        by_move, by_growth = jax.random.split(key)
+        move_key, growth_key = jax.random.split(key)
         params, active = gaussians.params, gaussians.active
         opacity = jax.nn.sigmoid(params.logit_opacities)
         alive = active & (opacity > settings.dead_opacity)
-        moved = spawn(by_move, gaussians, active & ~alive, alive, settings)
+        moved = spawn(move_key, gaussians, active & ~alive, alive, settings)
         count = jnp.sum(active, dtype=jnp.int32)
         grown = jnp.floor(settings.growth * count.astype(jnp.float32))
-        # By one at least, where there is any: of few, a factor alone makes no more.
+        # The factor alone rounds down to no growth for small counts.
         least = count + jnp.minimum(count, 1) if settings.growth > 1 else count
         target = jnp.clip(grown.astype(jnp.int32), least, settings.max_gaussians)
         free = ~active
         chosen = free & (jnp.cumsum(free, dtype=jnp.int32) <= target - count)
         after = Gaussians(params=moved.params, active=active)  # pyright: ignore
-        born = spawn(by_growth, after, chosen, active, settings)
-        edit = born._replace(cleared=moved.cleared | born.cleared, wanted=target)
+        born = spawn(growth_key, after, chosen, active, settings)
+        edit = born._replace(
+            cleared=moved.cleared | born.cleared,
+            wanted=target,
+            source=_compose(moved.source, born.source),
+        )
         return edit, stats
 
     def penalty(gaussians: Gaussians) -> Array:
@@ -121,7 +135,7 @@ def mcmc(settings: McmcSettings, extent: float = USUAL_EXTENT) -> Densifier:
         gate = jax.nn.sigmoid(-100 * (opacity - 0.005))
         noise = jax.random.normal(key, params.means.shape, params.means.dtype)
         shift = times_covariance(params.quats, exp_log_scale(params.log_scales), noise)
-        # The rate may be wider than the parameters, and must not widen them.
+        # The rate may be float64 while the parameters are float32.
         strength = settings.noise / unit**2 * rate.astype(gate.dtype)
         shift = shift * (gate * strength)[:, None]
         moved = params.means + shift
@@ -129,26 +143,40 @@ def mcmc(settings: McmcSettings, extent: float = USUAL_EXTENT) -> Densifier:
         means = jnp.where(good, moved, params.means)
         return params.replace(means=means)  # pyright: ignore
 
-    def due(step: Array) -> Array:
-        return is_due(step, settings.start, settings.stop, settings.every)
-
-    return Densifier(
+    return Strategy(
         init=lambda _: (),
         observe=lambda stats, _: stats,
-        due=due,
+        due=settings.schedule.due,
         plan=plan,
         penalty=penalty,
         perturb=perturb,
+        schedule=settings.schedule,
     )
+
+
+def _compose(first: Array | None, second: Array | None) -> Array:
+    """Return the sources [N] of two copies in a row."""
+    assert first is not None
+    assert second is not None
+    slots = first.shape[0]
+    via = first.at[second].get(mode="fill", fill_value=slots)
+    return jnp.where(second < slots, jnp.where(via < slots, via, second), first)
 
 
 def spawn(
     key: Array, gaussians: Gaussians, slots: Array, alive: Array, settings: McmcSettings
 ) -> SlotEdit:
-    """Fill ``slots`` [N] with copies of ``alive`` ones [N], drawn by opacity.
+    """Fill slots with copies of live Gaussians, which are drawn by opacity.
 
-    One that is drawn becomes n, itself included, which together look as it did: see
+    A Gaussian that is drawn n − 1 times shares its opacity and scale among n: see
     `shared_opacity` and `shared_scale`.
+
+    Args:
+      key: random key.
+      gaussians: N slots.
+      slots: [N] bool, the slots to fill.
+      alive: [N] bool, the Gaussians to draw from.
+      settings: of the strategy.
     """
     params = gaussians.params
     size = slots.shape[0]
@@ -179,26 +207,32 @@ def spawn(
         cleared=parents | born,
         opacities_reset=jnp.asarray(False),
         wanted=jnp.sum(gaussians.active | slots, dtype=jnp.int32),
+        source=source,
     )
 
 
 def shared_opacity(opacity: Array, count: Array) -> Array:
-    """Opacity of each of n that are together as opaque: 1 − (1 − o)^(1/n)."""
+    """Return 1 − (1 − o)^(1/n), the opacity of each of n Gaussians in place of one."""
     below = jnp.minimum(opacity, 1 - jnp.finfo(opacity.dtype).eps)
     return -jnp.expm1(jnp.log1p(-below) / count)
 
 
 def shared_scale(opacity: Array, shared: Array, count: Array) -> Array:
-    """Factor on the scales of ``count`` that take the place of one (Eq. 9).
+    """Return the factor on the scales of n Gaussians in place of one (Eq. 9).
 
-    The equation's denominator, Σᵢ Σₖ C(i−1, k) (−1)ᵏ o'^(k+1) / √(k+1), is the
-    integral of what n Gaussians in one place cover,
+    The denominator of the equation, Σᵢ Σₖ C(i−1, k) (−1)ᵏ o'^(k+1) / √(k+1), equals the
+    integral of the coverage of n coincident Gaussians,
 
         1/√π ∫ 1 − (1 − o' exp(−t²))ⁿ dt,
 
-    since 1/√(k+1) = 1/√π ∫ exp(−(k+1) t²) dt and the sums are then binomial and
-    geometric. In this form nothing cancels: the alternating sum has terms of 1e14 at
-    n = 51.
+    because 1/√(k+1) = 1/√π ∫ exp(−(k+1) t²) dt and the sums are then binomial and
+    geometric. The integral avoids the cancellation of the alternating sum, whose terms
+    reach 1e14 at n = 51.
+
+    Args:
+      opacity: [N] opacities o before.
+      shared: [N] opacities o' after, see `shared_opacity`.
+      count: [N] numbers n.
     """
     step = _REACH / (_NODES - 1)
 

@@ -1,4 +1,4 @@
-"""Penalties that free what a scene does not need."""
+"""Penalties that let Gaussians without support in the images fade and shrink."""
 
 import jax
 import jax.numpy as jnp
@@ -9,26 +9,26 @@ from gsjax.math.numerics import exp_log_scale
 
 
 def mean_penalty(
-    gaussians: Gaussians, by_opacity: float, by_scale: float, extent: float
+    gaussians: Gaussians, opacity_weight: float, scale_weight: float, extent: float
 ) -> jax.Array:
-    """Weighed means of opacity and scale over the active (Kheradmand et al. 2024).
+    """Return the weighted mean opacity and mean scale of the active Gaussians.
 
-    The gradient of what is not needed is then theirs alone: it fades and shrinks.
+    Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", 2024.
 
     Args:
-      gaussians: capacity N.
-      by_opacity: weight of the mean opacity.
-      by_scale: weight of the mean scale, in fifths of ``extent``.
-      extent: of the scene, in its units.
+      gaussians: N slots.
+      opacity_weight: weight of the mean opacity.
+      scale_weight: weight of the mean scale, in fifths of ``extent``.
+      extent: scene extent in world units.
 
     Returns:
-      [] to add to the loss; 0 of none.
+      [] to add to the loss; 0 if no Gaussian is active.
     """
     params, active = gaussians.params, gaussians.active
     count = jnp.maximum(jnp.sum(active), 1)
     opacity = jax.nn.sigmoid(jnp.where(active, params.logit_opacities, 0))
     scales = exp_log_scale(jnp.where(active[:, None], params.log_scales, 0))
-    of_opacity = jnp.sum(jnp.where(active, opacity, 0)) / count
-    of_scale = jnp.sum(jnp.where(active[:, None], scales, 0)) / (3 * count)
+    mean_opacity = jnp.sum(jnp.where(active, opacity, 0)) / count
+    mean_scale = jnp.sum(jnp.where(active[:, None], scales, 0)) / (3 * count)
     unit = extent / USUAL_EXTENT
-    return by_opacity * of_opacity + by_scale / unit * of_scale
+    return opacity_weight * mean_opacity + scale_weight / unit * mean_scale

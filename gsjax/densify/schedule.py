@@ -1,23 +1,76 @@
-"""When slots are edited, and what that may come to."""
+"""Steps at which slots are edited, and the growth to expect from the edits."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import jax
+import numpy as np
 
 
-def is_due(step: jax.Array, start: int, stop: int, every: int) -> jax.Array:
-    """[] bool: whether ``step`` is a multiple of ``every`` in (start, stop]."""
-    inside = (step > start) & (step <= stop)
-    return inside & (step % every == 0)
+@dataclass(frozen=True)
+class EditSchedule:
+    """When a strategy edits, and by how much the number of Gaussians may grow.
+
+    Attributes:
+      start, stop, every: edits follow the steps in (start, stop] that are multiples of
+        ``every``; steps are counted from 1.
+      growth: expected factor on the number of Gaussians at each edit, a forecast for
+        planning capacity; None if it is unknown.
+      max_gaussians: upper limit of the number of Gaussians.
+    """
+
+    start: int = 0
+    stop: int = 2**31 - 1
+    every: int = 1
+    growth: float | None = None
+    max_gaussians: int = 2**30
+
+    def due(self, step: jax.Array) -> jax.Array:
+        """Return [] bool: whether an edit follows ``step``; traceable."""
+        inside = (step > self.start) & (step <= self.stop)
+        return inside & (step % self.every == 0)
+
+    def edits_between(self, since: int, until: int) -> int:
+        """Return the number of edits after the steps in (since, until]."""
+        last, first = min(until, self.stop), max(since, self.start)
+        return max(0, last // self.every - first // self.every)
+
+    def expected(self, count: int, since: int, until: int) -> int:
+        """Return the number of Gaussians to expect at step ``until``.
+
+        Each edit adds at least one Gaussian if ``growth`` is above 1. If it is unknown,
+        half as many more are expected.
+
+        Args:
+          count: number of Gaussians at step ``since``.
+          since, until: steps.
+        """
+        edits = self.edits_between(since, until)
+        if self.growth is None:
+            more = count + count // 2 if edits else count
+            return max(count, min(more, self.max_gaussians))
+        if self.growth > 1 and count:
+            while edits > 0 and count < self.max_gaussians:
+                more = max(count + 1, int(self.growth * count))
+                count, edits = min(more, self.max_gaussians), edits - 1
+        return count
 
 
-def edits_between(since: int, until: int, start: int, stop: int, every: int) -> int:
-    """How many of the steps in (since, until] edit."""
-    return max(0, min(until, stop) // every - max(since, start) // every)
+def schedule_of(due: Callable[[Any], Any], steps: int) -> EditSchedule:
+    """Return a schedule that covers the steps at which ``due`` holds.
+
+    Args:
+      due: ``step → bool``, elementwise.
+      steps: last step of the run.
+    """
+    every_step = np.arange(steps + 1)
+    found = np.flatnonzero(np.broadcast_to(np.asarray(due(every_step)), steps + 1))
+    if not len(found):
+        return EditSchedule(stop=0)
+    every = int(np.diff(found).min()) if len(found) > 1 else 1
+    return EditSchedule(int(found[0]) - 1, int(found[-1]), every)
 
 
-def grown(count: int, edits: int, growth: float, most: int) -> int:
-    """``count`` after so many edits by a factor of ``growth``, each by one at least
-    if that is above 1, and up to ``most``."""
-    if growth > 1 and count:
-        while edits > 0 and count < most:
-            count, edits = min(max(count + 1, int(growth * count)), most), edits - 1
-    return count
+def edits_between(since, until, start, stop, every):
+    return EditSchedule(start, stop, every).edits_between(since, until)

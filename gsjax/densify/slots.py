@@ -1,25 +1,24 @@
-"""Who gets which free slot, under jit.
+"""Allocation of free slots and copies between slots; traceable.
 
 Axis legend: N slots.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gsjax.gaussians import GaussianParams
-
 Array = jax.Array
+Tree = TypeVar("Tree")
 
 
 class Assignment(NamedTuple):
-    """Candidates and the slots that they got.
+    """Candidates and the slots assigned to them.
 
     Attributes:
-      source: [N] for each slot the candidate that it was given to, or N.
-      chosen: [N] bool, which candidates got a slot.
+      source: [N] int32, for each slot the candidate assigned to it, or N.
+      chosen: [N] bool, the candidates that received a slot.
     """
 
     source: Array
@@ -27,17 +26,16 @@ class Assignment(NamedTuple):
 
 
 def assign(candidates: Array, priority: Array, free: Array, limit: Array) -> Assignment:
-    """Give free slots, lowest first, to the candidates of highest priority.
+    """Assign free slots, lowest first, to the candidates of highest priority.
 
     Args:
       candidates: [N] bool.
-      priority: [N]; among equals the lower slot goes first.
+      priority: [N]; ties go to the lower slot, -inf and NaN come last.
       free: [N] bool.
-      limit: [] give away no more than that many.
+      limit: [] upper limit of the number of slots to assign.
     """
     slots = candidates.shape[0]
     place = lax.iota(jnp.int32, slots)
-    # Candidates first, whatever their priority: -inf and NaN come last among them.
     by_priority = jnp.lexsort((-priority, ~candidates))
     by_slot = jnp.argsort(~free, stable=True)
     given = jnp.minimum(jnp.sum(candidates), jnp.sum(free))
@@ -55,21 +53,22 @@ def assign(candidates: Array, priority: Array, free: Array, limit: Array) -> Ass
     return Assignment(source, chosen)
 
 
-def copy_into(
-    params: GaussianParams, source: Array, born: GaussianParams
-) -> GaussianParams:
-    """``params`` with ``born[source]`` where a slot has a source (< N)."""
-    slots = source.shape[0]
+def slot_mask(mask: Array, like: Array) -> Array:
+    """Return ``mask`` [N] with trailing axes that broadcast against ``like`` [N, …]."""
+    return mask.reshape(-1, *(1,) * (like.ndim - 1))
+
+
+def copy_into(tree: Tree, source: Array, new: Tree) -> Tree:
+    """Return ``tree`` with ``new[source]`` in each slot that has a source (< N)."""
+    copied = source < source.shape[0]
 
     def leaf(old, new):
-        wide = (source < slots).reshape(-1, *(1,) * (old.ndim - 1))
-        return jnp.where(wide, new.at[source].get(mode="clip"), old)
+        row = new.at[source].get(mode="clip")
+        return jnp.where(slot_mask(copied, old), row, old)
 
-    return jax.tree.map(leaf, params, born)
+    return jax.tree.map(leaf, tree, new)
 
 
-def where_slots(mask: Array, yes: GaussianParams, no: GaussianParams):
-    """Slot by slot, one or the other."""
-    return jax.tree.map(
-        lambda a, b: jnp.where(mask.reshape(-1, *(1,) * (a.ndim - 1)), a, b), yes, no
-    )
+def where_slots(mask: Array, true: Tree, false: Tree) -> Tree:
+    """Return each slot from ``true`` where ``mask`` [N] is set, else from ``false``."""
+    return jax.tree.map(lambda a, b: jnp.where(slot_mask(mask, a), a, b), true, false)

@@ -5,6 +5,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 from gsjax.cameras.camera import look_at
 from gsjax.data.types import Dataset, View
@@ -26,7 +27,7 @@ from gsjax.stress.scenes import (
 )
 from gsjax.stress.types import Case, Measured, worse
 from gsjax.train.metrics import ssim
-from gsjax.train.optimiser import Rates, adam_step, init_moments
+from gsjax.train.optimiser import Rates, gaussian_rates, make_optimiser
 
 
 def similarity(full: bool) -> Measured:
@@ -42,16 +43,22 @@ def similarity(full: bool) -> Measured:
     return Measured(worst, f"{count} pictures")
 
 
+_OPTIMISER = make_optimiser(gaussian_rates(Rates(), 1.0))
+
+
 @jax.jit
 def _step(params, grads, moments):
-    return adam_step(params, grads, moments, Rates(), jnp.float32(0), 1.0)
+    updates, moments = _OPTIMISER.update(
+        grads, moments, params, fraction=jnp.float32(0)
+    )
+    return optax.apply_updates(params, updates), moments
 
 
 def dead_slots(full: bool) -> Measured:
     """Numbers of dead slots that Adam moves after they have had gradients."""
     start = usual()
     ones = jax.tree.map(jnp.ones_like, start.params)
-    params, moments = _step(start.params, ones, init_moments(start.params))
+    params, moments = _step(start.params, ones, _OPTIMISER.init(start.params))
     dead = jnp.arange(SLOTS) % 2 == 0
     edit = SlotEdit(
         params=params,
@@ -91,7 +98,7 @@ def reset_opacities(full: bool) -> Measured:
 def _kept_moments(reset: Gaussians) -> int:
     """Moments of opacities that outlive a reset, or of anything else that do not."""
     ones = jax.tree.map(jnp.ones_like, reset.params)
-    _, moments = _step(reset.params, ones, init_moments(reset.params))
+    _, moments = _step(reset.params, ones, _OPTIMISER.init(reset.params))
     edit = SlotEdit(
         params=reset.params,
         active=reset.active,
@@ -102,9 +109,9 @@ def _kept_moments(reset: Gaussians) -> int:
     _, after = apply_edit(edit, moments)
     wanted = [
         moment.replace(logit_opacities=jnp.zeros(SLOTS))
-        for moment in (moments.mu, moments.nu)
+        for moment in (moments[0].mu, moments[0].nu)
     ]
-    return unequal([after.mu, after.nu], wanted)
+    return unequal([after[0].mu, after[0].nu], wanted)
 
 
 def initial_scales(full: bool) -> Measured:

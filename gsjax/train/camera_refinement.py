@@ -1,33 +1,31 @@
-"""Small corrections of the cameras and of the exposures, learnt along with the scene.
+"""Corrections of camera poses, intrinsics and exposures, optimised with the scene.
 
 Axis legend: V views, B views of a step, H W image.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from gsjax.cameras.camera import Camera
 from gsjax.math.rotations import quaternion_to_matrix
 from gsjax.train.config import TrainConfig
 
 Array = jax.Array
-_ADAM = optax.scale_by_adam(eps=1e-15)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class CameraRefinement:
-    """Corrections; those that are not learnt are None, all others start at nothing.
+    """Corrections; zero is no correction, None is not optimised.
 
     Attributes:
       turns: [V, 3] rotation of the camera, as half the vector part of a quaternion.
-      shifts: [V, 3] of the camera, in camera axes and in extents of the scene.
-      intrinsics: [4] logarithm of the factor on each focal length, and shift of the
-        principal point in focal lengths, as given; one for all views. (Not in sizes of
-        the image, which is padded in a batch of photographs of several sizes.)
+      shifts: [V, 3] translation in camera axes, in scene extents.
+      intrinsics: [4] log factors of both focal lengths, and shift of the principal
+        point in focal lengths; shared by all views. Focal lengths are the unit because
+        images of several sizes are padded to one.
       exposures: [V, 3, 4] affine map of the colours, minus the identity.
     """
 
@@ -38,8 +36,8 @@ class CameraRefinement:
 
 
 def init_refinement(config: TrainConfig, views: int) -> CameraRefinement:
-    """Nothing corrected yet; of the kinds that the settings ask for."""
-    # Each its own array: a step that is donated takes none twice.
+    """Return zero corrections of the kinds that ``config`` enables."""
+    # Distinct arrays: a buffer can be donated only once.
     return CameraRefinement(
         turns=jnp.zeros((views, 3)) if config.refine_poses else None,
         shifts=jnp.zeros((views, 3)) if config.refine_poses else None,
@@ -48,33 +46,27 @@ def init_refinement(config: TrainConfig, views: int) -> CameraRefinement:
     )
 
 
-def init_refinement_moments(refinement: CameraRefinement) -> optax.ScaleByAdamState:
-    """Zero moments."""
-    return _ADAM.init(refinement)  # pyright: ignore
-
-
-def refinement_step(
-    refinement: CameraRefinement, grads: CameraRefinement, moments, config: TrainConfig
-):
-    """One step of Adam; returns (refinement, moments)."""
-    updates, moments = _ADAM.update(grads, moments)  # pyright: ignore
-    rates = {
+def refinement_rates(config: TrainConfig) -> dict[str, float]:
+    """Return the learning rates of the corrections by label."""
+    return {
         "turns": config.pose_rate,
         "shifts": config.pose_rate,
         "intrinsics": config.intrinsics_rate,
         "exposures": config.exposure_rate,
     }
-    moved = {
-        name: None if value is None else value - rates[name] * getattr(updates, name)
-        for name, value in vars(refinement).items()
-    }
-    return CameraRefinement(**moved), moments
 
 
 def refine_camera(
     camera: Camera, refinement: CameraRefinement, index: Array, extent: float
 ) -> Camera:
-    """The cameras of a batch, corrected; ``index`` [B] says which views they are."""
+    """Return corrected cameras.
+
+    Args:
+      camera: batch of B cameras.
+      refinement: corrections of V views.
+      index: [B] int32, the view of each camera.
+      extent: scene extent in world units.
+    """
     viewmat, K = camera.viewmat, camera.K
     if refinement.turns is not None and refinement.shifts is not None:
         turns = refinement.turns[index]
@@ -88,24 +80,23 @@ def refine_camera(
         focal = jnp.stack([K[:, 0, 0], K[:, 1, 1]], -1)
         K = K.at[:, 0, 0].multiply(factor[0]).at[:, 1, 1].multiply(factor[1])
         K = K.at[:, :2, 2].add(focal * refinement.intrinsics[2:])
-    return Camera(viewmat, K, camera.near, camera.far, camera.width, camera.height,
-                  camera.model)  # fmt: skip
+    return replace(camera, viewmat=viewmat, K=K)
 
 
-def exposed(
+def apply_exposure(
     images: Array,
     refinement: CameraRefinement,
     index: Array,
     alphas: Array | None = None,
 ) -> Array:
-    """Renders as the photographs' exposures would show them.
+    """Return renders with the exposure corrections of their photographs.
 
     Args:
       images: [B, H, W, 3].
-      refinement: with the exposures.
-      index: [B], which views they are.
-      alphas: [B, H, W] opacities of images over black; None where nothing shows
-        through.
+      refinement: corrections of V views.
+      index: [B] int32, the view of each image.
+      alphas: [B, H, W] opacities if the images are over black; None if they are
+        opaque.
     """
     if refinement.exposures is None:
         return images

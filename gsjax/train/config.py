@@ -6,7 +6,8 @@ from itertools import pairwise
 
 from gsjax.densify.adaptive import AdaptiveSettings, adaptive
 from gsjax.densify.mcmc import McmcSettings, mcmc
-from gsjax.densify.types import Densifier
+from gsjax.densify.schedule import EditSchedule
+from gsjax.densify.types import Strategy
 from gsjax.errors import InputError
 from gsjax.raster.types import RasterConfig
 from gsjax.runtime.settings import number, require_ranges, settle
@@ -19,14 +20,14 @@ INITIALS = ("auto", "points", "dense", "random")
 
 @dataclass(frozen=True)
 class Level:
-    """From ``start`` on, images are ``divisor`` times smaller.
+    """Resolution of the photographs from a point of the run on.
 
     Attributes:
-      start: share of all steps, 0 to 1.
-      divisor: of width and height.
+      start: fraction of all steps, 0 to 1.
+      divisor: divisor of width and height.
 
     Raises:
-      InputError: if one is no number.
+      InputError: if a value is not a number.
     """
 
     start: float
@@ -36,45 +37,51 @@ class Level:
         settle(self)
 
 
+# Compiles faster: a run grows its capacities itself, so one size suffices; and few
+# Gaussians are hidden in views of photographs, so occlusion culling does not pay.
+_RASTER = {"num_size_buckets": 1, "occlusion": False}
+
+
 @dataclass(frozen=True)
 class TrainConfig:
-    """All that a run depends on besides its photographs; the defaults are the field's.
+    """Settings of a training run; the defaults are those of Kerbl et al. 2023.
 
     Attributes:
-      steps: how many, of ``batch`` views each.
-      seed: of all that is random.
-      strategy: "adaptive" or "mcmc", with the settings of that name; no slot is
-        edited behind the last step.
-      max_size: px, longest side that photographs are scaled down to; None: as is.
-      levels: coarse to fine.
-      sh_degree: of the scene; bands join one by one, every ``sh_every`` steps.
-      ssim_weight: share of 1 − SSIM in the loss.
-      background: behind the scene while training; "random" is a new colour at each
-        step, so that nothing hides in it. "auto" is random where photographs are
-        transparent, which tells what is nothing, else black. But for "white", views
-        and files have it black.
-      initial: "points" of the dataset; "dense": those, and more on which the
-        photographs agree (`gsjax.train.initialisation.add_dense_points`); or "random" ones in view.
-        "auto" is points where there are any, else random; so is "dense" where next to
-        nothing is found.
-      initial_count: how many random ones.
-      dense_count: how many more points than those of the dataset, at most.
-      max_initial: of more points than that, that many are drawn.
-      rates: of Adam.
-      refine_poses, refine_intrinsics: learn small corrections of the cameras.
-      exposure: learn an affine correction of the colours of each photograph.
-      pose_rate, intrinsics_rate, exposure_rate: of Adam, for those.
-      skip_masked: leave out the tiles of a view whose pixels are all masked;
-        changes nothing beyond rounding.
-      prune_invisible: at the end, remove the Gaussians that are in none of the views that
-        were trained on; changes no bit of those. (The count of the last step is the
-        one before.)
-      every_eval: in steps, measure the held-out views; 0 only at the end.
-      every_checkpoint: in steps; 0 only at the end.
-      raster: how to render; sizes in it are set by the run.
+      steps: number of steps, of ``batch`` views each.
+      seed: seed of all random numbers.
+      strategy: density control, "adaptive" or "mcmc", with the settings of that name.
+        There is no edit after the last step.
+      max_size: longest side, px, that photographs are downscaled to; None keeps them.
+      levels: resolutions, coarse to fine.
+      sh_degree: degree of the spherical harmonics. Each degree is enabled ``sh_every``
+        steps after the one below.
+      ssim_weight: weight of 1 − SSIM in the loss; that of L1 is the rest.
+      background: colour behind the scene in training: "black", "white", "random" (a new
+        colour in each step, which prevents holes), or "auto": random if photographs are
+        transparent, else black. Evaluation and files use black unless it is "white".
+      initial: initial Gaussians: "points" of the dataset; "dense", those and points
+        matched between photographs (`gsjax.train.initialisation.add_dense_points`), or
+        random points if hardly any are found; "random" points in view; or "auto": the
+        points if there are any, else random ones.
+      initial_count: number of random points.
+      dense_count: maximum number of matched points.
+      max_initial: maximum number of initial points; a random subset is kept.
+      rates: learning rates of the Gaussians.
+      refine_poses, refine_intrinsics: optimise small corrections of the cameras.
+      exposure: optimise an affine correction of the colours of each photograph.
+      pose_rate, intrinsics_rate, exposure_rate: learning rates of these corrections.
+      skip_masked: skip tiles in which all pixels are masked; equal up to rounding.
+      prune_invisible: after the last step, remove the Gaussians that no training view
+        shows; the views stay bit-equal. (Metrics of the last step count them.)
+      every_eval: interval in steps at which held-out views are evaluated; 0 only at the
+        end.
+      every_checkpoint: interval in steps between checkpoints; 0 only at the end.
+      raster: render settings; the run chooses the capacities. With ``refine_poses`` the
+        default has the thresholds of `RasterConfig.accurate`, because those of the
+        default change pose gradients by up to a half; a value of your own is kept.
 
     Raises:
-      InputError: if a setting is out of its range.
+      InputError: if a setting is out of range.
     """
 
     steps: int = 30_000
@@ -104,19 +111,28 @@ class TrainConfig:
     prune_invisible: bool = True
     every_eval: int = 0
     every_checkpoint: int = 1000
-    # What compiles faster: one size of the work, as a run grows its capacities itself;
-    # no search for what is hidden, of which views of photographs hold next to nothing.
-    raster: RasterConfig = field(
-        default_factory=lambda: RasterConfig(num_size_buckets=1, occlusion=False)
-    )
+    raster: RasterConfig = field(default_factory=lambda: RasterConfig(**_RASTER))
 
     def __post_init__(self):
         settle(self)
-        if self.strategy not in STRATEGIES:  # which others depend on
-            require_ranges(self, {"strategy": False})
-        rates = _settled(self.rates)
+        choices = {
+            "strategy": STRATEGIES,
+            "background": BACKGROUNDS,
+            "initial": INITIALS,
+        }
+        for name, known in choices.items():
+            if getattr(self, name) not in known:
+                raise InputError(
+                    f"TrainConfig.{name}: expected one of {', '.join(known)}, got "
+                    f"{getattr(self, name)!r}"
+                )
+        if self.refine_poses and self.raster == RasterConfig(**_RASTER):
+            accurate = RasterConfig.accurate(**_RASTER)
+            object.__setattr__(self, "raster", accurate)
+        rates = _as_floats(self.rates)
         object.__setattr__(self, "rates", rates)
         first, last = rates.means
+        settings = self.strategy_settings
         checks = {
             "steps": 1 <= self.steps < 2**31 - 1,
             "seed": 0 <= self.seed < 2**31,
@@ -136,12 +152,10 @@ class TrainConfig:
             "pose_rate": 0 <= self.pose_rate < math.inf,
             "intrinsics_rate": 0 <= self.intrinsics_rate < math.inf,
             "exposure_rate": 0 <= self.exposure_rate < math.inf,
-            "background": self.background in BACKGROUNDS,
-            "initial": self.initial in INITIALS,
             "initial_count": self.initial_count >= 1,
             "dense_count": self.dense_count >= 0,
-            f"{self.strategy}'s initial_opacity": 0 < self.chosen.initial_opacity < 1,
-            f"{self.strategy}'s initial_scale": self.chosen.initial_scale > 0,
+            f"{self.strategy}'s initial_opacity": 0 < settings.initial_opacity < 1,
+            f"{self.strategy}'s initial_scale": settings.initial_scale > 0,
             "max_initial": self.max_initial >= 1,
             "every_eval": self.every_eval >= 0,
             "every_checkpoint": self.every_checkpoint >= 0,
@@ -149,39 +163,53 @@ class TrainConfig:
         require_ranges(self, checks)
 
     def replace(self, **changes) -> "TrainConfig":
-        """A copy with some settings changed."""
+        """Return a copy with some settings changed.
+
+        Args:
+          **changes: settings by name; also ``max_gaussians``, which sets the maximum
+            number of Gaussians of both strategies.
+        """
+        most = changes.pop("max_gaussians", None)
+        if most is not None:
+            for name in STRATEGIES:
+                settings = changes.get(name, getattr(self, name))
+                changes[name] = replace(settings, max_gaussians=most)
         return replace(self, **changes)
 
-    def densifier(self, extent: float) -> Densifier:
-        """The strategy, for a scene of this extent."""
-        settings = self.chosen
+    def make_strategy(self, extent: float) -> Strategy:
+        """Return the density control for a scene of this extent, in world units."""
+        settings = self.strategy_settings
         if isinstance(settings, McmcSettings):
             return mcmc(settings, extent)
         return adaptive(settings, extent)
 
     @property
-    def chosen(self) -> AdaptiveSettings | McmcSettings:
-        """The settings of the strategy, which edits nothing behind the last step:
-        that would not be learnt any more."""
+    def strategy_settings(self) -> AdaptiveSettings | McmcSettings:
+        """Settings of the strategy, without an edit after the last step."""
         settings = self.mcmc if self.strategy == "mcmc" else self.adaptive
         return replace(settings, stop=min(settings.stop, self.steps - 1))
 
     @property
     def max_gaussians(self) -> int:
-        """The most that the strategy may make."""
-        return self.chosen.max_gaussians
+        """Maximum number of Gaussians."""
+        return self.strategy_settings.max_gaussians
+
+    @property
+    def schedule(self) -> EditSchedule:
+        """Steps at which the strategy edits, and the growth to expect."""
+        return self.strategy_settings.schedule
 
     def divisor(self, step: int) -> int:
-        """How much smaller the images are at ``step`` (from 0)."""
-        share = step / self.steps
-        return next(lv.divisor for lv in reversed(self.levels) if share >= lv.start)
+        """Return the divisor of the image size at ``step``, counted from 0."""
+        done = step / self.steps
+        return next(lv.divisor for lv in reversed(self.levels) if done >= lv.start)
 
 
-def _settled(rates: Rates) -> Rates:
-    """Their numbers as Python's.
+def _as_floats(rates: Rates) -> Rates:
+    """Return the rates as Python floats.
 
     Raises:
-      InputError: if one is none.
+      InputError: if one is not a number.
     """
     first, last = rates.means
     means = number("Rates.means", first), number("Rates.means", last)
@@ -191,7 +219,7 @@ def _settled(rates: Rates) -> Rates:
 
 
 def scaled(config: TrainConfig, steps: int) -> TrainConfig:
-    """The same run in another number of steps: its schedules keep their shares."""
+    """Return the settings with another number of steps and schedules in proportion."""
     ratio = steps / config.steps
 
     def some(count: int, least: int = 1) -> int:
@@ -218,28 +246,33 @@ def scaled(config: TrainConfig, steps: int) -> TrainConfig:
 
 
 def continuation_config(config: TrainConfig) -> TrainConfig:
-    """The same run for a scene that was trained before: what such a scene has of
-    harmonics and of detail is used from the first steps on."""
+    """Return the settings for training that starts from a trained scene.
+
+    All harmonics and the finest resolution are used from the first step.
+    """
     finest = Level(0.0, config.levels[-1].divisor)
     return config.replace(sh_every=1, levels=(finest,))
 
 
-def preset(name: str) -> TrainConfig:
-    """Settings by name.
+def preset(name: str, **changes) -> TrainConfig:
+    """Return the settings of a preset.
 
     Args:
-      name: "fast" is minutes on two cores; "default" 4000 steps on photographs of up
-        to 800 px; "quality" the 30 000 steps of the papers, for bigger machines.
+      name: "fast" (1200 steps, photographs of up to 400 px), "default" (4000 steps, up
+        to 800 px) or "quality" (the 30 000 steps of Kerbl et al., up to 1600 px).
+      **changes: settings to change, as `TrainConfig.replace` takes them, such as
+        ``max_gaussians=50_000``.
 
     Raises:
-      InputError: if there is none of that name.
+      InputError: if the preset is unknown or a setting is out of range.
     """
     if name not in _PRESETS:
-        raise InputError(f"no preset is called {name!r}; known: {sorted(_PRESETS)}")
-    return _PRESETS[name]()
+        known = ", ".join(_PRESETS)
+        raise InputError(f"preset: expected one of {known}, got {name!r}")
+    return _PRESETS[name]().replace(**changes)
 
 
-_HALF = (Rates().means[0] / 2, Rates().means[1] / 2)  # the papers'
+_HALF = (Rates().means[0] / 2, Rates().means[1] / 2)
 
 
 def _fast() -> TrainConfig:
@@ -247,29 +280,23 @@ def _fast() -> TrainConfig:
         steps=1200,
         strategy="mcmc",
         max_size=400,
-        # One size of the photographs: a program more to compile is no faster in so few
-        # steps, and what dense points begin with is sharp.
+        # One resolution: a second program does not pay off in so few steps.
         initial="dense",
         dense_count=20_000,
         sh_degree=1,
         sh_every=375,
-        # Those of the papers are for 30 000 steps. So many times more than here, 25,
-        # are a walk √25 times as long, and rates of about that make up for it. What
-        # is held out swings with such rates, the more the more views there are, and so
-        # they fall early: from 60 % of the run on, a room of 120 views was 0.5 dB
-        # worse, and the demo 0.1 dB better. Dense
-        # points begin where they belong, half of it for the means, but with gaps
-        # between them, twice as much for the scales: bananas are at 25.5 dB after 100
-        # steps for 23.1. At the end that is 0.5 dB more on kermit and on the demo, and
-        # 0.2 dB less on bananas (benchmarks/training.py).
+        # The rates of the papers are for 30 000 steps. In a random walk, 25 times fewer
+        # steps need √25 times the rates. Such rates make the result fluctuate, so they
+        # fall early. Dense points are well placed (half the rate for the means) but
+        # leave gaps (twice the rate for the scales).
         rates=Rates(_HALF, log_scales=0.01, cooling=0.1, cooling_from=0.35).times(4.0),
-        # Edits set a run back for a while: few, and early enough to settle after.
+        # Each edit raises the loss for a while: few edits, none towards the end.
         adaptive=AdaptiveSettings(
             start=75,
             stop=600,
             every=75,
             reset_every=0,
-            # Without resets nothing else frees what hangs as fog before a few views.
+            # Without opacity resets, only the penalty removes fog before few views.
             scale_penalty=0.01,
             max_gaussians=30_000,
             initial_opacity=0.5,
@@ -291,13 +318,13 @@ def _default() -> TrainConfig:
         steps=4000,
         strategy="mcmc",
         max_size=800,
-        # No more: what is coarse costs by the Gaussian, not by the pixel.
+        # At coarse levels the cost grows with the Gaussians, not with the pixels.
         initial="dense",
         dense_count=20_000,
         levels=(Level(0.0, 2), Level(0.3, 1)),
         sh_degree=2,
         sh_every=600,
-        # As in `_fast`, for fewer steps than the papers'.
+        # Higher rates for fewer steps, as in `_fast`.
         rates=Rates(means=_HALF, cooling=0.1).times(2.0),
         adaptive=AdaptiveSettings(
             start=200, stop=2600, every=100, reset_every=0, max_gaussians=300_000

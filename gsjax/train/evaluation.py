@@ -1,4 +1,4 @@
-"""How well a scene shows the views that it was not trained on.
+"""PSNR and SSIM of a scene on held-out views.
 
 Axis legend: H W image.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from gsjax.cameras.camera import make_camera
 from gsjax.data.types import Photo, View
 from gsjax.gaussians import Gaussians
-from gsjax.raster.render import render_exact
+from gsjax.raster.exact import render_exact
 from gsjax.raster.types import RasterConfig
 from gsjax.runtime.devices import replicate
 from gsjax.train.metrics import psnr, ssim
@@ -22,17 +22,16 @@ LPIPS_NOTE = "unavailable: its weights are not part of gsjax"
 
 
 class ViewResult(NamedTuple):
-    """One view beside its photograph.
+    """Comparison of a render with its photograph.
 
     Attributes:
-      name: of the view.
-      psnr: dB, of the render clipped to [0, 1]; NaN, as is ``ssim``, where no pixel
-        counts.
-      ssim: see `gsjax.train.metrics.ssim`.
-      truth, render: [H, W, 3] float32; where the photograph is transparent it is over
-        the background.
-      depth: [H, W] expected camera z, 0 where nothing is.
-      valid: [H, W] bool, or None where every pixel counts.
+      name: name of the view.
+      psnr: PSNR in dB of the render, clipped to [0, 1]; NaN if all pixels are excluded.
+      ssim: see `gsjax.train.metrics.ssim`; NaN if all pixels are excluded.
+      truth: [H, W, 3] float32, the photograph over the background.
+      render: [H, W, 3] float32.
+      depth: [H, W] expected camera z, 0 in empty pixels.
+      valid: [H, W] bool, False for excluded pixels; None if all are valid.
     """
 
     name: str
@@ -45,13 +44,13 @@ class ViewResult(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """Means over the views of which any pixel counts.
+    """Means over the views that have valid pixels.
 
     Attributes:
-      views: how many.
-      psnr: dB; NaN of no views.
-      ssim: at most 1; NaN of no views.
-      lpips: why there is none.
+      views: number of views.
+      psnr: mean PSNR in dB; NaN without views.
+      ssim: mean SSIM, at most 1; NaN without views.
+      lpips: reason why LPIPS is unavailable.
     """
 
     views: int
@@ -73,30 +72,31 @@ def evaluate(
     config: RasterConfig | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Iterator[ViewResult]:
-    """Render each view at its photograph's size and compare.
+    """Render each view at the size of its photograph and compare them.
 
-    Photographs of other sizes than the largest are part of a larger picture while they
-    are rendered: one program is compiled for all.
+    Photographs of different sizes are padded to the largest, so that one program is
+    compiled for all.
 
     Args:
       gaussians: the scene.
-      views, photos: as many of one as of the other.
-      config: how to render.
-      background: [3] RGB behind the scene, and behind transparent photographs.
+      views: V views.
+      photos: V photographs, in the order of the views.
+      config: render settings.
+      background: [3] RGB behind the scene and behind transparent photographs.
 
     Yields:
-      One result for each view, as soon as it is there.
+      The result of each view, as soon as it is computed.
 
     Raises:
-      ValueError: if there are more of one than of the other.
+      ValueError: if the numbers of views and photographs differ.
       InputError: as `Photo.require`.
       CapacityError: as `render_exact`.
     """
     config = config or RasterConfig()
     config = config.replace(outputs=("rgb", "depth"), absgrad=False)
-    # One program for all that a training measures, however many are active by then.
-    room = config.visible_capacity or gaussians.capacity
-    config = config.replace(visible_capacity=room)
+    # Independent of the number of active Gaussians, so that a run compiles once.
+    visible = config.visible_capacity or gaussians.capacity
+    config = config.replace(visible_capacity=visible)
     behind = np.asarray(background, np.float32)
     gaussians = replicate(gaussians)
     for view, photo in zip(views, photos, strict=True):
@@ -113,23 +113,24 @@ def evaluate(
         )
         rows, cols = photo.pixels.shape[:2]
         size = jnp.asarray([cols, rows]) if len(sizes) > 1 else None
-        result = render_exact(gaussians, camera, config, jnp.asarray(behind), size=size)
+        camera = camera.replace(visible_size=size)
+        result = render_exact(gaussians, camera, config, jnp.asarray(behind))
         assert result.rgb is not None
         image = np.clip(np.asarray(result.rgb, np.float32)[:rows, :cols], 0, 1)
         truth, weight = _over(photo, behind), None
         if photo.valid is not None or len(sizes) > 1:
             weight = np.ones((rows, cols), np.float32)
             weight *= 1 if photo.valid is None else photo.valid
-        quality = likeness = np.nan
+        quality = similarity = np.nan
         if weight is None or weight.any():
-            room = (0, int(height) - rows), (0, int(width) - cols)
-            given = np.pad(image, (*room, (0, 0))), np.pad(truth, (*room, (0, 0)))
-            counted = None if weight is None else np.pad(weight, room)
-            quality, likeness = _scores(*given, counted)
+            padding = (0, int(height) - rows), (0, int(width) - cols)
+            images = [np.pad(a, (*padding, (0, 0))) for a in (image, truth)]
+            counted = None if weight is None else np.pad(weight, padding)
+            quality, similarity = _scores(*images, counted)
         yield ViewResult(
             name=view.name,
             psnr=float(quality),
-            ssim=float(likeness),
+            ssim=float(similarity),
             truth=truth,
             render=image,
             depth=np.asarray(result.depth, np.float32)[:rows, :cols],
@@ -138,7 +139,7 @@ def evaluate(
 
 
 def _over(photo: Photo, background: np.ndarray) -> np.ndarray:
-    """The photograph in [0, 1], over the background where it is transparent."""
+    """Return the photograph in [0, 1] over the background."""
     truth = photo.pixels.astype(np.float32) / 255
     if photo.alpha is None:
         return truth
@@ -147,7 +148,7 @@ def _over(photo: Photo, background: np.ndarray) -> np.ndarray:
 
 
 def summarise(results: Iterable[ViewResult]) -> Summary:
-    """Means of PSNR (dB) and SSIM over what `evaluate` gives; of no views NaN."""
+    """Return the means of PSNR (dB) and SSIM over the results of `evaluate`."""
     results = list(results)
     scores = np.array([(r.psnr, r.ssim) for r in results]).reshape(-1, 2)
     scores = scores[~np.isnan(scores).any(1)]

@@ -1,4 +1,4 @@
-"""Photographs on the device, and which of them a step looks at.
+"""Photographs on the device, and the views of each step.
 
 Axis legend: V views, H W image, B views of a step.
 """
@@ -21,41 +21,46 @@ Array = jax.Array
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=("pixels", "valid", "camera", "size"),
+    data_fields=("pixels", "valid", "camera", "size", "time"),
     meta_fields=(),
 )
 @dataclass(frozen=True)
 class Frames:
-    """All views of one resolution.
+    """Photographs of all views at one resolution.
 
     Attributes:
-      pixels: [V, H, W, 3 or 4] uint8; the fourth is the photograph's opacity.
-      valid: [V, H, W] bool, False where there is nothing to learn from; or None.
-      camera: batch of V.
-      size: [V, 2] int32, width and height of each photograph, which stands in the upper
-        left corner; None if all are as large as the frame.
+      pixels: [V, H, W, 3 or 4] uint8; the fourth channel is opacity.
+      valid: [V, H, W] bool, False for excluded pixels; None if all are valid.
+      camera: batch of V cameras.
+      size: [V, 2] int32, width and height of each photograph, which occupies the upper
+        left corner; None if all photographs have the size of the frame.
+      time: [V] `gsjax.data.types.View.time`.
     """
 
     pixels: Array
     valid: Array | None
     camera: Camera
     size: Array | None = None
+    time: Array | None = None
 
     @property
     def count(self) -> int:
-        """V."""
+        """Number of views V."""
         return self.pixels.shape[0]
 
 
 class Batch(NamedTuple):
-    """What one step sees.
+    """Photographs of one step.
 
     Attributes:
       pixels: [B, H, W, 3 or 4] uint8.
       valid: [B, H, W] bool or None.
-      camera: batch of B.
-      view: [B] int32, which of the V views these are.
+      camera: batch of B cameras.
+      view: [B] int32, indices of the views.
       size: [B, 2] int32 or None, see `Frames`.
+      time: [B] or None.
+      background: [3] colour behind the scene and transparent photographs; None is
+        black. The training step sets it.
     """
 
     pixels: Array
@@ -63,16 +68,23 @@ class Batch(NamedTuple):
     camera: Camera
     view: Array
     size: Array | None = None
+    time: Array | None = None
+    background: Array | None = None
+
+    @property
+    def transparent(self) -> bool:
+        """Whether the photographs have an opacity channel."""
+        return self.pixels.shape[-1] == 4
 
 
 def make_frames(
     views: Sequence[View], photos: Sequence[Photo], divisor: int = 1
 ) -> Frames:
-    """Photographs, ``divisor`` times smaller, in arrays of one size.
+    """Return photographs, downscaled by ``divisor``, padded to one size.
 
-    Smaller ones are padded on the right and below; those pixels are not valid.
+    Padding is on the right and bottom, and is not valid.
     """
-    small = [_shrunk(photo, divisor) for photo in photos]
+    small = [_downscale(photo, divisor) for photo in photos]
     height = max(p.pixels.shape[0] for p in small)
     width = max(p.pixels.shape[1] for p in small)
     with_alpha = any(p.alpha is not None for p in small)
@@ -97,11 +109,12 @@ def make_frames(
         None if valid.all() else valid,  # pyright: ignore
         camera,
         None if (size == (width, height)).all() else size,  # pyright: ignore
+        np.asarray([view.time for view in views], np.float32),  # pyright: ignore
     )
     return to_device(frames)
 
 
-def _shrunk(photo: Photo, divisor: int) -> Photo:
+def _downscale(photo: Photo, divisor: int) -> Photo:
     if divisor == 1:
         return photo
     cv2 = opencv()
@@ -117,7 +130,7 @@ def _shrunk(photo: Photo, divisor: int) -> Photo:
     scale = np.diag([size[0] / width, size[1] / height, 1.0])
     if photo.alpha is None:
         return Photo(area(photo.pixels), None, valid, scale @ photo.K)
-    # Colours count as much as they are seen: what is transparent has none.
+    # Premultiplied: the colour of transparent pixels is undefined.
     weight = photo.alpha.astype(np.float32)[..., None]
     alpha = area(weight)
     colors = area(photo.pixels * weight) / np.where(alpha > 0, alpha, 1)[..., None]
@@ -126,21 +139,46 @@ def _shrunk(photo: Photo, divisor: int) -> Photo:
 
 
 def views_of_step(seed: int, step: int, batch: int, views: int) -> np.ndarray:
-    """Which views [B] a step looks at: each once an epoch, in an order of its own.
+    """Return the views [B] int32 of a step: random order, each view once per epoch.
 
-    Depends on nothing but its arguments, so that a run that is resumed sees what it
-    would have seen. On the host: a permutation takes XLA half a second to compile.
+    The result depends on the arguments only, so that a resumed run sees the same views.
+    It is computed on the host because XLA compiles a permutation slowly.
+
+    Args:
+      seed: of the run.
+      step: number of completed steps.
+      batch: B.
+      views: number of views V.
     """
 
     def one(number: int) -> int:
         epoch, place = divmod(number, views)
         return np.random.default_rng((seed, epoch)).permutation(views)[place]
 
-    first = int(step) * batch  # `TrainState.step` is an array
+    first = int(step) * batch  # step may be an array
     return np.asarray([one(first + i) for i in range(batch)], np.int32)
 
 
 def draw(frames: Frames, view: Array) -> Batch:
-    """The views [B] of one step."""
+    """Return the photographs of the views [B]."""
     drawn = jax.tree.map(lambda a: a[view], frames)
-    return Batch(drawn.pixels, drawn.valid, drawn.camera, view, drawn.size)
+    return Batch(drawn.pixels, drawn.valid, drawn.camera, view, drawn.size, drawn.time)
+
+
+def targets(batch: Batch, dtype) -> tuple[Array, Array | None]:
+    """Return the photographs over the background of a step, and pixel weights.
+
+    Args:
+      batch: of B views.
+      dtype: of the result.
+
+    Returns:
+      Images [B, H, W, 3] in [0, 1]; weights [B, H, W], 0 for excluded pixels, or None.
+    """
+    values = batch.pixels.astype(dtype) / 255
+    rgb = values[..., :3]
+    if batch.transparent:
+        alpha = values[..., 3:]
+        behind = 0 if batch.background is None else batch.background
+        rgb = rgb * alpha + behind * (1 - alpha)
+    return rgb, None if batch.valid is None else batch.valid.astype(dtype)

@@ -1,7 +1,4 @@
-"""Whether there is anything to learn, and whether a run still learns it.
-
-Both are looked at on the host, and neither changes a bit of what is computed.
-"""
+"""Checks of the inputs of a run, and detection of divergence; on the host."""
 
 import warnings
 from collections import deque
@@ -15,98 +12,105 @@ from gsjax.data.types import Dataset, Photo
 from gsjax.errors import DivergedError, InputError
 from gsjax.train.state import Metrics
 
+# The usual causes of an empty view.
+POSE_HINT = (
+    "poses may be inverted (camera → world instead of world → camera) or in OpenGL "
+    "axes (y up, z backward): invert them, or flip their y and z axes"
+)
 _MAX_BAD_STEPS = 50
 _SAMPLED = 20_000
-_LOST = "nothing of the scene was in view"
-# A loss above it is not that of photographs of nothing.
-_SOMETHING = 0.01
+_NOT_IN_VIEW = "no Gaussian was in view"
+# Photographs of empty space have a lower loss.
+_EMPTY_LOSS = 0.01
 
 
-def is_seen(photo: Photo) -> bool:
-    """Whether any pixel of a photograph counts."""
+def has_valid_pixels(photo: Photo) -> bool:
+    """Return whether any pixel of a photograph is valid."""
     return photo.valid is None or bool(photo.valid.any())
 
 
-def check_photos(scene: Dataset, photos: Sequence[Photo]) -> None:
-    """Warn of photographs that are masked altogether.
+def check_photos(dataset: Dataset, photos: Sequence[Photo]) -> None:
+    """Check photographs before training; warn of those that are masked completely.
 
     Raises:
-      InputError: if all are, or there is not one for each view, or one has pixels of
-        another kind than `Photo` says.
+      InputError: if all are masked, their number is not that of the views, or one does
+        not have the shapes and dtypes of `Photo`.
     """
-    if len(photos) != len(scene.views) or not photos:
+    if len(photos) != len(dataset.views) or not photos:
         raise InputError(
-            f"{len(photos)} photos for {len(scene.views)} views; one for each is wanted"
+            f"photos: expected one for each of {len(dataset.views)} views, got "
+            f"{len(photos)}; load them with load_photos(dataset.views)"
         )
-    for view, photo in zip(scene.views, photos):
+    for view, photo in zip(dataset.views, photos):
         photo.require(view.name)
-    masked = [v.name for v, photo in zip(scene.views, photos) if not is_seen(photo)]
+    masked = [
+        v.name for v, photo in zip(dataset.views, photos) if not has_valid_pixels(photo)
+    ]
     if len(masked) == len(photos):
         raise InputError(
-            f"{scene.source}: no pixel is left to learn from: all {len(photos)} "
-            "photographs are masked altogether; black is what a mask leaves out: "
-            "invert the masks, or remove them"
+            f"{dataset.source}: expected photographs with valid pixels, got "
+            f"{len(photos)} that are masked completely; invert the masks (black is "
+            "excluded) or remove them"
         )
     if masked:
         warnings.warn(
-            f"{scene.source}: {len(masked)} of {len(photos)} photographs are masked "
-            f"altogether and teach nothing: {', '.join(masked[:3])}",
+            f"{dataset.source}: {len(masked)} of {len(photos)} photographs are masked "
+            f"completely and are not used: {', '.join(masked[:3])}",
             UserWarning,
             stacklevel=2,
         )
 
 
-def check_points(scene: Dataset) -> None:
-    """See that points lie before cameras, and not too near to be drawn.
+def check_points(dataset: Dataset) -> None:
+    """Check that points are in front of cameras, beyond the near plane.
 
-    Warns where half of those that lie before a camera are too near to it.
+    Warns if more than half of those in front are nearer than the near plane.
 
     Raises:
-      InputError: if no camera sees one: such Gaussians would never be drawn, nor
-        move; or if there are none.
+      InputError: if there are no points, or none can be drawn by any camera, so that
+        the Gaussians would have no gradient.
     """
-    require_points(scene)
-    points, views = scene.points, scene.views
-    found = _depths(scene, points[:: 1 + len(points) // _SAMPLED])
-    if not found.drawn:  # by those of a sample; all decide
-        found = _depths(scene, points)
+    require_points(dataset)
+    points, views = dataset.points, dataset.views
+    found = _depths(dataset, points[:: 1 + len(points) // _SAMPLED])
+    if not found.drawn:  # in the sample
+        found = _depths(dataset, points)
     near = max(view.near for view in views)
-    unit = "are points and poses in one unit of length?"
+    unit = "points and poses may have different units"
     if not found.before:
         raise InputError(
-            f"{scene.source}: all {len(points):,} points lie behind all {len(views)} "
-            "cameras; are the poses camera → world where world → camera is wanted, or "
-            "their axes others? Mend the dataset, or start from random points "
-            "(--initial random)"
+            f"{dataset.source}: expected points in front of the cameras, got all "
+            f"{len(points):,} behind all {len(views)}; {POSE_HINT}, or start from "
+            "random points (--initial random)"
         )
     if not found.drawn:
         raise InputError(
-            f"{scene.source}: no point is farther than {found.farthest:.2g} from a "
-            f"camera, and what is nearer than {near:.2g} is not drawn; {unit} Mend "
-            "the dataset, or start from random points (--initial random)"
+            f"{dataset.source}: expected points beyond the near plane {near:.2g}, got "
+            f"depths of at most {found.farthest:.2g}; {unit}: fix the dataset, or "
+            "start from random points (--initial random)"
         )
     if found.drawn < found.before / 2:
         share = 1 - found.drawn / found.before
         warnings.warn(
-            f"{scene.source}: {share:.0%} of the points before a camera are nearer to "
-            f"it than {near:.2g}, and not drawn; {unit}",
+            f"{dataset.source}: {share:.0%} of the points in front of a camera are "
+            f"nearer than the near plane {near:.2g} and not drawn; {unit}",
             UserWarning,
             stacklevel=2,
         )
 
 
-def check_in_view(scene: Dataset, means: np.ndarray, source: str) -> None:
-    """See that some of the Gaussians that a run is to start from are in a picture.
+def check_in_view(dataset: Dataset, means: np.ndarray, source: str) -> None:
+    """Check that a mean of the initial Gaussians is inside a view.
 
     Args:
-      scene: its views.
-      means: [N, 3] in the scene's coordinates.
-      source: where they are from.
+      dataset: with the views.
+      means: [N, 3] in the coordinates of the dataset.
+      source: file of the Gaussians, for messages.
 
     Raises:
-      InputError: if the centre of none is: they are no scene of these photographs.
+      InputError: if no mean is in any view.
     """
-    for view in scene.views:
+    for view in dataset.views:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             x, y, z = view.viewmat[:3, :3] @ means.T + view.viewmat[:3, 3:]
             u, v, _ = view.K @ np.stack([x / z, y / z, np.ones_like(z)])
@@ -114,26 +118,25 @@ def check_in_view(scene: Dataset, means: np.ndarray, source: str) -> None:
         if np.any(inside & (v >= 0) & (v <= view.height)):
             return
     raise InputError(
-        f"{source}: none of its {len(means):,} Gaussians is in the view of any of the "
-        f"{len(scene.views)} cameras of {scene.source}; a scene of this dataset is "
-        "wanted, in its coordinates"
+        f"{source}: expected a scene in the coordinates of {dataset.source}, got none "
+        f"of {len(means):,} Gaussians in any of {len(dataset.views)} views; pass one "
+        "that was trained on this dataset"
     )
 
 
 class _Depths(NamedTuple):
-    """Of points in all views: how many lie before the camera, how many of them far
-    enough to be drawn, and how far the farthest is."""
+    """Points in all views: number in front, number beyond near, largest depth."""
 
     before: int
     drawn: int
     farthest: float
 
 
-def _depths(scene: Dataset, points: np.ndarray) -> _Depths:
+def _depths(dataset: Dataset, points: np.ndarray) -> _Depths:
     before, drawn, farthest = 0, 0, 0.0
-    for view in scene.views:
+    for view in dataset.views:
         depth = points @ view.viewmat[2, :3] + view.viewmat[2, 3]
-        depth = depth[depth > 0]  # and no NaN
+        depth = depth[depth > 0]  # removes NaN
         before += len(depth)
         drawn += int((depth > view.near).sum())
         farthest = max(farthest, depth.max(initial=0))
@@ -141,43 +144,55 @@ def _depths(scene: Dataset, points: np.ndarray) -> _Depths:
 
 
 class Health:
-    """Counts the steps that did a run no good.
+    """Counter of failed steps, which stops runs that diverge.
 
     Attributes:
-      bad: that many in a row, up to now.
+      bad: number of failed steps in a row.
     """
 
     def __init__(self, steps: int):
         self.bad = 0
-        # A short run has an end before so many have come together.
+        self._warned = False
+        # Half of a short run, which ends before 50 failures.
         self._limit = min(_MAX_BAD_STEPS, max(1, steps // 2))
-        self._lately = deque[bool](maxlen=2 * _MAX_BAD_STEPS)
+        self._recent = deque[bool](maxlen=2 * _MAX_BAD_STEPS)
 
-    def look(self, metrics: Metrics) -> None:
-        """Take a step into account.
+    def check(self, metrics: Metrics) -> None:
+        """Record a step; warn once if no Gaussian is in view.
 
         Raises:
-          DivergedError: at the last of too many bad ones.
+          DivergedError: if too many steps failed.
         """
         fault = self._fault(metrics)
         self.bad = 0 if fault is None else self.bad + 1
-        lost = fault == _LOST
-        self._lately.append(fault is not None and not lost)
-        count, limit, span = sum(self._lately), self._limit, len(self._lately)
-        if lost:  # some views may show nothing of a scene that others show
+        lost = fault == _NOT_IN_VIEW
+        self._recent.append(fault is not None and not lost)
+        count, limit, span = sum(self._recent), self._limit, len(self._recent)
+        if lost:
+            self._warn(metrics)
+            # Some views may show nothing of a scene that others show.
             count, limit, span = self.bad, _MAX_BAD_STEPS, self.bad
         if fault and count >= limit:
             raise DivergedError(
                 f"{fault} in {count} of the last {span} steps, up to step "
-                f"{int(metrics.step)}; look for a photograph or a pose that is off, or "
-                "train anew with lower rates (TrainConfig.rates)"
+                f"{int(metrics.step)}; check the photographs and poses, or train again "
+                "with lower rates (TrainConfig.rates)"
+            )
+
+    def _warn(self, metrics: Metrics) -> None:
+        if not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"training step {int(metrics.step)}: {_NOT_IN_VIEW}; {POSE_HINT}",
+                UserWarning,
+                stacklevel=4,
             )
 
     def _fault(self, metrics: Metrics) -> str | None:
         if not metrics.finite:
             return "the loss, its gradient or a Gaussian was not finite"
-        if metrics.psnr < 0:  # an error above 1, of colours from 0 to 1
-            return "the picture was farther from the photograph than any can be"
-        if metrics.pairs == 0 and metrics.loss > _SOMETHING:
-            return _LOST
+        if metrics.psnr < 0:  # a larger error than between any two images in [0, 1]
+            return "the PSNR was below 0 dB"
+        if metrics.pairs == 0 and metrics.loss > _EMPTY_LOSS:
+            return _NOT_IN_VIEW
         return None

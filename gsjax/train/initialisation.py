@@ -1,4 +1,4 @@
-"""What a run starts from: points, Gaussians, and a state before the first step."""
+"""Initial points, Gaussians and state of a run."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,112 +16,117 @@ from gsjax.math.sh import num_bases
 from gsjax.train.capacity_policy import slots_for
 from gsjax.train.config import TrainConfig
 from gsjax.train.health import check_points
-from gsjax.train.state import TrainState, init_state
+from gsjax.train.setup import Setup, make_setup
+from gsjax.train.state import TrainState, setup_state
 
-_LEAST_FOUND = 1000
+_MIN_FOUND = 1000
 
 
-def resolve_initial(scene: Dataset, config: TrainConfig) -> TrainConfig:
-    """The same settings, with "auto" of `TrainConfig.initial` decided for this scene.
+def resolve_initial(dataset: Dataset, config: TrainConfig) -> TrainConfig:
+    """Return the settings with "auto" of `TrainConfig.initial` resolved.
 
     Raises:
-      InputError: if it is to start from its points, and has none, or none before any
-        camera.
+      InputError: if the run is to start from points and the dataset has none, or none
+        in front of a camera.
     """
     if config.initial == "auto":
-        config = config.replace(initial="points" if has_points(scene) else "random")
-    dense = config.initial == "dense" and has_points(scene)
+        config = config.replace(initial="points" if has_points(dataset) else "random")
+    dense = config.initial == "dense" and has_points(dataset)
     if config.initial == "points" or dense:
-        check_points(scene)
+        check_points(dataset)
     return config
 
 
 def add_dense_points(
-    scene: Dataset, photos: Sequence[Photo], config: TrainConfig
+    dataset: Dataset, photos: Sequence[Photo], config: TrainConfig
 ) -> Dataset:
-    """The scene with more points, where `TrainConfig.initial` is "dense".
+    """Return the dataset with matched points if `TrainConfig.initial` is "dense".
 
-    Fewer than a thousand, where so many are wanted, are left out if the scene has none
-    of its own: random ones are the better start then.
+    If fewer than 1000 points are found and the dataset has none of its own, it is
+    returned unchanged, since random points are then the better start.
 
     Raises:
-      InputError: if there is not one photo for each view.
-      MissingExtraError: if OpenCV is absent.
+      InputError: if the number of photographs is not that of the views.
+      MissingExtraError: if OpenCV is not installed.
     """
     if config.initial != "dense" or config.dense_count == 0:
-        return scene
-    found = find_points(scene, photos, config.dense_count, seed=config.seed)
-    too_few = len(found.points) < min(_LEAST_FOUND, config.dense_count)
-    if too_few and not has_points(scene):
-        return scene
+        return dataset
+    found = find_points(dataset, photos, config.dense_count, seed=config.seed)
+    too_few = len(found.points) < min(_MIN_FOUND, config.dense_count)
+    if too_few and not has_points(dataset):
+        return dataset
     return replace(
-        scene,
-        points=np.concatenate([scene.points, found.points]),
-        colors=np.concatenate([scene.colors, found.colors]),
+        dataset,
+        points=np.concatenate([dataset.points, found.points]),
+        colors=np.concatenate([dataset.colors, found.colors]),
     )
 
 
 def initial_state(
-    scene: Dataset, config: TrainConfig, gaussians: Gaussians | None = None
+    dataset: Dataset,
+    config: TrainConfig,
+    gaussians: Gaussians | None = None,
+    setup: Setup | None = None,
 ) -> TrainState:
-    """A run on this scene before its first step.
+    """Return the state of a run before its first step.
 
     Args:
-      scene: from `add_dense_points`, if more points than the dataset's are wanted.
-      config: the settings; for Gaussians that were trained before, see
+      dataset: from `add_dense_points`, to start from dense points.
+      config: settings; for trained Gaussians, see
         `gsjax.train.config.continuation_config`.
-      gaussians: to start from, in the scene's coordinates, instead of what
-        `TrainConfig.initial` says. Bands of their harmonics are cut, or added as zeros.
+      gaussians: initial Gaussians in the coordinates of the dataset, instead of those
+        of `TrainConfig.initial`. Their SH degree is adapted to the settings.
+      setup: parts of the training step; default those of ``config``.
 
     Raises:
-      InputError: as `resolve_initial`; if there are no such Gaussians, or more than there
-        may be.
+      InputError: as `resolve_initial`; if ``gaussians`` holds none, or more than the
+        maximum.
     """
-    extent, views = extent_of(scene), len(scene.views)
+    setup = setup or make_setup(config, extent_of(dataset))
+    views = len(dataset.views)
     if gaussians is not None:
-        return _begun(_with_slots(gaussians, config), config, extent, views)
-    config = resolve_initial(scene, config)
-    drawn = config.initial == "random" or not has_points(scene)
+        return _jitted_state(setup, _with_slots(gaussians, setup), views)
+    config = resolve_initial(dataset, config)
+    drawn = config.initial == "random" or not has_points(dataset)
     gaussians = init_gaussians(
-        scene,
+        dataset,
         sh_degree=config.sh_degree,
-        opacity=config.chosen.initial_opacity,
-        scale=config.chosen.initial_scale,
-        max_count=min(config.max_initial, config.max_gaussians),
+        opacity=config.strategy_settings.initial_opacity,
+        scale=config.strategy_settings.initial_scale,
+        max_count=min(config.max_initial, setup.schedule.max_gaussians),
         random_count=config.initial_count if drawn else None,
-        capacity=lambda count: slots_for(count, 0, config),
+        capacity=lambda count: slots_for(count, 0, config, setup.schedule),
         seed=config.seed,
     )
-    return _begun(gaussians, config, extent, views)
+    return _jitted_state(setup, gaussians, views)
 
 
-def _with_slots(gaussians: Gaussians, config: TrainConfig) -> Gaussians:
-    """The same, of the run's degree, in as many slots as it begins with."""
-    count, most = int(np.sum(gaussians.active)), config.max_gaussians
+def _with_slots(gaussians: Gaussians, setup: Setup) -> Gaussians:
+    """Return Gaussians with the SH degree and the initial capacity of a run."""
+    config, schedule = setup.config, setup.schedule
+    count, most = int(np.sum(gaussians.active)), schedule.max_gaussians
     if not 1 <= count <= most:
         raise InputError(
-            f"{count:,} Gaussians to start from; 1 to {most:,} are wanted "
-            "(max_gaussians, --max-gaussians)"
+            f"initial Gaussians: expected 1 to {most:,}, got {count:,}; raise the "
+            "maximum (max_gaussians, --max-gaussians), or remove some"
         )
     gaussians = with_sh_degree(gaussians, config.sh_degree)
-    return compact(gaussians, slots_for(count, 0, config))
+    return compact(gaussians, slots_for(count, 0, config, schedule))
 
 
-def _begun(
-    gaussians: Gaussians, config: TrainConfig, extent: float, views: int
-) -> TrainState:
-    """`init_state` by one program, instead of one for each kind of array."""
-    return jax.jit(lambda scene: init_state(scene, config, extent, views))(gaussians)
+def _jitted_state(setup: Setup, gaussians: Gaussians, views: int) -> TrainState:
+    """Return `setup_state`, compiled as one program instead of one per array."""
+    return jax.jit(lambda scene: setup_state(setup, scene, views))(gaussians)
 
 
 def empty_state(
     config: TrainConfig, extent: float, views: int, capacity: int
 ) -> TrainState:
-    """The shapes of a run with this many slots, for reading a checkpoint into."""
+    """Return a state of the given capacity, as a template for reading a checkpoint."""
     numbers = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1}
     gaussians = make_gaussians(
         **{name: np.zeros((0, count)) for name, count in numbers.items()},
         sh=np.zeros((0, num_bases(config.sh_degree), 3)),
         capacity=capacity,
     )
-    return _begun(gaussians, config, extent, views)
+    return _jitted_state(make_setup(config, extent), gaussians, views)

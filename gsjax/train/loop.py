@@ -1,7 +1,4 @@
-"""The loop around the step: resolution, and what is compiled when.
-
-Runs on the host and in memory; files are the business of `gsjax.runs.run`.
-"""
+"""Training loop on the host: resolutions, capacities and compilation."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -14,12 +11,13 @@ import numpy as np
 
 from gsjax.data.extent import extent_of
 from gsjax.data.types import Dataset, Photo
+from gsjax.densify.types import Strategy
 from gsjax.errors import CapacityError
 from gsjax.gaussians import Gaussians
 from gsjax.raster.types import RasterConfig
 from gsjax.train.capacity_policy import (
     pairs_for,
-    roomy_pairs,
+    with_margin,
     with_slots,
     with_slots_ahead,
 )
@@ -27,21 +25,24 @@ from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Frames, make_frames, views_of_step
 from gsjax.train.health import Health, check_photos
 from gsjax.train.initialisation import add_dense_points, initial_state
+from gsjax.train.losses import LossTerm
+from gsjax.train.models import Model
+from gsjax.train.setup import Setup, make_setup
 from gsjax.train.state import Metrics, TrainState
 from gsjax.train.step_compiler import CompiledStep, StepCompiler
 from gsjax.train.visibility_pruning import prune_invisible
 
 
 class Progress(NamedTuple):
-    """What the loop tells after each step.
+    """Progress of a run after a step.
 
     Attributes:
-      metrics: of the step, on the host.
-      seconds: since the start of this call, compilation included.
-      compile_seconds: of those, spent compiling before a step could begin.
-      compilations: sizes that a step was compiled for so far.
-      divisor: how much smaller the images are.
-      capacity: slots.
+      metrics: metrics of the step, on the host.
+      seconds: time since the call of `fit`, including compilation.
+      compile_seconds: part of it that was spent waiting for compilation.
+      compilations: number of sizes that a step was compiled for.
+      divisor: divisor of the image size.
+      capacity: number of slots.
     """
 
     metrics: Metrics
@@ -52,7 +53,7 @@ class Progress(NamedTuple):
     capacity: int
 
     def record(self) -> dict[str, float | int | bool]:
-        """As plain numbers, for a line of `metrics.jsonl`."""
+        """Return plain numbers, for a line of `metrics.jsonl`."""
         out = {k: np.asarray(v).item() for k, v in self.metrics._asdict().items()}
         rest = {k: v for k, v in self._asdict().items() if k != "metrics"}
         rounded = {
@@ -63,18 +64,18 @@ class Progress(NamedTuple):
 
 @dataclass
 class Hooks:
-    """What a caller may want to know or do; each is called on the host.
+    """Callbacks of a run, called on the host.
 
     Attributes:
-      step: after each step.
-      phase: before something that takes a while, with what it is.
-      checkpoint: every ``config.every_checkpoint`` steps, unless something is wrong
-        just then: state, pair capacity, and the record of that step.
-      measure: every ``config.every_eval`` steps, before the checkpoint where both are
-        due: state and record; the time that it takes does not count.
-      stop: asked after each step; True ends the run there.
-      state: after each step, with the state, whose memory the next step takes over:
-        copy what is to last.
+      step: called after each step.
+      phase: called before long operations, with a description.
+      checkpoint: called every ``config.every_checkpoint`` steps, unless the last step
+        failed, with state, pair capacity and progress.
+      measure: called every ``config.every_eval`` steps, before a checkpoint of the same
+        step, with state and progress; its time is not counted.
+      stop: called after each step; True ends the run.
+      state: called after each step, with state and progress. The next step donates the
+        state: copy what is kept.
     """
 
     step: Callable[[Progress], None] = lambda _: None
@@ -87,13 +88,13 @@ class Hooks:
 
 @dataclass
 class FitResult:
-    """What a run came to.
+    """Result of a run.
 
     Attributes:
-      state: after the last step.
-      pair_capacity: what the last step used.
-      progress: of the last step, or None if there was none to do.
-      dropped: Gaussians removed after it, as `TrainConfig.prune_invisible` says.
+      state: state after the last step.
+      pair_capacity: pair capacity of the last step.
+      progress: of the last step; None if no step was made.
+      dropped: number of Gaussians removed afterwards by `TrainConfig.prune_invisible`.
     """
 
     state: TrainState
@@ -103,53 +104,67 @@ class FitResult:
 
     @property
     def gaussians(self) -> Gaussians:
-        """The scene."""
+        """The scene; with a scene model, its canonical Gaussians."""
         return self.state.gaussians
 
 
 def fit(
-    scene: Dataset,
+    dataset: Dataset,
     photos: Sequence[Photo],
     config: TrainConfig,
     *,
     state: TrainState | None = None,
     pair_capacity: int | None = None,
     hooks: Hooks | None = None,
+    strategy: Strategy | None = None,
+    loss_terms: Sequence[LossTerm] = (),
+    model: Model | None = None,
 ) -> FitResult:
-    """Train.
+    """Train Gaussians on the photographs of a dataset.
 
-    The same arguments give the same bits on a CPU with as many devices, also when a run
-    is taken up again from the state and pair capacity that a checkpoint kept.
+    On a CPU, equal arguments and an equal number of devices give equal bits, also if
+    the run is resumed from a state and pair capacity that a checkpoint kept. Warns once
+    if no Gaussian is in view of a photograph that is not empty.
 
     Args:
-      scene: its views are trained on, all of them.
-      photos: one for each view, as `load_photo` gives them.
-      config: the settings.
-      state: go on from there; default `initial_state`.
-      pair_capacity: of that state's run.
-      hooks: see `Hooks`.
+      dataset: views to train on; all of them are used.
+      photos: one for each view, from `load_photos`.
+      config: settings.
+      state: state to resume from, of the same settings, strategy and model; default
+        `initial_state`.
+      pair_capacity: of the run that ``state`` is from.
+      hooks: callbacks.
+      strategy: density control; default that of ``config``.
+      loss_terms: terms added to the photometric loss and the strategy's penalty.
+      model: scene model; by default the Gaussians are rendered as they are.
 
     Returns:
-      The state after the last step, and what it needed; the scene is ``.gaussians``.
+      The state after the last step; the scene is ``.gaussians``.
 
     Raises:
-      InputError: if photos and views do not match, or there is nothing to start from,
-        or to learn from.
-      CapacityError: if a view wants more pairs than can be addressed, or a step more
-        memory than there is (see `gsjax.runtime.memory`); what was learnt until then has gone
-        to ``hooks.checkpoint``.
-      DivergedError: if in 50 of the last 100 steps, or half of a short run, numbers
-        are not finite or pictures worse than any can be; or in 50 running nothing is
-        in view.
+      InputError: if photographs and views do not match, all pixels are masked, or there
+        are no initial Gaussians.
+      CapacityError: if a view needs more pairs than can be addressed, or a step more
+        memory than is available. Before, the state is passed to ``hooks.checkpoint``.
+      DivergedError: if 50 of the last 100 steps, or half of a short run, had non-finite
+        numbers or a PSNR below 0 dB; or if no Gaussian was in view for 50 steps.
     """
-    check_photos(scene, photos)
-    run = _Run(scene, photos, config, hooks or Hooks())
+    check_photos(dataset, photos)
+    setup = make_setup(
+        config,
+        extent_of(dataset),
+        strategy=strategy,
+        loss_terms=loss_terms,
+        model=model,
+    )
+    run = _Run(dataset, photos, setup, hooks or Hooks())
     if state is None:
         if config.initial == "dense":
-            run.hooks.phase("looking for points on which the photographs agree")
-        state = initial_state(add_dense_points(scene, photos, config), config)
-    else:  # a step takes the state's memory over: not the caller's
-        state = _copied(state)
+            run.hooks.phase("matching points between the photographs")
+        dense = add_dense_points(dataset, photos, config)
+        state = initial_state(dense, config, setup=setup)
+    else:
+        state = _copied(state)  # steps donate their state, not that of the caller
     own: TrainState = run.compiler.place(state)
     try:
         return run.loop(own, pair_capacity)
@@ -164,82 +179,100 @@ def _copied(state: TrainState) -> TrainState:
 
 @dataclass
 class _Run:
-    """One call of `fit`."""
+    """A call of `fit`."""
 
-    scene: Dataset
+    dataset: Dataset
     photos: Sequence[Photo]
-    config: TrainConfig
+    setup: Setup
     hooks: Hooks
     start: float = field(default_factory=time.perf_counter)
     compile_seconds: float = 0.0
 
     def __post_init__(self):
-        extent, phase = extent_of(self.scene), self.hooks.phase
-        self.compiler = StepCompiler(self.config, extent, phase)
+        self.config = self.setup.config
+        self.health = Health(self.config.steps)
+        self.compiler = StepCompiler(self.setup, self.hooks.phase)
 
     def loop(self, state: TrainState, pair_capacity: int | None) -> FitResult:
-        config, hooks = self.config, self.hooks
-        step, health = int(state.step), Health(config.steps)
-        divisor = config.divisor(max(step - 1, 0))  # of the step before
+        """Run all remaining steps."""
+        config, schedule = self.config, self.setup.schedule
+        step, pairs = int(state.step), pair_capacity
+        divisor = config.divisor(max(step - 1, 0))  # of the previous step
         frames, progress = None, None
         while step < config.steps:
             finer = config.divisor(step) != divisor
             if frames is None or finer:
                 divisor = config.divisor(step)
-                frames = make_frames(self.scene.views, self.photos, divisor)
+                frames = make_frames(self.dataset.views, self.photos, divisor)
                 frames = self.compiler.place(frames)
             try:
-                if pair_capacity is None or finer:
-                    begun = time.perf_counter()
-                    if finer:
-                        state = with_slots_ahead(state, config)
-                    pair_capacity = pairs_for(state, frames, config)
-                    self.compile_seconds += time.perf_counter() - begun
-                raster = config.raster.replace(pair_capacity=pair_capacity)
+                if finer:
+                    state = with_slots_ahead(state, config, schedule)
+                if pairs is None or finer:
+                    pairs = self.pairs_for(state, frames)
+                raster = config.raster.replace(pair_capacity=pairs)
                 program = self.program(state, frames, raster)
                 view = views_of_step(config.seed, step, config.batch, frames.count)
                 state, metrics = program(state, frames, view)
                 if metrics.overflowed:
-                    state = with_slots_ahead(state, config)
+                    state = with_slots_ahead(state, config, schedule)
                     wanted = int(metrics.pair_capacity)
-                    pair_capacity = roomy_pairs(wanted, state, config)
+                    pairs = with_margin(wanted, state, config, schedule)
                     continue
             except CapacityError:
-                # Nothing that was learnt is lost, unless it is worth nothing.
-                if progress is not None and not health.bad:
-                    hooks.checkpoint(state, pair_capacity or 0, progress)
+                if progress is not None and not self.health.bad:
+                    self.hooks.checkpoint(state, pairs or 0, progress)
                 raise
             step = int(metrics.step)
             progress = self.progress(metrics, divisor, state)
-            health.look(metrics)
-            hooks.step(progress)
-            hooks.state(state, progress)
-            slots = state.gaussians.capacity
-            state = with_slots(state, int(metrics.wanted), config)
-            if state.gaussians.capacity > slots:  # a new program: with more pairs too
-                wanted = int(metrics.pair_capacity)
-                roomy = roomy_pairs(wanted, state, config)
-                pair_capacity = max(pair_capacity, roomy)
-            # The last is measured and saved by the caller, with what else ends a run.
-            every = config.every_eval
-            if every and step % every == 0 and step < config.steps:
-                begun = time.perf_counter()
-                hooks.measure(state, progress)
-                self.start += time.perf_counter() - begun
-            # After it: a run that goes on from there does not measure that step again.
-            every = config.every_checkpoint
-            due = every and step % every == 0 and step < config.steps
-            if due and not health.bad:  # what is lost is not to push out what is not
-                hooks.checkpoint(state, pair_capacity, progress)
-            if hooks.stop():
+            self.health.check(metrics)
+            self.hooks.step(progress)
+            self.hooks.state(state, progress)
+            state, pairs = self.grown(state, metrics, pairs)
+            self.report(state, pairs, progress)
+            if self.hooks.stop():
                 break
         dropped = 0
         if step >= config.steps and frames is not None and config.prune_invisible:
-            extent = extent_of(self.scene)
-            state, dropped = prune_invisible(state, frames, config, extent)
-        return FitResult(state, pair_capacity or 0, progress, dropped)
+            state, dropped = prune_invisible(state, frames, self.setup)
+        return FitResult(state, pairs or 0, progress, dropped)
+
+    def pairs_for(self, state: TrainState, frames: Frames) -> int:
+        """Return the pair capacity for new photographs."""
+        begun = time.perf_counter()
+        pairs = pairs_for(state, frames, self.config, self.setup.schedule)
+        self.compile_seconds += time.perf_counter() - begun
+        return pairs
+
+    def grown(
+        self, state: TrainState, metrics: Metrics, pairs: int
+    ) -> tuple[TrainState, int]:
+        """Return the state with the slots that it needs, and its pair capacity."""
+        config, schedule = self.config, self.setup.schedule
+        slots = state.gaussians.capacity
+        state = with_slots(state, int(metrics.wanted), config, schedule)
+        if state.gaussians.capacity > slots:  # recompiles: with more pairs too
+            wanted = int(metrics.pair_capacity)
+            pairs = max(pairs, with_margin(wanted, state, config, schedule))
+        return state, pairs
+
+    def report(self, state: TrainState, pairs: int, progress: Progress) -> None:
+        """Call the hooks that are due after a step; the caller handles the last one."""
+        step, config = int(progress.metrics.step), self.config
+        if step >= config.steps:
+            return
+        if config.every_eval and step % config.every_eval == 0:
+            begun = time.perf_counter()
+            self.hooks.measure(state, progress)
+            self.start += time.perf_counter() - begun
+        # After the measurement: a resumed run does not repeat it. A failed state is not
+        # saved, since it would displace a good one.
+        every = config.every_checkpoint
+        if every and step % every == 0 and not self.health.bad:
+            self.hooks.checkpoint(state, pairs, progress)
 
     def progress(self, metrics: Metrics, divisor: int, state: TrainState) -> Progress:
+        """Return the progress after a step."""
         return Progress(
             metrics=metrics,
             seconds=time.perf_counter() - self.start,
@@ -252,13 +285,13 @@ class _Run:
     def program(
         self, state: TrainState, frames: Frames, raster: RasterConfig
     ) -> CompiledStep:
-        """The compiled step for these sizes."""
+        """Return the compiled step for these sizes."""
         begun = time.perf_counter()
         step = self.compiler.step(state, frames, raster)
         self.compile_seconds += time.perf_counter() - begun
         return step
 
 
-def subset(scene: Dataset, indices: Sequence[int]) -> Dataset:
-    """The scene with some of its views, by their indices, in this order."""
-    return replace(scene, views=tuple(scene.views[i] for i in indices))
+def subset(dataset: Dataset, indices: Sequence[int]) -> Dataset:
+    """Return the dataset with the views of the given indices, in that order."""
+    return replace(dataset, views=tuple(dataset.views[i] for i in indices))

@@ -1,71 +1,153 @@
-"""What training minimises.
+"""Loss terms of training: the photometric loss, and the protocol of further terms.
 
-Axis legend: B pictures, H W image, C channels.
+Axis legend: B images, H W image, C channels.
 """
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gsjax.runtime.devices import spread
+from gsjax.densify.types import Strategy
+from gsjax.raster.types import Render
+from gsjax.runtime.devices import map_over_devices
 from gsjax.train import ssim_window
+from gsjax.train.frames import Batch, targets
 from gsjax.train.metrics import (
+    mask_excluded,
     ratio,
-    seen_only,
     ssim_map,
     weighted_mean,
     weighted_sum,
 )
+from gsjax.train.models import SceneParams
 
 Array = jax.Array
 
 
+class LossTerm(NamedTuple):
+    """A term of the training loss.
+
+    Attributes:
+      name: for messages.
+      function: ``(Render, Batch, SceneParams) → []``. The render has a leading axis B;
+        its ``rgb`` is over the background of the step, with the exposure corrections.
+        See `gsjax.train.frames.targets` for the photographs to compare it with.
+      weight: factor, or a function of the step (counted from 1).
+      start: first step at which the term counts; before, it is not computed.
+      outputs: outputs of the render that the function uses besides "rgb".
+    """
+
+    name: str
+    function: Callable[[Render, Batch, SceneParams], Array]
+    weight: float | Callable[[Array], Array] = 1.0
+    start: int = 0
+    outputs: tuple[str, ...] = ()
+
+
+def evaluate_terms(
+    terms: Sequence[LossTerm],
+    render: Render,
+    batch: Batch,
+    params: SceneParams,
+    step: Array,
+) -> Array:
+    """Return the weighted sum [] of loss terms at ``step`` (counted from 1)."""
+
+    def value_of(term: LossTerm) -> Array:
+        with jax.named_scope(term.name):
+            value = term.function(render, batch, params)
+        weight = term.weight(step) if callable(term.weight) else term.weight
+        return value if isinstance(weight, float) and weight == 1 else weight * value
+
+    total = None
+    for term in terms:
+        if term.start > 1:
+            shape = jax.eval_shape(lambda term=term: value_of(term))
+            value = lax.cond(
+                step >= term.start,
+                lambda term=term: value_of(term),
+                lambda shape=shape: jnp.zeros(shape.shape, shape.dtype),
+            )
+        else:
+            value = value_of(term)
+        total = value if total is None else total + value
+    assert total is not None
+    return total
+
+
+def photometric_term(ssim_weight: float = 0.2, devices: int = 1) -> LossTerm:
+    """Return `photometric_batch` against the photographs as a loss term."""
+
+    def function(render: Render, batch: Batch, params: SceneParams) -> Array:
+        del params
+        assert render.rgb is not None
+        target, weight = targets(batch, render.rgb.dtype)
+        loss = photometric_batch(render.rgb, target, weight, ssim_weight, devices)
+        return jnp.mean(loss)
+
+    return LossTerm("loss", function)
+
+
+def penalty_term(strategy: Strategy) -> LossTerm | None:
+    """Return the penalty of a strategy as a loss term, or None if it has none."""
+    penalty = strategy.penalty
+    if penalty is None:
+        return None
+    return LossTerm("penalty", lambda *inputs: penalty(inputs[2].gaussians))
+
+
 def l1(image: Array, target: Array, weight: Array | None = None) -> Array:
-    """Mean absolute difference, [].
+    """Return the mean absolute difference [].
 
     Args:
       image, target: [H, W, C].
-      weight: [H, W], 0 where a pixel is to be left out; or None.
+      weight: [H, W], 0 for excluded pixels; or None.
     """
-    image, target = seen_only(image, target, weight)
+    image, target = mask_excluded(image, target, weight)
     return weighted_mean(_absolute(image - target), weight)
 
 
 def _absolute(difference: Array) -> Array:
-    """|x|, of slope 0 at 0, where that of `jnp.abs` is 1: what is right stays so."""
+    """Return |x| with slope 0 at 0, so that equal pixels have no gradient."""
     return difference * lax.stop_gradient(jnp.sign(difference))
 
 
 def photometric(
     image: Array, target: Array, weight: Array | None = None, ssim_weight: float = 0.2
 ) -> Array:
-    """(1 − λ) L1 + λ (1 − SSIM), Kerbl et al. 2023, Eq. 7 (their D-SSIM is this one).
+    """Return the loss (1 − λ) L1 + λ (1 − SSIM) of Kerbl et al. 2023, Eq. 7.
 
     Args:
       image, target: [H, W, C] in [0, 1].
-      weight: [H, W], 0 where a pixel is to be left out; or None.
-      ssim_weight: λ; at 0 the SSIM is not in the program.
+      weight: [H, W], 0 for excluded pixels; or None.
+      ssim_weight: λ; at 0 the SSIM is not computed.
+
+    Raises:
+      InputError: if an image holds integers.
     """
-    return weighted_mean(_of_pixels(image, target, weight, ssim_weight), weight)
+    return weighted_mean(_pixel_loss(image, target, weight, ssim_weight), weight)
 
 
-def photometric_spread(
+def photometric_batch(
     images: Array,
     targets: Array,
     weights: Array | None = None,
     ssim_weight: float = 0.2,
     devices: int = 1,
 ) -> Array:
-    """`photometric` of B pictures, [B], each device at work on a band of their rows.
+    """Return `photometric` of B images, [B], with their rows shared by the devices.
 
-    What stands beside a `jax.shard_map` in a program is computed by every device in
-    whole; on one machine they then only wait for one another.
+    Each device computes a band of rows. Beside a `jax.shard_map`, every device would
+    otherwise compute the whole loss.
 
     Args:
       images, targets: [B, H, W, C] in [0, 1].
-      weights: [B, H, W], 0 where a pixel is to be left out; or None.
+      weights: [B, H, W], 0 for excluded pixels; or None.
       ssim_weight: λ, see `photometric`.
-      devices: how many; 1 shares nothing.
+      devices: number of devices.
     """
     height = images.shape[1]
     rows = -(-height // devices)
@@ -73,31 +155,31 @@ def photometric_spread(
     if weights is None:
         weights = jnp.ones(images.shape[:-1], images.dtype)
 
-    def band(device: Array, *pictures: Array) -> tuple[Array, Array]:
-        def cut(picture: Array) -> Array:
-            padding = [(0, 0)] * picture.ndim
+    def band(device: Array, *arrays: Array) -> tuple[Array, Array]:
+        def cut(array: Array) -> Array:
+            padding = [(0, 0)] * array.ndim
             padding[0] = (margin, margin + devices * rows - height)
             start = device[0] * rows
-            wide = jnp.pad(picture, padding)
+            wide = jnp.pad(array, padding)
             return lax.dynamic_slice_in_dim(wide, start, rows + 2 * margin)
 
         def sums(*one: Array) -> tuple[Array, Array]:
             image, target, weight = map(cut, one)
-            values = _of_pixels(image, target, weight, ssim_weight)
+            values = _pixel_loss(image, target, weight, ssim_weight)
             own = slice(margin, margin + rows)
             return weighted_sum(values[own], weight[own])
 
-        return jax.tree.map(lambda x: x[None], jax.vmap(sums)(*pictures))
+        return jax.tree.map(lambda x: x[None], jax.vmap(sums)(*arrays))
 
-    values, totals = spread(band, devices, images, targets, weights)
+    values, totals = map_over_devices(band, devices, images, targets, weights)
     return ratio(jnp.sum(values, 0), jnp.sum(totals, 0))
 
 
-def _of_pixels(
+def _pixel_loss(
     image: Array, target: Array, weight: Array | None, ssim_weight: float
 ) -> Array:
-    """What `photometric` is the mean of, [H, W, C]."""
-    image, target = seen_only(image, target, weight)
+    """Return the loss [H, W, C] that `photometric` averages."""
+    image, target = mask_excluded(image, target, weight)
     loss = (1 - ssim_weight) * _absolute(image - target)
     if ssim_weight > 0:
         loss += ssim_weight * (1 - ssim_map(image, target))

@@ -1,4 +1,4 @@
-"""How like two pictures are: PSNR and SSIM.
+"""Image similarity: PSNR and SSIM.
 
 Axis legend: H W image, C channels.
 """
@@ -16,39 +16,41 @@ _C1, _C2 = 0.01**2, 0.03**2
 
 
 def psnr(image: Array, target: Array, weight: Array | None = None) -> Array:
-    """Peak signal-to-noise ratio in dB, for a peak of 1.
+    """Return the peak signal-to-noise ratio in dB, for a peak of 1.
 
     Args:
       image, target: [H, W, C] in [0, 1].
-      weight: [H, W] of each pixel, or None for all alike.
+      weight: [H, W] pixel weights; None for equal weights.
 
     Returns:
-      [] −10 log10 of the mean squared error; infinite, without a derivative, for equal
-      pictures, and NaN where no pixel counts.
+      [] −10 log10 of the mean squared error. Infinite and not differentiable for equal
+      images; NaN if all weights are 0.
 
     Raises:
-      InputError: if a picture is of whole numbers.
+      InputError: if an image holds integers.
     """
-    image, target = seen_only(image, target, weight)
+    image, target = mask_excluded(image, target, weight)
     error = weighted_mean(jnp.square(image - target), weight)
     if weight is not None:
         error = jnp.where(jnp.any(weight > 0), error, jnp.nan)
     return -10 * jnp.log10(error)
 
 
-def seen_only(image: Array, target: Array, weight: Array | None) -> tuple[Array, Array]:
-    """Both pictures [H, W, C], black where the weight [H, W] is 0.
+def mask_excluded(
+    image: Array, target: Array, weight: Array | None
+) -> tuple[Array, Array]:
+    """Return both images [H, W, C] with 0 where the weight [H, W] is 0.
 
-    So that what lies there cannot show, NaN included, nor in a derivative.
+    Excluded pixels, NaN included, then affect neither value nor derivative.
 
     Raises:
-      InputError: if one is of whole numbers, whose differences would wrap.
+      InputError: if an image holds integers, whose differences would wrap.
     """
-    for picture in (image, target):
-        if not jnp.issubdtype(jnp.result_type(picture), jnp.floating):
+    for array in (image, target):
+        if not jnp.issubdtype(jnp.result_type(array), jnp.floating):
             raise InputError(
-                f"a picture of {jnp.result_type(picture)}; floating-point numbers in "
-                "[0, 1] are wanted: pass picture / 255"
+                "image: expected floating-point numbers in [0, 1], got "
+                f"{jnp.result_type(array)}; pass image / 255"
             )
     if weight is None:
         return image, target
@@ -57,51 +59,52 @@ def seen_only(image: Array, target: Array, weight: Array | None) -> tuple[Array,
 
 
 def weighted_mean(values: Array, weight: Array | None) -> Array:
-    """Mean of [H, W, ...] under weights [H, W]; 0 where all weights are."""
+    """Return the weighted mean of [H, W, …]; 0 if all weights [H, W] are 0."""
     return jnp.mean(values) if weight is None else ratio(*weighted_sum(values, weight))
 
 
 def weighted_sum(values: Array, weight: Array) -> tuple[Array, Array]:
-    """Of [H, W, ...] under weights [H, W], and that of the weights.
+    """Return the weighted sum of [H, W, …], and the sum of the weights.
 
-    In one sum: XLA's sums over the few channels of each pixel are slow on a CPU.
+    The sum runs over all axes at once: reducing a short channel axis is slow on CPUs.
     """
     wide = weight.reshape(*weight.shape, *(1,) * (values.ndim - weight.ndim))
     return jnp.sum(values * wide), values.size // weight.size * jnp.sum(weight)
 
 
 def ratio(sums: Array, totals: Array) -> Array:
-    """Of sums and what to divide them by; 0 where there is nothing to divide by."""
+    """Return ``sums / totals``; 0 where the total is 0."""
     return safe_divide(sums, totals, totals > 0)
 
 
 def ssim(image: Array, target: Array, weight: Array | None = None) -> Array:
-    """Mean structural similarity (Wang et al. 2004), as Kerbl et al. 2023 take it.
+    """Return the mean structural similarity, with the constants of Kerbl et al. 2023.
 
-    Gaussian window of 11 px and σ = 1.5 px, zeros beyond the border, all pixels
-    counted. With a weight, both pictures are black where it is 0.
+    Wang et al., "Image Quality Assessment: From Error Visibility to Structural
+    Similarity", 2004. Gaussian window of 11 px and σ = 1.5 px, zero padding, mean over
+    all pixels. Pixels of weight 0 are black in both images.
 
     Args:
       image, target: [H, W, C] in [0, 1].
-      weight: [H, W] of each pixel, or None for all alike.
+      weight: [H, W] pixel weights; None for equal weights.
 
     Returns:
       [] at most 1.
 
     Raises:
-      InputError: if a picture is of whole numbers.
+      InputError: if an image holds integers.
     """
-    image, target = seen_only(image, target, weight)
+    image, target = mask_excluded(image, target, weight)
     return weighted_mean(ssim_map(image, target), weight)
 
 
 def ssim_map(image: Array, target: Array) -> Array:
-    """SSIM of every pixel and channel, [H, W, C]; see `ssim`."""
+    """Return the SSIM [H, W, C] of each pixel and channel; see `ssim`."""
     dtype = jnp.result_type(image, target)
     x, y = jnp.broadcast_arrays(*(jnp.asarray(a, dtype) for a in (image, target)))
-    # By the difference d = x − y: of equal pictures, numerator and denominator are the
-    # same numbers, whatever the rounding. As var x + var y = 2 covar + var d, nothing
-    # else changes, and the derivative goes through three means only.
+    # In terms of d = x − y, with var x + var y = 2 covar + var d: for equal images the
+    # numerator and denominator are equal whatever the rounding, and the derivative
+    # passes through three means only.
     difference = x - y
     mean_x, product, square = window_means((x, x * y, difference * difference))
     (mean_y,) = window_means((y,))

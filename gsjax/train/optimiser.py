@@ -1,32 +1,36 @@
-"""Adam on the parameters of Gaussians, a rate for each kind of number.
+"""Adam with a learning rate for each label of parameters.
 
-The moments are pytrees like the parameters, slot by slot, so that an edit of the
-slots is the same edit of the moments.
+A label is the name of a field, such as "means" or "turns", or "model.NAME" for what a
+scene model adds. Adam is the same for all labels, so one state holds all moments; its
+leaves have the shapes of the parameters, and an edit of the slots edits them alike.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from gsjax.gaussians import GaussianParams
+from gsjax.errors import InputError
 
 Array = jax.Array
-_ADAM = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-15)
+# A constant learning rate, or a function of the completed fraction of the run.
+Rate = float | Callable[[Array], Array]
 
 
 class Rates(NamedTuple):
-    """Learning rates; the defaults are those of Kerbl et al. 2023.
+    """Learning rates of the Gaussians; the defaults are those of Kerbl et al. 2023.
 
     Attributes:
-      means: at the first and the last step, log-linear between, both above 0 or
-        equal; times the extent of the scene.
+      means: at the first and the last step, log-linear in between, in scene extents.
+        Both above 0, or equal.
       log_scales, quats, logit_opacities: of each number.
-      sh_dc, sh_rest: of degree 0, and of all above.
-      cooling: share of all but the means' that is left at the last step: constant at
-        first, log-linear from there; 1 is constant throughout.
-      cooling_from: share of the run after which they fall, 0 to below 1.
+      sh_dc, sh_rest: of the coefficients of degree 0, and of all above.
+      cooling: factor reached at the last step by all rates but that of the means; 1
+        keeps them constant.
+      cooling_from: fraction of the run, 0 to below 1, after which they fall
+        log-linearly.
     """
 
     means: tuple[float, float] = (1.6e-4, 1.6e-6)
@@ -39,7 +43,7 @@ class Rates(NamedTuple):
     cooling_from: float = 0.6
 
     def times(self, factor: float) -> "Rates":
-        """All rates, multiplied; the cooling as it was."""
+        """Return all rates multiplied by a factor, with the same cooling."""
         first, last = self.means
         others = [name for name in self._fields[1:] if "cooling" not in name]
         return self._replace(
@@ -49,56 +53,102 @@ class Rates(NamedTuple):
 
 
 def means_rate(rates: Rates, fraction: Array, extent: float | Array) -> Array:
-    """Rate of the means at ``fraction`` (0 to 1) of the run."""
+    """Return the learning rate of the means at ``fraction`` (0 to 1) of the run."""
     first, last = rates.means
     fraction = jnp.clip(fraction, 0, 1)
-    if first == last:  # (0, 0) holds the means where they are
+    if first == last:  # includes 0, which keeps the means fixed
         return extent * first * jnp.ones_like(fraction)
     return extent * first * (last / first) ** fraction
 
 
-def cooled(rates: Rates, fraction: Array) -> Array:
-    """Share of the rates but the means' that is left at ``fraction`` of the run."""
+def cooling_factor(rates: Rates, fraction: Array) -> Array:
+    """Return the factor on the rates other than that of the means."""
     late = (jnp.clip(fraction, 0, 1) - rates.cooling_from) / (1 - rates.cooling_from)
     return rates.cooling ** jnp.maximum(late, 0)
 
 
-def init_moments(params: GaussianParams) -> optax.ScaleByAdamState:
-    """Zero moments."""
-    return _ADAM.init(params)  # pyright: ignore
+def scale_by_rate(rate: Rate) -> optax.GradientTransformationExtraArgs:
+    """Return a transformation that multiplies updates by the negative learning rate."""
+    return _scale(lambda fraction, _: rate(fraction) if callable(rate) else rate)
 
 
-def adam_step(
-    params: GaussianParams,
-    grads: GaussianParams,
-    moments: optax.ScaleByAdamState,
-    rates: Rates,
-    fraction: Array,
-    extent: float | Array,
-) -> tuple[GaussianParams, optax.ScaleByAdamState]:
-    """One step of Adam (Kingma & Ba 2015; β 0.9 and 0.999, ε 1e-15).
+def _scale_sh(rates: Rates) -> optax.GradientTransformationExtraArgs:
+    """Return `scale_by_rate` for SH coefficients [N, K, 3]."""
+
+    def rate_of(fraction: Array, update: Array) -> Array:
+        first = jnp.arange(update.shape[-2]) == 0
+        band = jnp.where(first, rates.sh_dc, rates.sh_rest)
+        return cooling_factor(rates, fraction) * band[:, None]
+
+    return _scale(rate_of)
+
+
+def _scale(
+    rate_of: Callable[[Array, Array], Array | float],
+) -> optax.GradientTransformationExtraArgs:
+    def update(updates, state, params=None, **extra):
+        del params
+        rates = jax.tree.map(lambda u: rate_of(extra["fraction"], u), updates)
+        return jax.tree.map(
+            lambda u, r: -(u * r).astype(u.dtype), updates, rates
+        ), state
+
+    return optax.GradientTransformationExtraArgs(optax.identity().init, update)
+
+
+def gaussian_rates(
+    rates: Rates, extent: float
+) -> dict[Hashable, optax.GradientTransformation]:
+    """Return the transformations of the Gaussians' parameters by label.
 
     Args:
-      params, grads: as `Gaussians.params`.
-      moments: of the steps before; see `init_moments`.
-      rates: see `Rates`.
-      fraction: how far the run has come, 0 to 1.
-      extent: of the scene, in its units.
+      rates: learning rates.
+      extent: scene extent in world units.
     """
-    updates, moments = _ADAM.update(grads, moments)  # pyright: ignore
-    bases = params.sh.shape[-2]
-    by_band = jnp.where(jnp.arange(bases) == 0, rates.sh_dc, rates.sh_rest)
-    share = cooled(rates, fraction)
-    rate = GaussianParams(
-        **{
-            "means": means_rate(rates, fraction, extent),
-            "quats": share * rates.quats,
-            "log_scales": share * rates.log_scales,
-            "logit_opacities": share * rates.logit_opacities,
-            "sh": share * by_band[:, None],
-        }
-    )
-    moved = jax.tree.map(
-        lambda p, u, r: p - (u * r).astype(p.dtype), params, updates, rate
-    )
-    return moved, moments  # pyright: ignore
+
+    def cooled(rate: float) -> Rate:
+        return lambda fraction: cooling_factor(rates, fraction) * rate
+
+    return {
+        "means": scale_by_rate(lambda fraction: means_rate(rates, fraction, extent)),
+        "quats": scale_by_rate(cooled(rates.quats)),
+        "log_scales": scale_by_rate(cooled(rates.log_scales)),
+        "logit_opacities": scale_by_rate(cooled(rates.logit_opacities)),
+        "sh": _scale_sh(rates),
+    }
+
+
+def make_optimiser(
+    table: Mapping[Hashable, optax.GradientTransformation],
+) -> optax.GradientTransformationExtraArgs:
+    """Return Adam (β 0.9 and 0.999, ε 1e-15) followed by a transformation per label.
+
+    Kingma and Ba, "Adam: A Method for Stochastic Optimization", 2015. Its ``update``
+    takes the completed fraction of the run, 0 to 1, as ``fraction=``.
+
+    Args:
+      table: transformation of the updates of each label, such as `scale_by_rate`.
+        Usually `gaussian_rates`, extended by further labels.
+    """
+
+    def labels(params) -> Any:
+        found = jax.tree_util.tree_map_with_path(lambda path, _: _label(path), params)
+        unknown = {*jax.tree.leaves(found)} - {*table}
+        if unknown:
+            raise InputError(
+                "optimiser: expected a learning rate for each label, got none for "
+                f"{sorted(map(str, unknown))}; add one, such as Model(rates={{...}})"
+            )
+        return found
+
+    adam = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-15)
+    by_label = optax.partition(table, labels)
+    return optax.chain(adam, by_label)  # pyright: ignore
+
+
+def _label(path) -> str:
+    names = [
+        str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", ""))))
+        for key in path
+    ]
+    return ".".join(names[:2]) if names[0] == "model" else names[-1]

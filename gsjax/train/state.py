@@ -1,94 +1,251 @@
-"""What a run goes on from, and what its steps learn and tell.
+"""State of a training run, and the results of its steps.
 
 Axis legend: N Gaussians (capacity), V views, B views of a step.
 """
 
+import io
+import zipfile
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
-from gsjax.gaussians import GaussianParams, Gaussians
-from gsjax.train.camera_refinement import (
-    CameraRefinement,
-    init_refinement,
-    init_refinement_moments,
-)
+from gsjax.densify.types import Strategy
+from gsjax.errors import InputError
+from gsjax.gaussians import Gaussians
+from gsjax.io.npy import read_npy
+from gsjax.runtime.files import write_file
+from gsjax.train.camera_refinement import CameraRefinement, init_refinement
 from gsjax.train.config import TrainConfig
-from gsjax.train.optimiser import init_moments
+from gsjax.train.models import (
+    Model,
+    ModelParams,
+    SceneParams,
+    SharedParams,
+    SlotParams,
+    init_model,
+)
+from gsjax.train.setup import Setup, make_setup
 
 Array = jax.Array
+Tree = TypeVar("Tree")
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrainState:
-    """All that a run goes on from, with its settings and its photographs.
+    """State of a run; with its settings and photographs it determines all later steps.
 
     Attributes:
-      step: [] int32, steps done.
-      key: random key of the run; steps derive theirs from it and never change it.
-        (Which views a step looks at follows from `TrainConfig.seed`: it is drawn on
-        the host, see `gsjax.train.frames.views_of_step`.)
+      step: [] int32, number of completed steps.
+      key: random key of the run, constant; each step derives its own keys from it.
+        (The views of a step follow from `TrainConfig.seed`, see
+        `gsjax.train.frames.views_of_step`.)
       gaussians: the scene.
-      moments: Adam's, slot by slot.
-      stats: what the strategy has gathered.
-      refinement, refinement_moments: corrections of cameras and exposures.
+      model: parameters that the scene model adds.
+      refinement: corrections of cameras and exposures.
+      moments: optimiser state of `slot_params`.
+      shared_moments: optimiser state of `shared_params`.
+      stats: statistics of the strategy.
     """
 
     step: Array
     key: Array
     gaussians: Gaussians
-    moments: optax.ScaleByAdamState
-    stats: Any
+    model: ModelParams
     refinement: CameraRefinement
-    refinement_moments: optax.ScaleByAdamState
+    moments: optax.OptState
+    shared_moments: optax.OptState
+    stats: Any
 
     def replace(self, **changes) -> "TrainState":
-        """A copy with some fields changed."""
+        """Return a copy with some fields changed."""
         return replace(self, **changes)
+
+    @property
+    def params(self) -> SceneParams:
+        """Everything that is trained, as scene models and loss terms take it."""
+        return SceneParams(self.gaussians, self.model, self.refinement)
+
+    @property
+    def slot_params(self) -> SlotParams:
+        """Trained parameters with a slot axis."""
+        return SlotParams(self.gaussians.params, self.model.slots)
+
+    @property
+    def shared_params(self) -> SharedParams:
+        """Trained parameters without a slot axis."""
+        return SharedParams(self.refinement, self.model.shared)
+
+    def with_params(self, slots: SlotParams, shared: SharedParams) -> "TrainState":
+        """Return a copy with other parameters."""
+        gaussians = self.gaussians.replace(params=slots.gaussians)  # pyright: ignore
+        return self.replace(
+            gaussians=gaussians,
+            model=ModelParams(slots.model, shared.model),
+            refinement=shared.refinement,
+        )
 
 
 def init_state(
-    gaussians: Gaussians, config: TrainConfig, extent: float, views: int
+    gaussians: Gaussians,
+    config: TrainConfig,
+    extent: float,
+    views: int,
+    *,
+    strategy: Strategy | None = None,
+    model: Model | None = None,
 ) -> TrainState:
-    """A run before its first step.
+    """Return the state of a run before its first step.
 
     Args:
-      gaussians: as initialised; capacity as wanted.
-      config: the settings.
-      extent: of the scene, see `gsjax.init.gaussians.scene_extent`.
-      views: V.
+      gaussians: initial Gaussians, N slots.
+      config: settings.
+      extent: scene extent in world units, see `gsjax.data.extent.scene_extent`.
+      views: V, number of views.
+      strategy: density control; default that of ``config``.
+      model: scene model; by default the Gaussians are rendered as they are.
+
+    Raises:
+      InputError: if the model has no learning rate for one of its parameters, or an
+        array of its ``slots`` does not have N rows.
     """
-    refinement = init_refinement(config, views)
+    setup = make_setup(config, extent, strategy=strategy, model=model)
+    return setup_state(setup, gaussians, views)
+
+
+def setup_state(setup: Setup, gaussians: Gaussians, views: int) -> TrainState:
+    """Return `init_state` of a `Setup`."""
+    model = init_model(setup.model, gaussians)
+    refinement = init_refinement(setup.config, views)
+    slots: Any = SlotParams(gaussians.params, model.slots)
+    shared: Any = SharedParams(refinement, model.shared)
     return TrainState(
         step=jnp.int32(0),
-        key=jax.random.key(config.seed),
+        key=jax.random.key(setup.config.seed),
         gaussians=gaussians,
-        moments=init_moments(gaussians.params),
-        stats=config.densifier(extent).init(gaussians),
+        model=model,
         refinement=refinement,
-        refinement_moments=init_refinement_moments(refinement),
+        moments=setup.optimiser.init(slots),
+        shared_moments=setup.optimiser.init(shared),
+        stats=setup.strategy.init(gaussians),
     )
 
 
+def state_arrays(state: Any) -> dict[str, np.ndarray]:
+    """Return the leaves of a pytree on the host by path; random keys as numbers."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
+    return {
+        jax.tree_util.keystr(path): np.asarray(
+            jax.random.key_data(leaf) if _is_key(leaf) else leaf
+        )
+        for path, leaf in leaves
+    }
+
+
+def _is_key(leaf) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def state_from_arrays(where: str, arrays: dict[str, np.ndarray], like: Tree) -> Tree:
+    """Return a pytree like ``like`` with the leaves of `state_arrays`.
+
+    Raises:
+      InputError: if leaves are missing or surplus, or a shape or dtype differs;
+        ``where`` is the subject of the message.
+    """
+    leaves, structure = jax.tree_util.tree_flatten_with_path(like)
+    names = [jax.tree_util.keystr(path) for path, _ in leaves]
+    remedy = "pass the settings of the run that wrote it"
+    if {*names} != {*arrays}:
+        missing, surplus = sorted({*names} - {*arrays}), sorted({*arrays} - {*names})
+        raise InputError(
+            f"{where}: expected the arrays of these settings, got {surplus[:3]} in "
+            f"excess and {missing[:3]} missing; {remedy}"
+        )
+    out = []
+    for name, (_, leaf) in zip(names, leaves):
+        array = arrays[name]
+        expected = jax.random.key_data(leaf) if _is_key(leaf) else leaf
+        if array.shape != expected.shape or array.dtype != expected.dtype:
+            raise InputError(
+                f"{where}: expected {name} as {expected.dtype} {expected.shape}, got "
+                f"{array.dtype} {array.shape}; {remedy}"
+            )
+        value = jnp.asarray(array)
+        out.append(jax.random.wrap_key_data(value) if _is_key(leaf) else value)
+    return jax.tree_util.tree_unflatten(structure, out)
+
+
+def save_state(path: str | PathLike, state: Any) -> None:
+    """Write a training state, or any pytree of arrays, to an .npz file.
+
+    An existing file is replaced only after the new one is complete.
+
+    Args:
+      path: file to write.
+      state: pytree of arrays; random keys are allowed.
+
+    Raises:
+      InputError: if the file cannot be written.
+    """
+
+    buffer = io.BytesIO()
+    np.savez(buffer, **state_arrays(state))  # pyright: ignore
+    write_file(Path(path), buffer.getvalue(), durable=True)
+
+
+def load_state(path: str | PathLike, like: Tree) -> Tree:
+    """Read a state that `save_state` wrote.
+
+    Args:
+      path: file to read.
+      like: state of the same settings and capacity, such as `init_state`; only its
+        structure, shapes and dtypes are used.
+
+    Raises:
+      InputError: if the file is missing or damaged, or its arrays are not those of
+        ``like``.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+            if any(entry.compress_type for entry in entries):
+                raise ValueError("compressed arrays")
+            arrays = {
+                entry.filename.removesuffix(".npy"): read_npy(
+                    entry.filename, archive.read(entry)
+                )
+                for entry in entries
+            }
+    except (OSError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{path}: expected a file of save_state, got {error}; save it again"
+        ) from error
+    return state_from_arrays(str(path), arrays, like)
+
+
 class Metrics(NamedTuple):
-    """What a step tells of itself; scalars.
+    """Measurements of a step; scalars.
 
     Attributes:
-      step: steps done, including this one.
-      loss: what was minimised.
-      psnr: dB of the views of this step, before it.
-      gaussians: active ones, after it.
-      wanted: how many there would be with room for all; 0 where nothing was edited.
+      step: number of completed steps, including this one.
+      loss: value of the loss.
+      psnr: PSNR in dB of the views of this step, before the update.
+      gaussians: number of active Gaussians after the step.
+      wanted: number of Gaussians if the capacity had sufficed; 0 without an edit.
       pairs: (tile, Gaussian) pairs of all views of this step.
-      pair_capacity: what the view that wants most of it would have room in.
-      overflowed: the pairs did not fit, and nothing was changed, nor counted as a
-        step: grow `RasterConfig.pair_capacity`, and go on.
-      finite: False if loss or gradients were not, and nothing but ``step`` changed; or
-        if a number would have left the finite ones by this step, and stayed.
+      pair_capacity: largest pair capacity that a view requires.
+      overflowed: True if the pairs exceeded the capacity. Nothing was changed and the
+        step does not count: increase `RasterConfig.pair_capacity` and repeat it.
+      finite: False if the loss or a gradient was not finite, in which case only
+        ``step`` changed, or if a parameter would have become non-finite, in which case
+        it was kept.
     """
 
     step: Array
@@ -103,13 +260,13 @@ class Metrics(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """What a step learns from its views.
+    """Loss and gradients of a step.
 
     Attributes:
       loss, psnr: [] as in `Metrics`.
-      by_params: of the loss, by the parameters.
-      by_refinement: by the corrections.
-      by_probe: [B, N, 2] by the projected means, px; see `Observation`.
+      by_slots: gradient by `TrainState.slot_params`.
+      by_shared: gradient by `TrainState.shared_params`.
+      by_probe: [B, N, 2] gradient by the projected means, 1/px; see `Observation`.
       radii: [B, N] px.
       size: [B, 2] int32, width and height of the photographs.
       pairs, pair_capacity, overflowed: [] as in `Metrics`.
@@ -117,8 +274,8 @@ class Gradients(NamedTuple):
 
     loss: Array
     psnr: Array
-    by_params: GaussianParams
-    by_refinement: CameraRefinement
+    by_slots: SlotParams
+    by_shared: SharedParams
     by_probe: Array
     radii: Array
     size: Array
@@ -128,21 +285,21 @@ class Gradients(NamedTuple):
 
 
 def gradients_like(state: TrainState, batch: int) -> Gradients:
-    """Shapes of what `Stages.differentiate` returns for ``batch`` views."""
+    """Return the shapes and dtypes of the `Gradients` of ``batch`` views."""
     dtype, slots = state.gaussians.params.means.dtype, state.gaussians.capacity
 
     def shape(*sizes: int, dtype=dtype) -> Any:
         return jax.ShapeDtypeStruct(sizes, dtype)
 
-    params, refinement = jax.tree.map(
+    by_slots, by_shared = jax.tree.map(
         lambda a: shape(*a.shape, dtype=a.dtype),
-        (state.gaussians.params, state.refinement),
+        (state.slot_params, state.shared_params),
     )
     return Gradients(
         loss=shape(),
         psnr=shape(),
-        by_params=params,
-        by_refinement=refinement,
+        by_slots=by_slots,
+        by_shared=by_shared,
         by_probe=shape(batch, slots, 2),
         radii=shape(batch, slots),
         size=shape(batch, 2, dtype=jnp.int32),

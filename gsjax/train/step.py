@@ -1,46 +1,56 @@
-"""One step of training: a pure function (state, batch) → (state, metrics).
+"""A training step: a pure function (state, batch) → (state, metrics).
 
-Its stages, which a run compiles one by one (`gsjax.train.step_compiler`): differentiate what
-the views show, advance by it, and edit the slots where that is due.
+It consists of three stages, which `gsjax.train.step_compiler` compiles separately:
+differentiate the loss, advance the parameters, and edit the slots when that is due.
 
 Axis legend: N Gaussians (capacity), V views, B views of a step, H W image.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 from jax import lax
 
-from gsjax.densify.types import Densifier, Observation, apply_edit
-from gsjax.gaussians import Gaussians, num_active
+from gsjax.cameras.camera import Camera
+from gsjax.densify.types import Observation, Strategy, apply_edit, copy_rows
+from gsjax.gaussians import num_active
 from gsjax.math.numerics import all_within
-from gsjax.raster.render import device_count, render
-from gsjax.raster.types import RasterConfig
-from gsjax.train.camera_refinement import exposed, refine_camera, refinement_step
+from gsjax.raster.render import render
+from gsjax.raster.tile_render import device_count
+from gsjax.raster.types import OUTPUTS, RasterConfig, Render
+from gsjax.train.camera_refinement import apply_exposure, refine_camera
 from gsjax.train.config import TrainConfig
-from gsjax.train.frames import Batch
-from gsjax.train.losses import photometric_spread
+from gsjax.train.frames import Batch, targets
+from gsjax.train.losses import (
+    LossTerm,
+    evaluate_terms,
+    penalty_term,
+    photometric_term,
+)
 from gsjax.train.metrics import psnr
-from gsjax.train.optimiser import adam_step, means_rate
+from gsjax.train.models import IDENTITY, Model, SceneParams, ViewInfo
+from gsjax.train.optimiser import means_rate
+from gsjax.train.setup import Setup, make_setup
 from gsjax.train.state import Gradients, Metrics, TrainState, gradients_like
 
 Array = jax.Array
 
-# A gradient from there on counts as infinite: Adam squares it, and in float32 the
-# second moment of a slot would never come back from infinity.
-_STEEPEST = 1e18
+# Gradients from here on count as infinite: Adam squares them, and a second moment that
+# overflows in float32 never recovers.
+_MAX_GRADIENT = 1e18
 
 
 class Stages(NamedTuple):
-    """The parts of a step, as pure functions.
+    """Stages of a training step, as pure functions.
 
     Attributes:
-      differentiate: of the state, looks at scene, corrections, step and key.
-      advance: optimiser and what the strategy does at each step; the last result is []
-        bool, whether an edit is due then.
-      edit: the edit of the strategy, behind a step that it is due at.
+      differentiate: loss and gradients of a batch.
+      advance: optimiser update, noise and statistics of the strategy; the third result
+        is [] bool, whether an edit is due.
+      edit: edit of the slots, to be applied after a step at which it is due.
     """
 
     differentiate: Callable[[TrainState, Batch], Gradients]
@@ -52,21 +62,34 @@ TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
 
 
 def make_train_step(
-    config: TrainConfig, extent: float, raster: RasterConfig | None = None
+    config: TrainConfig,
+    extent: float,
+    *,
+    strategy: Strategy | None = None,
+    loss_terms: Sequence[LossTerm] = (),
+    model: Model | None = None,
+    raster: RasterConfig | None = None,
 ) -> TrainStep:
-    """The step of a run: to be jitted, scanned, or mapped over seeds by the caller.
+    """Return a training step, to be jitted, scanned or vmapped over seeds.
 
     Args:
-      config: the settings.
-      extent: of the scene, in its units.
-      raster: how to render, with a `pair_capacity` that fits; default
-        ``config.raster``. Its ``visible_capacity`` is not used.
+      config: settings.
+      extent: scene extent in world units.
+      strategy: density control; default that of ``config``.
+      loss_terms: terms added to the photometric loss and the strategy's penalty.
+      model: scene model; by default the Gaussians are rendered as they are.
+      raster: render settings with a sufficient `pair_capacity`; default
+        ``config.raster``. Its ``visible_capacity`` is ignored.
 
     Returns:
-      (`TrainState`, `Batch` of B views) → (`TrainState`, `Metrics`). Look at
-      ``overflowed``; if True, nothing was done.
+      Function (`TrainState`, `Batch` of B views) → (`TrainState`, `Metrics`). The state
+      is that of `init_state` with the same strategy and model. If
+      ``Metrics.overflowed``, the state is unchanged.
     """
-    stages = make_stages(config, extent, raster)
+    setup = make_setup(
+        config, extent, strategy=strategy, loss_terms=loss_terms, model=model
+    )
+    stages = make_stages(setup, raster)
 
     def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
         gradients = stages.differentiate(state, batch)
@@ -76,89 +99,155 @@ def make_train_step(
     return train_step
 
 
-def make_stages(
-    config: TrainConfig, extent: float, raster: RasterConfig | None = None
-) -> Stages:
-    """The parts of `make_train_step`, each a pure function to be compiled by itself.
+def make_stages(setup: Setup, raster: RasterConfig | None = None) -> Stages:
+    """Return the stages of a training step.
 
     Args:
-      config, extent, raster: as for `make_train_step`.
+      setup: parts of the step, see `make_setup`.
+      raster: as for `make_train_step`.
     """
-    densifier = config.densifier(extent)
-    # Room for all that is visible: `Metrics` would not tell how many there are.
-    raster = (raster or config.raster).replace(
-        outputs=("rgb",), absgrad=densifier.absgrad, visible_capacity=None
+    return Stages(_differentiate(setup, raster), _advance(setup), _edit(setup))
+
+
+def step_raster(setup: Setup, raster: RasterConfig | None = None) -> RasterConfig:
+    """Return the render settings of a step: with the outputs that its loss uses."""
+    needed = {"rgb", *(name for term in setup.loss_terms for name in term.outputs)}
+    # Room for all slots: `Metrics` does not report how many are visible.
+    return (raster or setup.config.raster).replace(
+        outputs=tuple(name for name in OUTPUTS if name in needed),
+        absgrad=setup.strategy.absgrad,
+        visible_capacity=None,
     )
 
-    def objective(params, refinement, probe, state, batch: Batch, background):
-        gaussians = state.gaussians.replace(params=params)
-        camera = refine_camera(batch.camera, refinement, batch.view, extent)
-        name = "abs_probe" if densifier.absgrad else "probe"
-        mask = batch.valid if config.skip_masked else None
-        given = {"mask": mask, "size": batch.size, name: probe}
-        if config.exposure and _transparent(batch):
-            # Of such photographs the background is ours, and has no exposure.
-            outputs = raster.replace(outputs=("rgb", "alpha"))
-            view = render(gaussians, camera, outputs, **given)
-            assert view.rgb is not None
-            assert view.alpha is not None
-            image = exposed(view.rgb, refinement, batch.view, view.alpha)
-            image += (1 - view.alpha[..., None]) * background
-        else:
-            view = render(gaussians, camera, raster, background, **given)
-            assert view.rgb is not None
-            image = exposed(view.rgb, refinement, batch.view)
-        target, weight = targets(batch, background, image.dtype)
-        with jax.named_scope("loss"):
-            loss = photometric_spread(
-                image, target, weight, config.ssim_weight, device_count(raster)
-            )
-        total = jnp.mean(loss)
-        if densifier.penalty is not None:
-            total += densifier.penalty(gaussians)
+
+def _differentiate(setup: Setup, raster: RasterConfig | None):
+    config, strategy = setup.config, setup.strategy
+    raster = step_raster(setup, raster)
+    photometric = photometric_term(config.ssim_weight, device_count(raster))
+    penalty = penalty_term(strategy)
+    terms = (photometric, *((penalty,) if penalty else ()), *setup.loss_terms)
+
+    def objective(trained, probe, state: TrainState, batch: Batch):
+        params = state.with_params(*trained).params
+        view = _render(setup, raster, params, batch, probe)
+        assert view.rgb is not None
+        loss = evaluate_terms(terms, view, batch, params, state.step + 1)
+        image, (target, weight) = view.rgb, targets(batch, view.rgb.dtype)
         quality = jnp.mean(
             jax.vmap(psnr, in_axes=(0, 0, None if weight is None else 0))(
                 lax.stop_gradient(image), target, weight
             )
         )
-        return total, (quality, view)
+        return loss, (quality, view)
 
-    slopes = jax.value_and_grad(objective, argnums=(0, 1, 2), has_aux=True)
+    value_and_grad = jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)
 
     def differentiate(state: TrainState, batch: Batch) -> Gradients:
-        params, count = state.gaussians.params, batch.view.shape[0]
-        dtype = params.means.dtype
-        by_background, *_ = _keys(state.key, state.step)
-        background = background_of(config, _transparent(batch), by_background, dtype)
+        count, dtype = batch.view.shape[0], state.gaussians.params.means.dtype
+        key, *_ = _keys(state.key, state.step)
+        background = background_of(config, batch.transparent, key, dtype)
+        batch = batch._replace(background=background)
         probe = jnp.zeros((count, state.gaussians.capacity, 2), dtype)
-        (loss, (quality, view)), by = slopes(
-            params, state.refinement, probe, state, batch, background
+        trained = state.slot_params, state.shared_params
+        (loss, (quality, view)), ((by_slots, by_shared), by_probe) = value_and_grad(
+            trained, probe, state, batch
         )
         size = batch.size
         if size is None:
             whole = jnp.asarray([batch.camera.width, batch.camera.height], jnp.int32)
             size = jnp.broadcast_to(whole, (count, 2))
-        demand = view.demand
-        by_params, by_refinement, by_probe = by
         found = Gradients(
             loss=loss,
             psnr=quality,
-            by_params=by_params,
-            by_refinement=by_refinement,
+            by_slots=by_slots,
+            by_shared=by_shared,
             by_probe=by_probe,
             radii=view.radii,
             size=size,
-            pairs=demand.pairs,
-            pair_capacity=demand.capacity,
+            pairs=view.demand.pairs,
+            pair_capacity=view.demand.capacity,
             overflowed=view.overflowed,
         )
-        # Cameras may be wider than what is learnt.
+        # Cameras may be float64 while the parameters are float32.
         like = gradients_like(state, count)
         return jax.tree.map(lambda a, b: a.astype(b.dtype), found, like)
 
+    return differentiate
+
+
+def _render(
+    setup: Setup,
+    raster: RasterConfig,
+    params: SceneParams,
+    batch: Batch,
+    probe: Array,
+) -> Render:
+    """Render the views of a batch as their photographs would show them."""
+    config, refinement = setup.config, params.refinement
+    camera = refine_camera(batch.camera, refinement, batch.view, setup.extent)
+    mask = batch.valid if config.skip_masked else None
+    camera = camera.replace(visible_size=batch.size)
+    arguments = {"mask": mask, "probe": probe}
+    if not (config.exposure and batch.transparent):
+        behind = batch.background
+        view = _render_model(setup, raster, params, batch, (camera, behind, arguments))
+        image = apply_exposure(_rgb(view), refinement, batch.view)
+        return view._replace(rgb=image)
+    # The background of transparent photographs is ours and has no exposure.
+    outputs = tuple(name for name in OUTPUTS if name in {*raster.outputs, "alpha"})
+    raster = raster.replace(outputs=outputs)
+    view = _render_model(setup, raster, params, batch, (camera, None, arguments))
+    assert view.alpha is not None
+    image = apply_exposure(_rgb(view), refinement, batch.view, view.alpha)
+    assert batch.background is not None
+    image += (1 - view.alpha[..., None]) * batch.background
+    return view._replace(rgb=image)
+
+
+def _rgb(view: Render) -> Array:
+    assert view.rgb is not None
+    return view.rgb
+
+
+def _render_model(
+    setup: Setup,
+    raster: RasterConfig,
+    params: SceneParams,
+    batch: Batch,
+    inputs: tuple[Camera, Array | None, dict[str, Array | None]],
+) -> Render:
+    """Render each view of a batch with its own Gaussians."""
+    camera, background, arguments = inputs
+    if setup.model is IDENTITY:
+        return render(params.gaussians, camera, raster, background, **arguments)
+    count = batch.view.shape[0]
+    time = jnp.zeros(count) if batch.time is None else batch.time
+
+    def one(inputs) -> Render:
+        info, camera, arguments = inputs
+        gaussians = setup.model.apply(params, info)
+        return render(gaussians, camera, raster, background, **arguments)
+
+    views = ViewInfo(batch.view, time), camera, arguments
+    if count == 1:
+        found = one(jax.tree.map(lambda a: a[0], views))
+        found = jax.tree.map(lambda a: a[None], found)
+    else:
+        found = lax.map(one, views)
+    demand = found.demand._replace(
+        visible=jnp.max(found.demand.visible),
+        pairs=jnp.sum(found.demand.pairs),
+        capacity=jnp.max(found.demand.capacity),
+    )
+    return found._replace(demand=demand, overflowed=jnp.any(found.overflowed))
+
+
+def _advance(setup: Setup):
+    config, strategy = setup.config, setup.strategy
+
     def advance(state: TrainState, found: Gradients):
-        by = found.by_params, found.by_refinement, found.by_probe
-        finite = jnp.isfinite(found.loss) & all_within(by, _STEEPEST)
+        by = found.by_slots, found.by_shared, found.by_probe
+        finite = jnp.isfinite(found.loss) & all_within(by, _MAX_GRADIENT)
 
         def keep():
             return state, jnp.asarray(True)
@@ -168,11 +257,11 @@ def make_stages(
 
         def update():
             with jax.named_scope("optimise"):
-                moved, good = _optimise(state, found, config, extent)
-            _, by_noise, _ = _keys(state.key, state.step)
-            rate = means_rate(config.rates, moved.step / config.steps, extent)
+                moved, good = optimise(setup, state, found)
+            _, noise_key, _ = _keys(state.key, state.step)
+            rate = means_rate(config.rates, moved.step / config.steps, setup.extent)
             with jax.named_scope("observe"):
-                return _observe(moved, found, by_noise, densifier, rate), good
+                return _observe(moved, found, noise_key, strategy, rate), good
 
         after, good = lax.cond(
             found.overflowed, keep, lambda: lax.cond(finite, update, skip)
@@ -188,100 +277,100 @@ def make_stages(
             overflowed=found.overflowed,
             finite=finite & good,
         )
-        return after, metrics, ~found.overflowed & finite & densifier.due(after.step)
+        return after, metrics, ~found.overflowed & finite & strategy.due(after.step)
+
+    return advance
+
+
+def _edit(setup: Setup):
+    strategy = setup.strategy
 
     def edit(state: TrainState, metrics: Metrics) -> tuple[TrainState, Metrics]:
-        *_, by_plan = _keys(state.key, state.step - 1)
-        plan, stats = densifier.plan(by_plan, state.step, state.gaussians, state.stats)
+        *_, key = _keys(state.key, state.step - 1)
+        plan, stats = strategy.plan(key, state.step, state.gaussians, state.stats)
         gaussians, moments = apply_edit(plan, state.moments)
-        state = state.replace(gaussians=gaussians, moments=moments, stats=stats)
+        model = state.model._replace(slots=copy_rows(plan, state.model.slots))
+        state = state.replace(
+            gaussians=gaussians, model=model, moments=moments, stats=stats
+        )
         count = num_active(gaussians)
         return state, metrics._replace(gaussians=count, wanted=plan.wanted)
 
-    return Stages(differentiate, advance, edit)
-
-
-def _transparent(batch: Batch) -> bool:
-    """Whether something shows through the photographs."""
-    return batch.pixels.shape[-1] == 4
+    return edit
 
 
 def _keys(key: Array, step: Array) -> Array:
-    """[3] of the step behind ``step`` others: background, noise and edit."""
+    """Return the keys [3] of a step: background, noise and edit."""
     return jax.random.split(jax.random.fold_in(key, step), 3)
 
 
 def background_of(config: TrainConfig, transparent: bool, key: Array, dtype) -> Array:
-    """[3] colour behind the scene, and behind photographs that are ``transparent``."""
+    """Return the colour [3] behind the scene and behind transparent photographs."""
     if config.background == "random" or (config.background == "auto" and transparent):
         return jax.random.uniform(key, (3,), dtype)
     return jnp.full(3, 1.0 if config.background == "white" else 0.0, dtype)
 
 
-def targets(batch: Batch, background: Array, dtype) -> tuple[Array, Array | None]:
-    """What to learn, [B, H, W, 3] in [0, 1], and the weights [B, H, W] or None."""
-    values = batch.pixels.astype(dtype) / 255
-    rgb = values[..., :3]
-    if _transparent(batch):
-        alpha = values[..., 3:]
-        rgb = rgb * alpha + background * (1 - alpha)
-    return rgb, None if batch.valid is None else batch.valid.astype(dtype)
-
-
-def _optimise(
-    state: TrainState, found: Gradients, config: TrainConfig, extent: float
+def optimise(
+    setup: Setup, state: TrainState, found: Gradients
 ) -> tuple[TrainState, Array]:
-    """Parameters and corrections after one step of Adam; whether all made it."""
-    by_params, by_refinement = found.by_params, found.by_refinement
-    bases = by_params.sh.shape[-2]
-    degree = jnp.floor(jnp.sqrt(jnp.arange(bases, dtype=jnp.float32))).astype(jnp.int32)
-    learnt = degree <= state.step // config.sh_every
-    sh = jnp.where(learnt[:, None], by_params.sh, 0)
-    params, moments = adam_step(
-        state.gaussians.params,
-        by_params.replace(sh=sh),  # pyright: ignore
-        state.moments,
-        config.rates,
-        state.step / config.steps,
-        extent,
+    """Return the state after an optimiser update, and whether it is finite.
+
+    Numbers that would become non-finite keep their values.
+    """
+    config, by_slots = setup.config, found.by_slots
+    sh = by_slots.gaussians.sh
+    bases = jnp.arange(sh.shape[-2], dtype=jnp.float32)
+    degree = jnp.floor(jnp.sqrt(bases)).astype(jnp.int32)
+    enabled = degree <= state.step // config.sh_every
+    gaussians = by_slots.gaussians.replace(  # pyright: ignore
+        sh=jnp.where(enabled[:, None], sh, 0)
     )
-    good, params = _still_numbers(state.gaussians, params)
-    refinement, refinement_moments = refinement_step(
-        state.refinement, by_refinement, state.refinement_moments, config
+    by_slots = by_slots._replace(gaussians=gaussians)
+    fraction = state.step / config.steps
+
+    def update(gradients, moments, params: Any) -> tuple[Any, Any]:
+        updates, moments = setup.optimiser.update(
+            gradients, moments, params, fraction=fraction
+        )
+        return optax.apply_updates(params, updates), moments
+
+    slots, moments = update(by_slots, state.moments, state.slot_params)
+    good, slots = _keep_finite(state.gaussians.active, state.slot_params, slots)
+    shared, shared_moments = update(
+        found.by_shared, state.shared_moments, state.shared_params
     )
-    moved = state.replace(
-        step=state.step + 1,
-        gaussians=state.gaussians.replace(params=params),  # pyright: ignore
-        moments=moments,
-        refinement=refinement,
-        refinement_moments=refinement_moments,
+    moved = state.with_params(slots, shared).replace(
+        step=state.step + 1, moments=moments, shared_moments=shared_moments
     )
-    return moved, good & all_within(refinement)
+    return moved, good & all_within(shared)
 
 
-def _still_numbers(before: Gaussians, params) -> tuple[Array, Any]:
-    """Whether all numbers are still finite; parameters, with those that are not as
-    they were before."""
+def _keep_finite(active: Array, before: Any, after: Any) -> tuple[Array, Any]:
+    """Return whether all active slots are finite, and the finite values.
+
+    Values that are not finite are replaced by those before the update.
+    """
 
     def is_good(number):
-        active = before.active.reshape(-1, *(1,) * (number.ndim - 1))
-        return jnp.isfinite(number) | ~active
+        wide = active.reshape(-1, *(1,) * (number.ndim - 1))
+        return jnp.isfinite(number) | ~wide
 
-    good = jax.tree.map(is_good, params)
-    kept = jax.tree.map(jnp.where, good, params, before.params)
+    good = jax.tree.map(is_good, after)
+    kept = jax.tree.map(jnp.where, good, after, before)
     return jnp.all(jnp.stack([jnp.all(g) for g in jax.tree.leaves(good)])), kept
 
 
 def _observe(
-    state: TrainState, found: Gradients, key: Array, densifier: Densifier, rate: Array
+    state: TrainState, found: Gradients, key: Array, strategy: Strategy, rate: Array
 ) -> TrainState:
-    """What the strategy does at each step: its noise, and what it gathers."""
+    """Apply the noise of the strategy and update its statistics."""
     gaussians = state.gaussians
-    if densifier.perturb is not None:
-        moved = densifier.perturb(key, gaussians, rate)
+    if strategy.perturb is not None:
+        moved = strategy.perturb(key, gaussians, rate)
         gaussians = gaussians.replace(params=moved)  # pyright: ignore
     # The loss is a mean over the views of the step.
     gradient = found.by_probe * found.radii.shape[0]
-    seen = Observation(gradient, found.radii, *found.size.T)
-    stats = densifier.observe(state.stats, seen)
+    observation = Observation(gradient, found.radii, *found.size.T)
+    stats = strategy.observe(state.stats, observation)
     return state.replace(gaussians=gaussians, stats=stats)

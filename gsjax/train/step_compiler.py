@@ -1,8 +1,8 @@
-"""What a run compiles: the stages of its step, side by side and no more than change.
+"""Concurrent compilation of the stages of a training step, by their sizes.
 
-To differentiate is most of a step's compiling, and alone of the stages depends on the
-photographs' size and on the room for pairs. The others go with the slots; they compile
-on a second core while that one is traced.
+Differentiation is most of the compile time, and the only stage that depends on the size
+of the photographs and the pair capacity. The other stages depend on the slots alone;
+they compile in a second thread while differentiation is traced.
 """
 
 from collections.abc import Callable
@@ -12,56 +12,53 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gsjax.densify.schedule import edits_between
-from gsjax.raster.render import device_count
+from gsjax.raster.tile_render import device_count
 from gsjax.raster.types import RasterConfig
 from gsjax.runtime.devices import replicated_sharding
 from gsjax.runtime.memory import require
-from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Frames, draw
 from gsjax.train.memory_estimate import step_estimate
+from gsjax.train.setup import Setup
 from gsjax.train.state import Gradients, Metrics, TrainState, gradients_like
-from gsjax.train.step import Stages, make_stages
+from gsjax.train.step import Stages, make_stages, step_raster
 
 Array = jax.Array
 
 
 class StepCompiler:
-    """The compiled stages of one run, by their sizes.
+    """Compiled stages of one run, by their sizes.
 
     Attributes:
-      by_sizes: differentiating, by size of the photographs, slots and settings.
-      by_slots: the stages behind it, by slots.
+      by_sizes: differentiation, by size of the photographs, slots and render settings.
+      by_slots: the other stages, by number of slots.
     """
 
-    def __init__(
-        self, config: TrainConfig, extent: float, phase: Callable[[str], None]
-    ):
-        """For a run of these settings; ``phase`` is told what is being compiled."""
-        self._config, self._extent, self._phase = config, extent, phase
-        self._whole = replicated_sharding(device_count(config.raster))
+    def __init__(self, setup: Setup, phase: Callable[[str], None]):
+        """Prepare the compilation of a run; ``phase`` receives progress messages."""
+        self._setup, self._phase = setup, phase
+        self._sharding = replicated_sharding(device_count(setup.config.raster))
         self._worker = ThreadPoolExecutor(1)
         self.by_sizes: dict[Any, Any] = {}
-        self.by_slots: dict[int, _Behind] = {}
+        self.by_slots: dict[int, _SlotStages] = {}
 
     def close(self) -> None:
-        """Begin nothing more; what is being compiled nobody waits for."""
+        """Cancel compilations that have not started."""
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     def place(self, tree: Any) -> Any:
-        """``tree`` where the programs want it: on all devices that they run on."""
-        return tree if self._whole is None else jax.device_put(tree, self._whole)
+        """Return ``tree`` on all devices that the programs run on."""
+        return tree if self._sharding is None else jax.device_put(tree, self._sharding)
 
     def step(
         self, state: TrainState, frames: Frames, raster: RasterConfig
     ) -> "CompiledStep":
-        """The stages for these sizes, compiled; editing perhaps not yet.
+        """Return the step for these sizes; its edit may still be compiling.
 
         Raises:
-          CapacityError: if it would take more memory than there is.
+          CapacityError: if it would take more memory than is available.
         """
         slots = state.gaussians.capacity
-        kind = (frames.pixels.shape, jax.tree.structure(frames))  # what it lacks, too
+        kind = (frames.pixels.shape, jax.tree.structure(frames))
         sizes = (kind, slots, raster)
         if sizes not in self.by_sizes:
             self._compile(sizes, state, frames, raster)
@@ -70,80 +67,82 @@ class StepCompiler:
     def _compile(
         self, sizes: Any, state: TrainState, frames: Frames, raster: RasterConfig
     ) -> None:
-        config, slots = self._config, state.gaussians.capacity
+        setup, slots = self._setup, state.gaussians.capacity
         height, width = frames.pixels.shape[1:3]
         told = f"{width} × {height} px, {slots:,} slots, {raster.pair_capacity:,} pairs"
-        self._phase(f"compiling, half a minute or so, for {told}")
+        self._phase(f"compiling (about 30 s) for {told}")
         require(
-            step_estimate(slots, (width, height), config, raster, frames.pixels.nbytes),
+            step_estimate(
+                slots,
+                (width, height),
+                setup.config,
+                step_raster(setup, raster),
+                frames.pixels.nbytes,
+            ),
             f"a step for {told},",
             "train with smaller photographs (--max-size) or fewer Gaussians "
             "(--max-gaussians)",
         )
-        stages = make_stages(config, self._extent, raster)
+        stages = make_stages(setup, raster)
 
         def differentiate(state: TrainState, frames: Frames, view: Array) -> Gradients:
             return stages.differentiate(state, draw(frames, view))
 
         if slots not in self.by_slots:
-            self.by_slots[slots] = self._begin(state, stages)
-        view = jax.ShapeDtypeStruct((config.batch,), jnp.int32)
+            self.by_slots[slots] = self._compile_slot_stages(state, stages)
+        view = jax.ShapeDtypeStruct((setup.config.batch,), jnp.int32)
         inputs = self._shapes((state, frames, view))
         self.by_sizes[sizes] = self._jit(differentiate).lower(*inputs).compile()
         self.by_slots[slots].advance.result()
 
-    def _begin(self, state: TrainState, stages: Stages) -> "_Behind":
-        """Compile in another thread; it is traced in this one, whose settings of JAX
-        are meant."""
-        config, strategy = self._config, self._config.chosen
+    def _compile_slot_stages(self, state: TrainState, stages: Stages) -> "_SlotStages":
+        """Trace here, because JAX's settings are per thread; compile in the other."""
+        config, schedule = self._setup.config, self._setup.schedule
         shapes, found = self._shapes((state, gradients_like(state, config.batch)))
         advance = self._jit(stages.advance, donate_argnums=0).lower(shapes, found)
         advancing = self._worker.submit(advance.compile)
-        when = strategy.start, strategy.stop, strategy.every
-        if not edits_between(0, config.steps, *when):
-            return _Behind(advancing, None)
+        if not schedule.edits_between(0, config.steps):
+            return _SlotStages(advancing, None)
         _, metrics, _ = advance.out_info
         edit = self._jit(stages.edit, donate_argnums=0)
         edit = edit.lower(shapes, self._shapes(metrics))
-        return _Behind(advancing, self._worker.submit(edit.compile))
+        return _SlotStages(advancing, self._worker.submit(edit.compile))
 
     def _jit(self, stage: Callable, **options):
-        return jax.jit(stage, out_shardings=self._whole, **options)
+        return jax.jit(stage, out_shardings=self._sharding, **options)
 
     def _shapes(self, tree: Any) -> Any:
-        """Of arrays that lie where the programs want them, or on the one device that
-        they were put on."""
+        """Return shapes with the sharding of the programs, or of committed arrays."""
 
         def shape(a):
-            put = isinstance(a, jax.Array) and a.committed
-            lies = self._whole or (a.sharding if put else None)
-            return jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=lies)
+            committed = isinstance(a, jax.Array) and a.committed
+            sharding = self._sharding or (a.sharding if committed else None)
+            return jax.ShapeDtypeStruct(a.shape, a.dtype, sharding=sharding)
 
         return jax.tree.map(shape, tree)
 
 
-class _Behind(NamedTuple):
-    """What goes with the slots alone; no edit in a run without any."""
+class _SlotStages(NamedTuple):
+    """Stages that depend on the slots alone; ``edit`` is None in runs without edits."""
 
     advance: Future
     edit: Future | None
 
 
 class CompiledStep(NamedTuple):
-    """One step of a run by its compiled stages; see `gsjax.train.step.make_stages`."""
+    """A training step from compiled stages; see `gsjax.train.step.make_stages`."""
 
     differentiate: Any
-    behind: _Behind
+    slot_stages: _SlotStages
 
     def __call__(
         self, state: TrainState, frames: Frames, view: Array
     ) -> tuple[TrainState, Metrics]:
-        """As `gsjax.train.step.TrainStep`, metrics on the host; the state's memory is
-        taken over."""
+        """Run a step; donates the state and returns the metrics on the host."""
         found = self.differentiate(state, frames, view)
-        state, metrics, due = self.behind.advance.result()(state, found)
+        state, metrics, due = self.slot_stages.advance.result()(state, found)
         del found
         if due:
-            assert self.behind.edit is not None
-            state, metrics = self.behind.edit.result()(state, metrics)
+            assert self.slot_stages.edit is not None
+            state, metrics = self.slot_stages.edit.result()(state, metrics)
         return state, jax.device_get(metrics)

@@ -1,4 +1,4 @@
-"""Gaussians that no photograph shows: what is learnt cannot tell anything of them.
+"""Removal of the Gaussians that no training view shows.
 
 Axis legend: N Gaussians (capacity), V views.
 """
@@ -13,8 +13,9 @@ from gsjax.gaussians import Gaussians
 from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig
 from gsjax.train.camera_refinement import refine_camera
-from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Frames
+from gsjax.train.models import IDENTITY, ViewInfo
+from gsjax.train.setup import Setup
 from gsjax.train.state import TrainState
 
 Array = jax.Array
@@ -24,38 +25,44 @@ Array = jax.Array
 def _in_view(
     gaussians: Gaussians, camera: Camera, size: Array | None, raster: RasterConfig
 ) -> Array:
-    """[N] of a batch of cameras; colours and pairs are not in the program."""
-    return jnp.any(render(gaussians, camera, raster, size=size).radii > 0, 0)
+    """Return [N] bool: the Gaussians visible to any camera of a batch."""
+    return jnp.any(
+        render(gaussians, camera.replace(visible_size=size), raster).radii > 0, 0
+    )
 
 
 def prune_invisible(
-    state: TrainState, frames: Frames, config: TrainConfig, extent: float
+    state: TrainState, frames: Frames, setup: Setup
 ) -> tuple[TrainState, int]:
-    """``state`` without the Gaussians that none of the views show, to the bit.
+    """Remove the Gaussians that none of the views show; the views stay bit-equal.
 
-    Most are fainter than the α cut everywhere; the others have drifted out of view, and
-    would stand before a camera elsewhere as a blur that no photograph knows of.
+    They are below the α threshold everywhere, or outside of all views, where they would
+    appear from other viewpoints as blur.
 
     Args:
-      state: of the run.
-      frames: V views, at the size they were last trained at.
-      config: the settings.
-      extent: of the scene, in its units.
+      state: state of the run.
+      frames: V views, at the size of the last step.
+      setup: parts of the training step.
 
     Returns:
-      The state, its slots free where there was one, and how many those were.
+      The state, and the number of Gaussians removed.
     """
-    raster = config.raster.replace(
+    raster = setup.config.raster.replace(
         outputs=("alpha",), num_size_buckets=1, absgrad=False, visible_capacity=None
     )
-    seen = jnp.zeros(state.gaussians.capacity, bool)
+    visible = jnp.zeros(state.gaussians.capacity, bool)
     for view in range(frames.count):
         index = jnp.full(1, view, jnp.int32)
-        shown = (frames.camera, frames.size)
-        camera, size = jax.tree.map(lambda a, i=index: a[i], shown)
-        camera = refine_camera(camera, state.refinement, index, extent)
-        seen |= _in_view(state.gaussians, camera, size, raster)
+        arrays = frames.camera, frames.size, frames.time
+        camera, size, time = jax.tree.map(lambda a, i=index: a[i], arrays)
+        camera = refine_camera(camera, state.refinement, index, setup.extent)
+        gaussians = state.gaussians
+        if setup.model is not IDENTITY:
+            time = jnp.zeros(1) if time is None else time
+            info = ViewInfo(index[0], time[0])
+            gaussians = setup.model.apply(state.params, info)
+        visible |= _in_view(gaussians, camera, size, raster)
     active = state.gaussians.active
-    dropped = int(jnp.sum(active & ~seen))
-    gaussians = state.gaussians.replace(active=active & seen)  # pyright: ignore
+    dropped = int(jnp.sum(active & ~visible))
+    gaussians = state.gaussians.replace(active=active & visible)  # pyright: ignore
     return state.replace(gaussians=gaussians), dropped
