@@ -28,8 +28,8 @@ import measure
 import numpy as np
 
 import gsjax
-from gsjax.runs.folder import load_data, load_settings, run_files
-from gsjax.runs.trajectories import path_entries
+from gsjax.runs.folder import load_settings, load_split, run_files
+from gsjax.runs.trajectories import view_entries
 
 PACKAGES = ("@mkkellogg/gaussian-splats-3d@0.4.7", "three@0.167.1")
 PATIENCE = 300.0  # s: the browser draws without a GPU
@@ -149,18 +149,18 @@ def main() -> None:
     parser.add_argument("run", type=Path, metavar="RUN")
     run = parser.parse_args().run
     settings, files = load_settings(run), run_files(run)
-    data = load_data(settings)
+    split = load_split(settings)
     size = settings.config.max_size
-    entry = path_entries(data, "train", max_size=size)[0]
+    entry = view_entries(split.views("train"), max_size=size)[0]
     gaussians = gsjax.load(files.splat)
     with tempfile.TemporaryDirectory() as folder:
         found = theirs(
-            Path(folder), files.splat, entry.camera, data.scene.origin,
+            Path(folder), files.splat, entry.camera, split.dataset.origin,
             gaussians.sh_degree,
         )  # fmt: skip
     scene = gaussians.replace(
         params=gaussians.params.replace(
-            means=gaussians.params.means - data.scene.origin.astype(np.float32)
+            means=gaussians.params.means - split.dataset.origin.astype(np.float32)
         )
     )
     view = gsjax.render_exact(scene, entry.camera, settings.config.raster)

@@ -122,16 +122,17 @@ class Run(NamedTuple):
 
 def of_run(folder: Path) -> Run:
     """The scene and the cameras of a run that ``gsjax train`` made."""
-    from gsjax.runs.folder import load_data, load_scene, load_settings, run_files
-    from gsjax.runs.trajectories import path_entries
+    from gsjax.runs.folder import load_scene, load_settings, load_split, run_files
+    from gsjax.runs.trajectories import CAMERA_PATHS, path_entries, view_entries
 
     settings = load_settings(folder)
-    data = load_data(settings)
+    split = load_split(settings)
     size = settings.config.max_size
-    seen = path_entries(data, "train", max_size=size)
-    between = path_entries(data, "interpolate", frames=400, max_size=size)
+    seen = view_entries(split.views("train"), max_size=size)
+    path = CAMERA_PATHS["interpolate"]
+    between = path_entries(split.dataset, path, frames=400, max_size=size)
     return Run(
-        load_scene(run_files(folder).splat, data.scene.origin),
+        load_scene(run_files(folder).splat, split.dataset.origin),
         [entry.camera for entry in seen],
         [entry.camera for entry in between],
     )

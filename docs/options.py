@@ -12,6 +12,9 @@ from pathlib import Path
 SOURCE = Path(__file__).parents[1] / "gsjax" / "cli"
 _MARK = re.compile(r"<!-- options: (\w+) -->")
 _METAVARS = {"int": "N", "float": "X", "str": "TEXT", "Path": "PATH", "bool": ""}
+# Types of gsjax.cli.options.
+_METAVARS |= {"Size": "WxH", "OptionalSize": "WxH", "Kinds": "KINDS"}
+_METAVARS |= {"Color": "R,G,B", "Budget": "ERROR"}
 
 
 def _sources() -> list[str]:
@@ -20,7 +23,7 @@ def _sources() -> list[str]:
 
 def command_classes() -> dict[str, str]:
     """Return the class of each command by its name."""
-    pattern = re.compile(r'^ +"(\w+)": (\w+Command),$', re.MULTILINE)
+    pattern = re.compile(r'^ +"(\w+)": \("\w+", "(\w+Command)"\),$', re.MULTILINE)
     return dict(pair for text in _sources() for pair in pattern.findall(text))
 
 
@@ -55,7 +58,7 @@ def row(field: ast.AnnAssign, help_text: str) -> str:
     kind, name = ast.unparse(field.annotation), ast.unparse(field.target)
     choices = re.search(r"Literal\[(.*?)\]", kind)
     metavar = re.search(r"metavar='(.*?)'", kind)
-    plain = re.search(r"\b(int|float|str|Path|bool)\b", kind)
+    plain = re.search(rf"\b({'|'.join(_METAVARS)})\b", kind)
     if metavar:
         value = metavar[1]
     elif choices:
@@ -79,7 +82,9 @@ def _literal(value: ast.expr) -> str:
     if isinstance(value, ast.Call):  # Path("…")
         value = value.args[0]
     plain = ast.literal_eval(value)
-    return "" if plain is None or plain is False or plain in ((), "") else str(plain)
+    if isinstance(plain, tuple):
+        plain = ("x" if plain and type(plain[0]) is int else ",").join(map(str, plain))
+    return "" if plain is None or plain is False else str(plain)
 
 
 def table(command: str) -> str:

@@ -1,4 +1,4 @@
-"""`python -m gsjax`: the command line."""
+"""`python -m gsjax` runs the command line."""
 
 import sys
 

@@ -12,9 +12,9 @@ from gsjax.data.transforms import (
 )
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
-from gsjax.runs.folder import load_data, load_settings, refined_data, run_files
+from gsjax.runs.folder import load_settings, load_split, run_files, with_refined_cameras
 from gsjax.runs.scene_source import is_run, open_scene_source
-from gsjax.runs.trajectories import path_entries
+from gsjax.runs.trajectories import view_entries
 from gsjax.synthetic.stress_scenes import STRESS_SCENES, StressScene
 
 _SIZE = (400, 300)
@@ -50,9 +50,10 @@ def open_stress_scene(
         camera = _first(cameras, entries)
     elif is_run(path):
         settings = load_settings(path)
-        data = refined_data(load_data(settings), run_files(path))
-        origin = data.scene.origin
-        entries = path_entries(data, "train", max_size=settings.config.max_size)
+        split = with_refined_cameras(load_split(settings), run_files(path))
+        origin = split.dataset.origin
+        max_size = settings.config.max_size
+        entries = view_entries(split.views("train"), max_size=max_size)
         camera = _sized(entries[0].camera, size)
     subject = open_scene_source(path, origin=origin)
     gaussians = subject.load()

@@ -1,4 +1,4 @@
-"""`gsjax demo`: photographs from nothing, a scene trained on them, and a turntable."""
+"""`gsjax demo`: synthetic photographs, a scene trained on them, and a turntable."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,40 +10,35 @@ from gsjax.cli.common import (
     HeavyCommand,
     UsageError,
     command_line,
-    parse_size,
     start_jax,
     view_hint,
 )
+from gsjax.cli.options import Size, integer
 from gsjax.runtime.console import decibels, note, say
 
 
 @dataclass(kw_only=True)
 class DemoCommand(HeavyCommand):
-    """Take photographs of a made-up still life, train a scene on them, and show it."""
+    """Render photographs of a synthetic still life, train a scene on them, and render
+    a turntable."""
 
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR")] = Path("gsjax-demo")
     """Folder for dataset/, run/ and turntable.webp; created if missing."""
-    steps: int = 600
-    """Steps of training."""
-    size: Annotated[str, arg(metavar="WxH")] = "256x192"
+    steps: Annotated[int, integer(1)] = 600
+    """Number of training steps."""
+    size: Size = (256, 192)
     """Size of the photographs."""
-    photos: int = 40
-    """How many; every 8th is held out to measure with."""
-    seed: int = 0
-    """Of the points to start from, and of the training."""
+    photos: Annotated[int, integer(2, 1000)] = 40
+    """Number of photographs; every 8th is held out for evaluation."""
+    seed: Annotated[int, integer(0)] = 0
+    """Seed of the initial points and of the training."""
     overwrite: bool = False
-    """Replace a demonstration that exists."""
+    """Replace an existing demo."""
 
     def run(self) -> int:
-        width, height = parse_size(self.size)
+        width, height = self.size
         if min(width, height) < 16:
-            raise UsageError(f"--size {self.size}: from 16x16")
-        if not 1 <= self.steps < 2**31 - 1:
-            raise UsageError(f"--steps {self.steps}: from 1 to {2**31 - 2} is wanted")
-        if not 2 <= self.photos <= 1000:
-            raise UsageError(f"--photos {self.photos}: from 2 to 1000 is wanted")
-        if not 0 <= self.seed < 2**31:
-            raise UsageError(f"--seed {self.seed}: from 0 to {2**31 - 1} is wanted")
+            raise UsageError(f"--size {width}x{height}: expected at least 16x16")
         start_jax()
         from gsjax.runs.demo import DemoSettings, run_demo
 
@@ -51,30 +46,25 @@ class DemoCommand(HeavyCommand):
         files, result = run_demo(self.out, settings, overwrite=self.overwrite)
         if not result.finished:
             again = command_line("train", files.dataset, "-o", files.run, "--resume")
-            note(f"stopped after step {result.step}; go on with {again}")
+            note(f"stopped after step {result.step}; resume with {again}")
             return 130
-        summary = result.summary
+        summary, written = result.summary, result.files
         assert summary is not None, "some views are held out"
-        for path in (
-            result.files.splat,
-            result.files.preview,
-            result.files.curves,
-            files.turntable,
-        ):
+        for path in (written.splat, written.preview, written.curves, files.turntable):
             say(str(path))
         say(
             f"{result.gaussians:,} Gaussians, {result.seconds:.0f} s; "
             f"{summary.views} held-out views: PSNR {decibels(summary.psnr)}, "
             f"SSIM {summary.ssim:.4f}"
         )
+        views = ("--path", "test", "-o", self.out / "views")
+        opaque = (self.out / "scene.ply", "--min-opacity", "0.01")
         note("done; next, try")
         note(f"  {view_hint(files.run)}")
-        views, small = ("--path", "test", "-o", self.out / "views"), "--min-opacity"
-        ply = self.out / "scene.ply"
         note(f"  {command_line('info', files.run)}")
         note(f"  {command_line('render', files.run, *views)}")
-        note(f"  {command_line('export', files.run, ply, small, '0.01')}")
-        note("and with photographs of your own")
+        note(f"  {command_line('export', files.run, *opaque)}")
+        note("and with your own photographs")
         note("  gsjax sfm PHOTOS -o DATASET")
         note("  gsjax train DATASET -o RUN --preset fast")
         return 0

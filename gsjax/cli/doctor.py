@@ -1,4 +1,4 @@
-"""`gsjax doctor`: is the installation well?"""
+"""`gsjax doctor`: checks of the installation."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,8 @@ from gsjax.runtime.console import say
 
 @dataclass(kw_only=True)
 class DoctorCommand(Command):
-    """Check the installation: versions, devices, and a tiny render."""
+    """Check the installation: versions, devices, and a small render against a
+    reference. The exit code is 1 if a check fails."""
 
     def run(self) -> int:
         start_jax()

@@ -1,4 +1,4 @@
-"""Is this installation well? Versions, devices, and a render against the oracle."""
+"""Checks of the installation: versions, devices, and a render against the reference."""
 
 import importlib
 import os
@@ -9,70 +9,59 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsjax.raster.exact import render_exact
 from gsjax.raster.reference import reference_render
-from gsjax.raster.render import DEFAULT_CONFIG, render_exact
+from gsjax.raster.render import DEFAULT_CONFIG
 from gsjax.runtime.machine import usable_cores
 from gsjax.synthetic.torus_knot import torus_knot_scene
 
-# Package that is installed, module that is imported, what is not without it.
+# Name shown, module imported, package to install, and what needs it.
 _PACKAGES = (
-    ("jax", "jax", "everything needs it"),
-    ("jaxlib", "jaxlib", "everything needs it"),
-    ("numpy", "numpy", "everything needs it"),
-    ("opencv-contrib-python-headless", "cv2", "photographs and images need it"),
-    ("pycolmap", "pycolmap", "gsjax sfm needs it"),
+    ("jax", "jax", "jax", "everything needs it"),
+    ("jaxlib", "jaxlib", "jaxlib", "everything needs it"),
+    ("numpy", "numpy", "numpy", "everything needs it"),
+    ("opencv", "cv2", "opencv-contrib-python-headless", "images need it"),
+    ("pycolmap", "pycolmap", "pycolmap", "gsjax sfm needs it"),
 )
 _TOLERANCE = 1e-4
 
 
 def doctor_lines() -> tuple[list[str], bool]:
-    """The report as lines, and whether all packages are there and rendering works."""
-    lines = [f"gsjax     {version('gsjax')}", f"python    {platform.python_version()}"]
-    packages = {name: _package(*rest) for name, *rest in _package_rows()}
-    lines += [f"{name:<9} {told}" for name, (told, _) in packages.items()]
+    """Return a report as lines, and whether every check passed."""
     devices = jax.local_devices()
     kinds = sorted({f"{d.platform} ({d.device_kind})" for d in devices})
-    lines.append(f"devices   {len(devices)} × {', '.join(kinds)}")
-    lines.append(f"cores     {_cores()}")
-    lines.append(f"memory    {_memory()}")
-    lines.append(f"float64   {'on' if jax.config.jax_enable_x64 else 'off'}")  # pyright: ignore
+    cores = usable_cores()
+    rows = {"gsjax": version("gsjax"), "python": platform.python_version()}
+    packages = {name: _package(*rest) for name, *rest in _PACKAGES}
+    rows |= {name: text for name, (text, _) in packages.items()}
+    rows["devices"] = f"{len(devices)} × {', '.join(kinds)}"
+    rows["cores"] = f"{cores} usable of {os.cpu_count() or cores}"
+    rows["memory"] = _memory()
+    rows["float64"] = "on" if jax.config.jax_enable_x64 else "off"  # pyright: ignore
     error, compared = render_error()
     good = compared > 0 and error <= _TOLERANCE
-    verdict = "well" if good else f"NOT WELL, at most {_TOLERANCE:g} is wanted"
-    lines.append(
-        f"render    {error:.2g} from the reference at most, over {compared} pixels: "
-        f"{verdict}"
-    )
-    return lines, good and all(there for _, there in packages.values())
+    verdict = "ok" if good else f"FAILED, expected at most {_TOLERANCE:g}"
+    rows["render"] = f"maximum error {error:.2g} over {compared} pixels: {verdict}"
+    lines = [f"{name:<9} {text}" for name, text in rows.items()]
+    return lines, good and all(found for _, found in packages.values())
 
 
 def version(package: str) -> str:
-    """Installed version of a package, or what to say in its place."""
+    """Return the installed version of a package, or "unknown (not installed)"."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return "unknown (not installed)"
 
 
-def _package_rows():
-    for package, module, use in _PACKAGES:
-        yield {"cv2": "opencv"}.get(module, module), package, module, use
-
-
-def _package(package: str, module: str, use: str) -> tuple[str, bool]:
-    """Version, or why the package cannot be used and what then is missing; whether it
-    can."""
+def _package(module: str, package: str, use: str) -> tuple[str, bool]:
+    """Return the version of a package or why it fails, and whether it imports."""
     try:
         loaded = importlib.import_module(module)
     except Exception as error:  # a broken binary may raise anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        return f"NOT WELL, absent ({reason}); {use}: pip install {package}", False
+        return f"FAILED ({reason}); {use}: pip install {package}", False
     return getattr(loaded, "__version__", version(package)), True
-
-
-def _cores() -> str:
-    usable = usable_cores()
-    return f"{usable} usable of {os.cpu_count() or usable}"
 
 
 def _memory() -> str:
@@ -84,10 +73,10 @@ def _memory() -> str:
 
 
 def render_error() -> tuple[float, int]:
-    """Largest difference from the dense reference in a tiny scene, and the pixels.
+    """Return the maximum error of a small render, and the number of pixels compared.
 
-    Pixels within a relative 1e-3 of a threshold are left out: there the two may
-    rightly differ by a whole Gaussian.
+    Pixels within a relative 1e-3 of a threshold are excluded: there, the renders may
+    differ by a whole Gaussian.
     """
     scene = torus_knot_scene(count=60, frames=1, width=32, height=24)
     gaussians, camera = scene.gaussians, scene.cameras[0]
@@ -95,8 +84,8 @@ def render_error() -> tuple[float, int]:
     background = jnp.asarray(scene.background)
 
     def reference(params):
-        seen = gaussians.replace(params=params)  # pyright: ignore
-        return reference_render(seen, camera, config, background)
+        with_params = gaussians.replace(params=params)  # pyright: ignore
+        return reference_render(with_params, camera, config, background)
 
     fast = render_exact(gaussians, camera, config, background)
     slow = jax.jit(reference)(gaussians.params)

@@ -1,4 +1,4 @@
-"""`gsjax eval`: how well a run shows the views that were held out."""
+"""`gsjax eval`: metrics of a run on its held-out views."""
 
 import json
 from dataclasses import dataclass
@@ -13,37 +13,34 @@ from gsjax.runtime.console import decibels, note, say
 
 @dataclass(kw_only=True)
 class EvalCommand(HeavyCommand):
-    """Measure a run: PSNR and SSIM of held-out views, with pictures."""
+    """Evaluate a run: PSNR and SSIM of its held-out views, with renders."""
 
     folder: Positional[Path]
     """Folder of the run."""
     views: Literal["test", "train"] = "test"
-    """Which views to measure on."""
+    """Evaluate the held-out or the training views."""
     json: bool = False
     """Print JSON."""
 
     def run(self) -> int:
         start_jax()
         from gsjax.runs.checkpoint import latest_step
+        from gsjax.runs.evaluation import evaluate_run
         from gsjax.runs.folder import load_settings, run_files
-        from gsjax.runs.held_out import evaluate_run
 
         summary = evaluate_run(self.folder, which=self.views)
         files = run_files(self.folder, self.views)
         steps = load_settings(self.folder).config.steps
         saved = latest_step(files.checkpoints)
         if saved is not None and saved < steps:
-            note(
-                f"this run is not at its end: step {saved:,} of {steps:,} is its last "
-                "checkpoint"
-            )
-        told = json.loads(files.eval.read_text(encoding="utf-8"))
+            note(f"the run is unfinished: step {saved:,} of {steps:,} is saved")
+        report = json.loads(files.eval.read_text(encoding="utf-8"))
         if self.json:
-            say(json.dumps(told, indent=2))
+            say(json.dumps(report, indent=2))
             return 0
-        for each in told["each"]:
+        for each in report["each"]:
             if each["ssim"] is None:
-                say(f"{each['name']}  masked altogether")
+                say(f"{each['name']}  fully masked")
                 continue
             say(
                 f"{each['name']}  PSNR {decibels(each['psnr'])}  "

@@ -1,4 +1,4 @@
-"""`gsjax export`: a scene to a file that viewers read."""
+"""`gsjax export`: a scene as a file for other programs."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,31 +6,29 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.cli.common import HeavyCommand, UsageError, start_jax
+from gsjax.cli.common import HeavyCommand, start_jax
+from gsjax.cli.options import real
 from gsjax.runtime.console import say
 
 
 @dataclass(kw_only=True)
 class ExportCommand(HeavyCommand):
-    """Write a scene as a standard PLY, or as a smaller .spz or .splat, in the
-    coordinates of its dataset."""
+    """Write a scene as .ply, .spz or .splat, in the coordinates of its dataset."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
-    """The Gaussians: a .ply or .spz file, or the folder of a run."""
+    """Folder of a run, or a .ply or .spz file."""
     out: Annotated[Positional[Path], arg(metavar="OUT.ply")]
-    """The file to write: .ply, .spz, about a fifth as large, or .splat, without
-    harmonics; folders above it are created."""
+    """File to write: .ply; .spz, about a fifth of the size; or .splat, without
+    spherical harmonics. Its folder is created if missing."""
     sh_degree: Literal[0, 1, 2, 3, 4] | None = None
-    """Degree of the spherical harmonics: higher ones are cut, lower ones filled up
-    with zeros (some viewers read degree 3 only)."""
-    min_opacity: float = 0.0
-    """Leave out Gaussians of a lower opacity; 0.005 is hardly seen."""
+    """SH degree to write: higher bands are dropped, missing ones are zero. Some viewers
+    read degree 3 only."""
+    min_opacity: Annotated[float, real(0, 1)] = 0.0
+    """Leave out Gaussians below this opacity; 0.005 is hardly visible."""
     overwrite: bool = False
-    """Replace a file that exists."""
+    """Replace an existing file."""
 
     def run(self) -> int:
-        if not 0 <= self.min_opacity < 1:
-            raise UsageError(f"--min-opacity {self.min_opacity:g}: from 0 to below 1")
         start_jax()
         from gsjax.runs.export import export_scene
 
@@ -41,7 +39,7 @@ class ExportCommand(HeavyCommand):
             min_opacity=self.min_opacity,
             overwrite=self.overwrite,
         )
-        less = f" of {found:,}" if written < found else ""
+        of_all = f" of {found:,}" if written < found else ""
         size = self.out.stat().st_size / 2**20
-        say(f"{self.out}  {written:,}{less} Gaussians, {size:.2f} MiB")
+        say(f"{self.out}  {written:,}{of_all} Gaussians, {size:.2f} MiB")
         return 0

@@ -1,4 +1,4 @@
-"""`gsjax info`: what a scene or a run consists of."""
+"""`gsjax info`: statistics of a scene and of its run."""
 
 import json
 from dataclasses import dataclass
@@ -7,29 +7,28 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from gsjax.cli.common import HeavyCommand, UsageError, start_jax
+from gsjax.cli.common import HeavyCommand, check_suffix, start_jax
 from gsjax.runtime.console import say
 
 
 @dataclass(kw_only=True)
 class InfoCommand(HeavyCommand):
-    """Say what a scene consists of, and how a run went."""
+    """Print statistics of a scene, and the progress and quality of its run."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
-    """The Gaussians: a .ply or .spz file, or the folder of a run."""
+    """Folder of a run, or a .ply or .spz file."""
     json: bool = False
     """Print JSON."""
     plot: Annotated[Path | None, arg(metavar="OUT.png")] = None
-    """Also draw histograms of opacity, scale and anisotropy."""
+    """Also plot histograms of opacity, scale and anisotropy."""
     overwrite: bool = False
-    """Replace a plot that exists."""
+    """Replace an existing plot."""
 
     def run(self) -> int:
         from gsjax.runtime import files
 
         if self.plot is not None:
-            if self.plot.suffix.lower() != ".png":
-                raise UsageError(f"--plot {self.plot}: a name in .png is wanted")
+            check_suffix("--plot", self.plot, ".png")
             files.refuse_existing(
                 [self.plot], self.overwrite, "another name with --plot"
             )
@@ -41,25 +40,25 @@ class InfoCommand(HeavyCommand):
         from gsjax.runs.scene_info import describe, info_text
         from gsjax.runs.scene_source import is_run, splat_file
 
-        told: dict[str, Any] = {"path": str(self.scene)}
+        report: dict[str, Any] = {"path": str(self.scene)}
         texts, splat = [], self.scene
         if is_run(self.scene):
-            told["run"] = describe_run(self.scene)
-            texts.append(run_text(str(self.scene), told["run"]))
+            report["run"] = describe_run(self.scene)
+            texts.append(run_text(str(self.scene), report["run"]))
             splat = run_files(self.scene).splat
         if self.plot is not None:
-            splat = splat_file(self.scene)  # which says what is missing
-        if splat.exists() or "run" not in told:
+            splat = splat_file(self.scene)  # raises if there is no scene yet
+        if splat.exists() or "run" not in report:
             gaussians = load(splat)
             facts = describe(gaussians)
             facts["file_bytes"] = splat.stat().st_size
-            told |= facts
+            report |= facts
             texts.append(info_text(str(splat), facts))
             if self.plot is not None:
                 files.make_folder(self.plot.parent)
-                named = self.scene.resolve() if "run" in told else splat
+                named = self.scene.resolve() if "run" in report else splat
                 histograms_png(self.plot, gaussians, title=named.name)
-                told["plot"] = str(self.plot)
+                report["plot"] = str(self.plot)
                 texts.append(str(self.plot))
-        say(json.dumps(told, indent=2) if self.json else "\n".join(texts))
+        say(json.dumps(report, indent=2) if self.json else "\n".join(texts))
         return 0

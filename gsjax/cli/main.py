@@ -1,9 +1,9 @@
-"""The command line: `gsjax demo`, `sfm`, `train`, `eval`, `render`, `export`, …
+"""Entry point of the command line: exit codes, errors, Ctrl-C and broken pipes.
 
-Exit codes: 0 done, 1 not well, 2 usage, 3 bad or missing input, 4 structure from
-motion failed, 5 training diverged, 6 a package is missing, 130 interrupted, 141 nobody
-reads the results any more. Results go to stdout, all else to stderr; an error is one
-line, unless --debug asks for the traceback.
+Exit codes: 0 success, 1 a check failed, 2 usage, 3 bad or missing input, 4 structure
+from motion failed, 5 training diverged, 6 a package is missing, 130 interrupted, 141
+broken pipe. Results go to stdout, everything else to stderr. An error is one line;
+--debug shows the traceback.
 """
 
 import contextlib
@@ -14,28 +14,25 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
-from functools import reduce
 from importlib import import_module
-from operator import or_
-from typing import Annotated, Any
 
 from gsjax.errors import CapacityError, GsjaxError, InputError
 from gsjax.runtime.console import one_line, warnings_as_lines
-from gsjax.runtime.machine import restart_with_large_pages
+from gsjax.runtime.setup import restart_with_large_pages
 from gsjax.runtime.memory import unlimited
 
-_LONGEST = 2000  # characters of an error, whose remedy stands at its end
-_EXHAUSTED = "RESOURCE_EXHAUSTED"  # as XLA tells it
+_MAX_CHARACTERS = 2000  # of an error, whose end states the remedy
+_XLA_OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"
 
 
 def program() -> int:
-    """`main` as a program of its own."""
+    """Run `main` in a process of its own, with large memory pages."""
     restart_with_large_pages()
     return main()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line with ``argv``, or `sys.argv`, and return the exit code."""
     argv = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in argv
     try:
@@ -43,82 +40,82 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _report("interrupted", 130, debug)
     except GsjaxError as error:
-        return _report(one_line(error, _LONGEST), error.exit_code, debug)
+        return _report(one_line(error, _MAX_CHARACTERS), error.exit_code, debug)
     except BrokenPipeError:
-        return _hung_up()
+        return _discard_output()
     except OSError as error:
-        what = "" if error.filename is None else f"{str(error.filename)[:200]!r}: "
-        text = f"{what}{error.strerror or error}; check the path and its permissions"
-        return _report(one_line(text, _LONGEST), InputError.exit_code, debug)
+        name = "" if error.filename is None else f"{str(error.filename)[:200]!r}: "
+        text = f"{name}{error.strerror or error}; check the path and its permissions"
+        return _report(one_line(text, _MAX_CHARACTERS), InputError.exit_code, debug)
     except Exception as error:
-        if isinstance(error, MemoryError) or _EXHAUSTED in str(error):
-            text = "the memory of this machine does not hold what this takes; make it "
-            text += "smaller: fewer Gaussians, smaller photographs or pictures"
+        if isinstance(error, MemoryError) or _XLA_OUT_OF_MEMORY in str(error):
+            text = "out of memory; use fewer Gaussians or smaller images"
             return _report(text, CapacityError.exit_code, debug)
-        # Not foreseen: still one line, which says how to see more.
         text = f"{type(error).__name__}: {one_line(error)[:300]}"
-        return _report(f"{text} (--debug shows where)", 1, debug)
+        return _report(f"{text} (--debug shows the traceback)", 1, debug)
 
 
 def _run(argv: list[str]) -> int:
-    # OpenCV warns of what is no harm; of what is, `scene.decode` hears and tells.
+    # `gsjax.data.decode` reports the warnings of OpenCV that matter.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
-    # Each line as it is said, into a file too: a server's address, say. Where there is
-    # no ∞, a ?; stderr has a way of its own, and so may stdout.
+    # Lines reach a pipe at once, and characters that its encoding lacks become "?".
     if isinstance(sys.stdout, io.TextIOWrapper):
         errors = "replace" if sys.stdout.errors == "strict" else sys.stdout.errors
         sys.stdout.reconfigure(errors=errors, line_buffering=True)
     try:
         with warnings_as_lines():
             code = _result(argv)
-    except SystemExit as exit_:  # --help, or a usage error told already
+    except SystemExit as exit_:  # --help
         code = exit_.code if isinstance(exit_.code, int) else 1
-    print(end="", flush=True)  # not at the very end, where an error is a traceback
+    print(end="", flush=True)  # at interpreter exit, an error would be a traceback
     return code
 
 
 def _result(argv: list[str]) -> int:
-    with _leaving_on_ctrl_c():
+    with _exit_on_ctrl_c():
         if argv == ["--version"]:
             from gsjax.cli.doctor_checks import version
 
             print(f"gsjax {version('gsjax')}")
             return 0
-        command = _parse(argv)
-        import_module("gsjax.public")  # and so JAX
+        # Imports tyro, and so after Ctrl-C is handled.
+        from gsjax.cli.parsing import parse
+
+        command = parse(argv)
+        import_module("gsjax.raster.render")  # and so JAX
     with unlimited(getattr(command, "ignore_memory", False)):
         return command.run()
 
 
-def _leave(*_) -> None:
-    os.write(2, b"gsjax: error: interrupted\n")  # sys.stderr may be any by now
+def _exit(*_) -> None:
+    os.write(2, b"gsjax: error: interrupted\n")  # sys.stderr may be replaced by now
     os._exit(130)
 
 
 @contextlib.contextmanager
-def _leaving_on_ctrl_c() -> Iterator[None]:
-    """Within, Ctrl-C ends the process on the spot: nothing has begun.
+def _exit_on_ctrl_c() -> Iterator[None]:
+    """End the process at Ctrl-C inside the context, in which no work has begun.
 
-    Where JAX is being imported, `KeyboardInterrupt` is lost, or crashes it. What has
-    JAX already, or another way with Ctrl-C, keeps that.
+    A `KeyboardInterrupt` while JAX is imported would be lost, or crash it. Nothing
+    changes if JAX is imported already, or Ctrl-C is handled in another way.
     """
     usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    mine = threading.current_thread() is threading.main_thread()
-    if "jax" in sys.modules or not usual or not mine:
+    is_main = threading.current_thread() is threading.main_thread()
+    if "jax" in sys.modules or not usual or not is_main:
         yield
         return
-    signal.signal(signal.SIGINT, _leave)
+    signal.signal(signal.SIGINT, _exit)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def _hung_up() -> int:
-    """Who read our lines has gone, as `head` does: nothing is left to be said."""
-    with contextlib.suppress(OSError):  # not a stream of the system
+def _discard_output() -> int:
+    """Discard further output: its reader has gone, as `head` does."""
+    with contextlib.suppress(OSError):  # stdout is not a file of the system
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 141  # as a shell calls the death by SIGPIPE
+    return 141  # 128 + SIGPIPE, as in a shell
 
 
 def _report(message: str, code: int, debug: bool) -> int:
@@ -126,70 +123,6 @@ def _report(message: str, code: int, debug: bool) -> int:
         traceback.print_exc()
     print(f"gsjax: error: {message}", file=sys.stderr)
     return code
-
-
-def _commands() -> dict[str, type]:
-    """By their names; not imported before Ctrl-C is told in one line."""
-    from gsjax.cli.bench import BenchCommand
-    from gsjax.cli.demo import DemoCommand
-    from gsjax.cli.doctor import DoctorCommand
-    from gsjax.cli.evaluate import EvalCommand
-    from gsjax.cli.export import ExportCommand
-    from gsjax.cli.info import InfoCommand
-    from gsjax.cli.render import RenderCommand
-    from gsjax.cli.sfm import SfmCommand
-    from gsjax.cli.stress import StressCommand
-    from gsjax.cli.train import TrainCommand
-    from gsjax.cli.view import ViewCommand
-
-    return {
-        "demo": DemoCommand,
-        "sfm": SfmCommand,
-        "train": TrainCommand,
-        "eval": EvalCommand,
-        "render": RenderCommand,
-        "view": ViewCommand,
-        "export": ExportCommand,
-        "info": InfoCommand,
-        "bench": BenchCommand,
-        "doctor": DoctorCommand,
-        "stress": StressCommand,
-    }
-
-
-def _parse(argv: list[str]):
-    """The command of a line.
-
-    Raises:
-      UsageError: with tyro's box of explanations made one line.
-      SystemExit: after --help.
-    """
-    import tyro
-
-    from gsjax.cli.common import UsageError
-    from gsjax.cli.options import OPTIONAL
-    from gsjax.cli.usage import explained
-
-    commands, told = _commands(), io.StringIO()
-    named = [
-        Annotated[kind, tyro.conf.subcommand(name)] for name, kind in commands.items()
-    ]
-    any_of_them: Any = reduce(or_, named)
-    try:
-        with contextlib.redirect_stderr(told):
-            return tyro.cli(
-                any_of_them,
-                prog="gsjax",
-                description="3D Gaussian splatting in pure JAX. "
-                "gsjax --version prints the version.",
-                args=argv or ["--help"],
-                config=(tyro.conf.FlagCreatePairsOff,),
-                registry=OPTIONAL,
-            )
-    except SystemExit as exit_:
-        if exit_.code in (0, None):
-            raise
-        raise UsageError(explained(told.getvalue(), argv, commands)) from None
 
 
 if __name__ == "__main__":

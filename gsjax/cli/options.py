@@ -1,8 +1,13 @@
-"""Options that may be left out: how tyro reads them, and what its help says of them."""
+"""Types of command-line options: each parses one argument and checks its range.
 
-from dataclasses import replace
+They are tyro constructors; a `ValueError` becomes a one-line error.
+"""
+
+import re
+from collections.abc import Callable, Iterable
+from difflib import get_close_matches
 from types import NoneType, UnionType
-from typing import Union, get_args
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from tyro.conf import arg
 from tyro.constructors import (
@@ -11,30 +16,154 @@ from tyro.constructors import (
     PrimitiveTypeInfo,
 )
 
-OPTIONAL = ConstructorRegistry()
+T = TypeVar("T")
+IMAGE_KINDS = ("rgb", "alpha", "depth")
+REGISTRY = ConstructorRegistry()
+_NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,2})?"
 
 
-@OPTIONAL.primitive_rule
-def _left_out_or(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """``X | None`` is read as X: None is what it is when left out, not to be typed."""
-    kinds = set(get_args(info.type)) - {NoneType}
-    if info.type_origin not in (Union, UnionType) or len(kinds) != 1:
-        return None
-    inner = PrimitiveTypeInfo.make(kinds.pop(), info.markers)
-    spec = ConstructorRegistry.get_primitive_spec(inner)
-    assert isinstance(spec, PrimitiveConstructorSpec), f"{info.type} is no option"
-    return replace(
-        spec,
-        is_instance=lambda value: value is None or spec.is_instance(value),
-        str_from_instance=lambda value: (
-            [] if value is None else spec.str_from_instance(value)
-        ),
+def option(
+    metavar: str, parse: Callable[[str], T], show: Callable[[T], str] = str
+) -> PrimitiveConstructorSpec[T | None]:
+    """Return a tyro constructor that calls ``parse`` with one argument.
+
+    Args:
+      metavar: placeholder of the argument in the help text.
+      parse: returns the value, or raises `ValueError`.
+      show: returns the argument of a default.
+    """
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=lambda words: parse(words[0]),
+        is_instance=lambda _: True,
+        str_from_instance=lambda value: [] if value is None else [show(value)],
     )
 
 
-def _default(shown: str) -> str:
-    return "" if shown in ("", "False") else f"(default: {shown})"
+def integer(least: int, most: int = 2**31 - 2) -> PrimitiveConstructorSpec[int | None]:
+    """Return the type of a whole number from ``least`` to ``most``."""
+
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            raise ValueError(f"expected a whole number, got {text!r}") from None
+        if not least <= value <= most:
+            raise ValueError(f"expected {least:,} to {most:,}, got {value}")
+        return value
+
+    return option("INT", parse)
 
 
-# What is off or left open has its default in the words of its help, if anywhere.
-TOLD = arg(help_behavior_hint=_default)
+def real(least: float, below: float) -> PrimitiveConstructorSpec[float | None]:
+    """Return the type of a number of at least ``least`` and below ``below``."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            raise ValueError(f"expected a number, got {text!r}") from None
+        if not least <= value < below:
+            raise ValueError(
+                f"expected at least {least:g} and below {below:g}, got {value:g}"
+            )
+        return value
+
+    return option("FLOAT", parse)
+
+
+def suggestion(word: str, names: Iterable[str]) -> str:
+    """Return the name that was probably meant, or else all names."""
+    names = list(names)
+    similar = get_close_matches(word.lower(), names, 1) if len(word) > 2 else []
+    return f"did you mean {similar[0]}?" if similar else f"choose {', '.join(names)}"
+
+
+@REGISTRY.primitive_rule
+def _choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """Parse `Literal` types, also optional ones."""
+    optional = info.type_origin in (Union, UnionType)
+    kinds = [k for k in get_args(info.type) if k is not NoneType]
+    kind = kinds[0] if optional and len(kinds) == 1 else info.type
+    if get_origin(kind) is not Literal:
+        return None
+    values = {str(value): value for value in get_args(kind)}
+
+    def parse(text: str) -> Any:
+        if text not in values:
+            raise ValueError(f"unknown value {text!r} ({suggestion(text, values)})")
+        return values[text]
+
+    return option(f"{{{','.join(values)}}}", parse)
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Return width and height of a size like ``800x600``.
+
+    Raises:
+      ValueError: if it is malformed.
+    """
+    match = re.fullmatch(r"([0-9]{1,6})[x×X]([0-9]{1,6})", text)
+    if match is None or min(int(match[1]), int(match[2])) < 1:
+        raise ValueError(
+            f"expected WIDTHxHEIGHT in pixels, each 1 to 999999, got {text!r}"
+        )
+    return int(match[1]), int(match[2])
+
+
+def parse_kinds(text: str) -> tuple[str, ...]:
+    """Return the kinds of image in a list like ``rgb,depth``, each once.
+
+    Raises:
+      ValueError: if one is unknown.
+    """
+    kinds = tuple(dict.fromkeys(text.split(",")))
+    if not set(kinds) <= set(IMAGE_KINDS):
+        raise ValueError(
+            f"expected {', '.join(IMAGE_KINDS)}, or several with commas, got {text!r}"
+        )
+    return kinds
+
+
+def parse_color(text: str) -> tuple[float, ...]:
+    """Return the RGB values of a colour like ``1,0.5,0``.
+
+    Raises:
+      ValueError: if it is malformed.
+    """
+    parts = text.split(",")
+    good = len(parts) == 3 and all(re.fullmatch(f"[+]?{_NUMBER}", p) for p in parts)
+    if not good or not all(float(part) <= 1 for part in parts):
+        raise ValueError(f"expected R,G,B, each from 0 to 1, got {text!r}")
+    return tuple(map(float, parts))
+
+
+def parse_budget(text: str) -> float:
+    """Return the maximum error in a text like ``1/255`` or ``0.004``.
+
+    Raises:
+      ValueError: if it is malformed, or not above 0 and below 1.
+    """
+    match = re.fullmatch(rf"({_NUMBER})(?:/({_NUMBER}))?", text)
+    parts = [float(part or 1) for part in match.groups()] if match else [0.0]
+    if min(parts) <= 0 or parts[0] >= parts[1]:
+        raise ValueError(
+            f"expected an error above 0 and below 1, like 1/255, got {text!r}"
+        )
+    return parts[0] / parts[1]
+
+
+Size = Annotated[tuple[int, int], option("WxH", parse_size, "{0[0]}x{0[1]}".format)]
+OptionalSize = Annotated[tuple[int, int] | None, option("WxH", parse_size)]
+Kinds = Annotated[tuple[str, ...], option("KINDS", parse_kinds, ",".join)]
+Color = Annotated[tuple[float, ...] | None, option("R,G,B", parse_color)]
+Budget = Annotated[float | None, option("ERROR", parse_budget)]
+
+
+def _default_hint(shown: str) -> str:
+    return "" if shown in ("", "None", "False") else f"(default: {shown})"
+
+
+# Defaults of flags and optional values are explained in the help text, if at all.
+WITH_DEFAULT = arg(help_behavior_hint=_default_hint)

@@ -1,27 +1,29 @@
-"""`gsjax stress`: is what is computed here numerically sound?"""
+"""`gsjax stress`: checks of numerical stability on this machine."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from gsjax.cli.common import Command, UsageError, start_jax
+from gsjax.cli.options import suggestion
 from gsjax.runtime.console import note, say
 
 
 @dataclass(kw_only=True)
 class StressCommand(Command):
-    """Measure numerical stability: one line a case, exit code 1 if one is outside its
-    bound."""
+    """Measure numerical stability, one line per case. The exit code is 1 if a case
+    exceeds its bound."""
 
     full: bool = False
-    """Over more scenes and values, and all cases: minutes in place of one."""
+    """Run all cases, over more scenes and values: minutes instead of one."""
     only: str = ""
-    """Only the cases whose name has this in it."""
+    """Run only the cases whose name contains this text."""
     json: Path | None = None
     """Write the results to this file."""
     markdown: Path | None = None
-    """Put the table into this file, between its comments "(/)gsjax stress"."""
+    """Write the table into this file, between its comments "gsjax stress" and "/gsjax
+    stress"."""
     overwrite: bool = False
-    """Replace a --json file that exists."""
+    """Replace an existing --json file."""
 
     def run(self) -> int:
         start_jax()
@@ -35,32 +37,24 @@ class StressCommand(Command):
         if self.markdown is not None:
             if self.only:
                 raise UsageError("--markdown and --only exclude each other")
-            stress.around_marks(self.markdown)  # before minutes go by
+            stress.around_marks(self.markdown)  # checked before minutes of work
         cases = [c for c in stress.chosen(self.full) if self.only in c.name]
         if not cases:
-            raise UsageError(f"--only {self.only!r}: {self._no_case()}")
+            names = [c.name for c in stress.chosen(True)]
+            found = ", ".join(name for name in names if self.only in name)
+            hint = f"pass --full for {found}" if found else suggestion(self.only, names)
+            raise UsageError(f"--only {self.only!r}: no such case; {hint}")
         results = []
         for result in stress.run_cases(tuple(cases), self.full):
             results.append(result)
             say(stress.line(result))
         say(stress.summary(results))
-        told = stress.as_json(results, self.full)
+        report = stress.as_json(results, self.full)
         if self.json is not None:
             files.make_folder(self.json.parent)
-            files.write_json(self.json, told)
+            files.write_json(self.json, report)
             note(f"{self.json} written")
         if self.markdown is not None:
-            stress.put_between_marks(self.markdown, stress.markdown(told))
+            stress.put_between_marks(self.markdown, stress.markdown(report))
             note(f"{self.markdown} written")
         return 0 if all(result.good for result in results) else 1
-
-    def _no_case(self) -> str:
-        """Why --only chooses none."""
-        from gsjax.stress import run as stress
-
-        names = [c.name for c in stress.chosen(True) if self.only in c.name]
-        if names:
-            return f"only with --full: {', '.join(names)}"
-        names = [c.name for c in stress.chosen(self.full)]
-        more = "" if self.full else "; more with --full"
-        return f"no case; there are {', '.join(names)}{more}"

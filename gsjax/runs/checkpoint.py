@@ -1,8 +1,8 @@
-"""Checkpoints: the whole state of a run in one file, written at once or not at all.
+"""Checkpoints: the whole state of a run in one file, written completely or not at all.
 
-An .npz holds every array of the state under its path in the pytree, each with a
-checksum (that of the zip format), and a JSON text beside them. The two latest are
-kept, so that a file that was damaged later costs one interval, not the run.
+An .npz holds every array of the state under its path in the pytree, each with the CRC
+of the zip format, and a JSON entry of metadata. The latest two files are kept, so that
+a file damaged later costs one interval rather than the run.
 """
 
 import io
@@ -28,8 +28,8 @@ from gsjax.train.state import TrainState
 _KEEP = 2
 _FORMAT = 1
 _META = "meta.json"
-_REMEDY = "remove it to go on from the one before, or train anew"
-# What zipfile raises of damaged archives.
+_REMEDY = "remove it to resume from the previous one, or train again"
+# Errors that zipfile raises on damaged archives.
 _ZIP_ERRORS = (
     *(zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError),
     *(EOFError, KeyError, OverflowError, struct.error),
@@ -37,13 +37,13 @@ _ZIP_ERRORS = (
 
 
 class Checkpoint(NamedTuple):
-    """A file as read.
+    """The content of a checkpoint file.
 
     Attributes:
-      path: of the file.
-      step: at which it was written.
-      arrays: by path in the state.
-      meta: what was saved with it: ``capacity``, ``pair_capacity``, …
+      path: the file.
+      step: step at which it was written.
+      arrays: arrays by their path in the state.
+      meta: metadata saved with them: ``capacity``, ``pair_capacity``, …
     """
 
     path: Path
@@ -52,48 +52,47 @@ class Checkpoint(NamedTuple):
     meta: dict[str, Any]
 
 
-def _named_leaves(state: TrainState) -> dict[str, Any]:
-    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
-    return {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
-
-
 def _is_key(leaf) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Path:
-    """Write the state; older files than the latest two are removed after that.
+    """Write the state, then remove all but the latest two checkpoints.
 
     Args:
       folder: created if missing.
-      state: of the run.
-      meta: JSON values to keep with it: ``pair_capacity``, ``seconds`` of training, and
-        the number of ``devices``, which may be missing.
+      state: state of the run.
+      meta: JSON values to store: ``pair_capacity``, ``seconds`` of training, and
+        optionally the number of ``devices``.
+
+    Returns:
+      The file.
 
     Raises:
-      InputError: if it cannot be written; the checkpoints that were there still are.
+      InputError: if writing fails; earlier checkpoints are kept.
     """
     make_folder(folder)
-    leaves = _named_leaves(state)
+    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
     arrays = {
-        name: np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
-        for name, leaf in leaves.items()
+        jax.tree_util.keystr(path): np.asarray(
+            jax.random.key_data(leaf) if _is_key(leaf) else leaf
+        )
+        for path, leaf in leaves
     }
     step = int(state.step)
-    text = {**meta, "format": _FORMAT, "step": step}
-    text["capacity"], text["arrays"] = state.gaussians.capacity, sorted(arrays)
-    encoded = np.frombuffer(json.dumps(text).encode(), np.uint8)
+    header = {**meta, "format": _FORMAT, "step": step}
+    header["capacity"], header["arrays"] = state.gaussians.capacity, sorted(arrays)
+    encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
     buffer = io.BytesIO()
     if any(array.dtype.hasobject for array in arrays.values()):
-        # NumPy below 2.2 cannot be told to refuse them itself.
-        raise TypeError("a state is of numbers alone; objects are in this one")
+        # NumPy below 2.2 has no argument to reject them.
+        raise TypeError("state: expected numeric arrays, got an array of objects")
     np.savez(buffer, **{_META: encoded, **arrays})  # pyright: ignore
     path = folder / f"step_{step:09d}.npz"
-    # Given up at once where writing fails: a view that lives on with the error keeps
-    # the buffer from being freed.
+    # A view that an exception keeps alive would keep the buffer from being freed.
     with buffer.getbuffer() as data:
         write_file(path, data, durable=True)
-    # Later ones, which a run that was taken up again could not read, do not count.
+    # Later files, unreadable to the run that resumed before them, do not count.
     upto = [old for old in _files(folder) if old.name <= path.name]
     for old in upto[:-_KEEP]:
         old.unlink(missing_ok=True)
@@ -101,25 +100,25 @@ def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Pa
 
 
 def latest_step(folder: Path) -> int | None:
-    """Of the last checkpoint in the folder, by its name; None where there is none."""
-    names = _files(folder)
-    return int(names[-1].stem.removeprefix("step_")) if names else None
+    """Return the step in the name of the last checkpoint; None if there is none."""
+    files = _files(folder)
+    return int(files[-1].stem.removeprefix("step_")) if files else None
 
 
 def _files(folder: Path) -> list[Path]:
-    names = sorted(folder.glob("step_*.npz"))
-    return [path for path in names if re.fullmatch(r"step_\d{9}\.npz", path.name)]
+    paths = sorted(folder.glob("step_*.npz"))
+    return [path for path in paths if re.fullmatch(r"step_\d{9}\.npz", path.name)]
 
 
 def load_latest(folder: Path, steps: int | None = None) -> Checkpoint:
-    """The latest checkpoint that can be used; a warning names those that cannot.
+    """Return the latest readable checkpoint; warn about each unreadable later one.
 
     Args:
-      folder: of the checkpoints.
-      steps: of the whole run; see `load_checkpoint`.
+      folder: folder of the checkpoints.
+      steps: number of steps of the whole run, see `load_checkpoint`.
 
     Raises:
-      InputError: if there is none.
+      InputError: if no checkpoint is readable.
     """
     failed = []
     for path in reversed(_files(folder)):
@@ -129,53 +128,54 @@ def load_latest(folder: Path, steps: int | None = None) -> Checkpoint:
             failed.append(str(error))
             continue
         for message in failed:
-            warnings.warn(f"{message}; going on from {path.name}", stacklevel=2)
+            warnings.warn(f"{message}; resuming from {path.name}", stacklevel=2)
         return found
-    told = f" ({'; '.join(failed)})" if failed else ""
-    raise InputError(f"{folder}: no checkpoint to go on from{told}; train anew")
+    details = f" ({'; '.join(failed)})" if failed else ""
+    raise InputError(f"{folder}: no checkpoint to resume from{details}; train again")
 
 
 def load_checkpoint(path: Path, steps: int | None = None) -> Checkpoint:
-    """One file.
+    """Read and check one file.
 
     Args:
-      path: of the file.
-      steps: of the whole run, beyond which it cannot have come; None for any.
+      path: the file.
+      steps: number of steps of the whole run, which bounds the step of the file; None
+        for no bound.
 
     Raises:
-      InputError: if it is damaged, cut short or no checkpoint, or holds values that no
-        run can have come to.
+      InputError: if the file is damaged, truncated or no checkpoint, or holds values
+        that no run produces.
     """
-    where = f"{path}: no readable checkpoint"
+    where = f"{path}: not a readable checkpoint"
     arrays = {
         name.removesuffix(".npy"): read_npy(f"{path}: {name}", data)
         for name, data in _entries(path)
     }
     if _META not in arrays:
-        raise InputError(f"{where}: {_META} is not in it; {_REMEDY}")
-    text = arrays.pop(_META).tobytes()
+        raise InputError(f"{where}: {_META} is missing; {_REMEDY}")
     try:
-        meta = json.loads(text)
+        meta = json.loads(arrays.pop(_META).tobytes())
     except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: {_META}: {str(error)[:80]}; {_REMEDY}") from error
-    wanted = {
+    lengths = {len(array) for array in arrays.values() if array.ndim}
+    checks = {
         "format": lambda value: value == _FORMAT,
         "step": lambda value: type(value) is int and value >= 0,
-        "capacity": lambda value: type(value) is int and value in _lengths(arrays),
+        "capacity": lambda value: type(value) is int and value in lengths,
         "pair_capacity": lambda value: type(value) is int and 0 <= value < 2**30,
         "seconds": lambda value: type(value) in (int, float) and 0 <= value < math.inf,
         "arrays": lambda value: value == sorted(arrays),
         "devices": lambda value: type(value) is int and value >= 1,
     }
     meta = meta if isinstance(meta, dict) else {}
-    if "devices" not in meta:  # an old one
-        del wanted["devices"]
-    for key, good in wanted.items():
-        if not good(meta.get(key)):
+    if "devices" not in meta:  # older checkpoints lack it
+        del checks["devices"]
+    for key, valid in checks.items():
+        if not valid(meta.get(key)):
             found = repr(meta.get(key, "missing"))[:80]
-            told = f"; {_FORMAT} is wanted" if key == "format" else ""
-            raise InputError(f"{where}: {_META}: {key} {found}{told}; {_REMEDY}")
-    fault = _step_fault(path, arrays, meta["step"], steps) or _fault(arrays)
+            expected = f" (expected {_FORMAT})" if key == "format" else ""
+            raise InputError(f"{where}: {_META}: {key} {found}{expected}; {_REMEDY}")
+    fault = _step_fault(path, arrays, meta["step"], steps) or _value_fault(arrays)
     if fault is not None:
         raise InputError(f"{path}: damaged checkpoint: {fault}; {_REMEDY}")
     return Checkpoint(path, meta["step"], arrays, meta)
@@ -184,57 +184,53 @@ def load_checkpoint(path: Path, steps: int | None = None) -> Checkpoint:
 def _step_fault(
     path: Path, arrays: dict[str, np.ndarray], step: int, steps: int | None
 ) -> str | None:
-    """What contradicts the step that a checkpoint says it is of."""
+    """Return what contradicts the step in the metadata, or None."""
     named = re.fullmatch(r"step_(\d{9})\.npz", path.name)
     if named is not None and int(named[1]) != step:
-        return f"{_META} says step {step}, and its name another"
+        return f"{_META} says step {step}, but the file name another"
     if steps is not None and step > steps:
         return f"{_META} says step {step} of a run of {steps} (config.json)"
-    told = arrays.get(".step", np.int32(step)).tolist()
-    if told != step:
-        return f".step is {str(told)[:40]}, and {_META} says {step}"
-    for name in (".moments.count", ".refinement_moments.count"):
+    stored = arrays.get(".step", np.int32(step)).tolist()
+    if stored != step:
+        return f".step is {str(stored)[:40]}, but {_META} says {step}"
+    for name in (".moments[0].count", ".shared_moments[0].count"):
         # Steps without a gradient are not counted.
         count = arrays.get(name, np.int32(0)).tolist()
         if not (isinstance(count, int) and 0 <= count <= step):
-            return f"{name} is {str(count)[:40]}; 0 to {step}, the step, is wanted"
+            return f"expected {name} from 0 to {step}, the step, got {str(count)[:40]}"
     return None
 
 
-def _fault(arrays: dict[str, np.ndarray]) -> str | None:
-    """What no training leaves behind: numbers that are not finite, squares below 0.
+def _value_fault(arrays: dict[str, np.ndarray]) -> str | None:
+    """Return the first non-finite number or negative square, or None.
 
-    What stands in an inactive slot does not matter.
+    Inactive slots may hold anything.
     """
     active = arrays.get(".gaussians.active", np.ones(0, bool))
     if active.dtype != bool or active.ndim != 1 or (active.view(np.uint8) > 1).any():
-        return ".gaussians.active is no list of what is true or false"
+        return ".gaussians.active: expected a list of booleans"
     for name, array in arrays.items():
         if array.dtype.kind != "f":
             continue
-        squares = name.startswith((".moments.nu", ".refinement_moments.nu", ".stats"))
+        squares = name.startswith((".moments[0].nu", ".shared_moments[0].nu", ".stats"))
         good = np.isfinite(array)
         if squares:
             good &= array >= 0
-        if name.startswith(".refinement"):
+        if name.startswith((".refinement", ".shared_moments", ".model.shared")):
             bad = ~good
         elif array.shape[:1] == active.shape:
             bad = active & ~good.reshape(len(active), -1).all(axis=1)
-        else:  # of other settings, which `restore` tells of
+        else:  # other settings: `restore` reports them
             continue
         if bad.any():
-            wanted = "finite numbers" + " of at least 0" * squares
-            where = f"{np.argwhere(bad)[0].tolist()} the first"
-            return f"{name}: {bad.sum()} of {bad.size} are not {wanted}, {where}"
+            expected = "finite numbers" + " of at least 0" * squares
+            where = f"{np.argwhere(bad)[0].tolist()} first"
+            return f"{name}: {bad.sum()} of {bad.size} are not {expected}, {where}"
     return None
 
 
-def _lengths(arrays: dict[str, np.ndarray]) -> set[int]:
-    return {len(array) for array in arrays.values() if array.ndim}
-
-
 def _entries(path: Path) -> Iterator[tuple[str, bytes]]:
-    """Names and bytes in an archive, whose checksums fit; none is unpacked."""
+    """Yield name and bytes of each uncompressed entry with a matching checksum."""
     with opened(path, "a checkpoint") as file:
         try:
             archive = zipfile.ZipFile(file)
@@ -245,57 +241,53 @@ def _entries(path: Path) -> Iterator[tuple[str, bytes]]:
         declared = sum(entry.file_size for entry in entries)
         faults = {
             "compressed": any(entry.compress_type for entry in entries),
-            "more than it can hold": declared > size,
-            "of one name": len({entry.filename for entry in entries}) < len(entries),
+            "larger than the file": declared > size,
+            "with equal names": len({e.filename for e in entries}) < len(entries),
         }
         fault = next((fault for fault, found in faults.items() if found), None)
         if fault is not None:
             raise InputError(
-                f"{path}: no readable checkpoint: {len(entries)} arrays, {fault}, in "
-                f"{declared} bytes ({size} are there); {_REMEDY}"
+                f"{path}: not a readable checkpoint: {len(entries)} arrays, {fault}, "
+                f"of {declared} bytes in a file of {size}; {_REMEDY}"
             )
         for entry in entries:
             try:
                 data = archive.read(entry)
             except _ZIP_ERRORS as error:
-                where = f"{entry.filename[:80]} (byte {entry.header_offset})"
+                where = f"{entry.filename[:80]} (byte {entry.header_offset}): "
                 raise _damaged(path, error, where) from error
             yield entry.filename, data
 
 
 def _damaged(path: Path, error: Exception, where: str = "") -> InputError:
-    told = f"{where}: {error}" if where else f"{error}"
-    return InputError(f"{path}: damaged checkpoint: {told}; {_REMEDY}")
+    return InputError(f"{path}: damaged checkpoint: {where}{error}; {_REMEDY}")
 
 
 def restore(checkpoint: Checkpoint, template: TrainState) -> TrainState:
-    """The state of a checkpoint.
+    """Return the state that a checkpoint holds.
 
     Args:
-      checkpoint: as read.
-      template: a state with the same settings and capacity.
+      checkpoint: see `load_checkpoint`.
+      template: a state of the same settings and capacity.
 
     Raises:
-      InputError: if the settings are others than those that it was written under.
+      InputError: if the checkpoint was written under other settings.
     """
+    where = f"{checkpoint.path}: the checkpoint of step {checkpoint.step}"
+    remedy = "it has other settings; pass those of the run, or train again"
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     names = [jax.tree_util.keystr(path) for path, _ in leaves]
     if set(names) != set(checkpoint.arrays):
         differing = sorted(set(names) ^ set(checkpoint.arrays))[:3]
-        raise InputError(
-            f"{checkpoint.path}: the checkpoint of step {checkpoint.step} is of other "
-            f"settings: {differing} differ; pass those of the run, or train anew"
-        )
+        raise InputError(f"{where} differs in {differing}: {remedy}")
     out = []
     for name, (_, leaf) in zip(names, leaves):
         array = checkpoint.arrays[name]
-        wanted = jax.random.key_data(leaf) if _is_key(leaf) else leaf
-        if array.shape != wanted.shape or array.dtype != wanted.dtype:
+        like = jax.random.key_data(leaf) if _is_key(leaf) else leaf
+        if array.shape != like.shape or array.dtype != like.dtype:
             raise InputError(
-                f"{checkpoint.path}: the checkpoint of step {checkpoint.step} has "
-                f"{name} as {array.dtype} {array.shape}; {wanted.dtype} {wanted.shape} "
-                "is wanted: its settings are others; pass those of the run, or train "
-                "anew"
+                f"{where}: expected {name} of {like.dtype} {like.shape}, got "
+                f"{array.dtype} {array.shape}: {remedy}"
             )
         value = jnp.asarray(array)
         out.append(jax.random.wrap_key_data(value) if _is_key(leaf) else value)

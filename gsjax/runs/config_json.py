@@ -1,4 +1,4 @@
-"""Settings of a training run as JSON, and values of JSON held against types."""
+"""Training settings as JSON, and JSON values checked against type annotations."""
 
 import json
 import math
@@ -14,47 +14,23 @@ from gsjax.raster.types import RasterConfig
 from gsjax.train.config import Level, TrainConfig
 from gsjax.train.optimiser import Rates
 
-_MAX_WHOLE = 1 << 63
+_MAX_INTEGER = 1 << 63
+_RENAMED = {"stop": "transmittance_min"}  # settings of RasterConfig in older runs
 
 
-def to_json(config: TrainConfig) -> str:
-    """As text, for `config.json`."""
+def config_to_json(config: TrainConfig) -> str:
+    """Return the settings as the JSON text of `config.json`."""
     return json.dumps(asdict(config), indent=2) + "\n"
 
 
-def from_json(text: str) -> TrainConfig:
-    """The settings in such a text.
+def config_from_json(text: str) -> TrainConfig:
+    """Return the settings of a JSON text.
 
     Raises:
-      InputError: if it is not one, or of another version.
+      InputError: if the text is malformed or of an incompatible version.
     """
     try:
-        data = json.loads(text)
-        if not isinstance(data, dict):
-            raise ValueError(f"{repr(data)[:80]} is no object")
-        unknown = set(data) - {f.name for f in fields(TrainConfig)}
-        if unknown:
-            raise ValueError(f"unknown settings {sorted(unknown)}")
-        check_kinds(TrainConfig, data)
-        if "rates" in data:  # a NamedTuple: a list in JSON
-            rates = data["rates"]
-            if len(rates) in (6, 7):  # of before there was a cooling, or from where
-                rates = [*rates, *Rates()[len(rates) :]]
-            check_kinds(Rates, dict(zip(Rates._fields, rates, strict=True)))
-            data["rates"] = Rates(tuple(rates[0]), *rates[1:])
-        for name, kind in (("adaptive", AdaptiveSettings), ("mcmc", McmcSettings)):
-            if name in data:
-                check_kinds(kind, data[name])
-                data[name] = kind(**data[name])
-        if "raster" in data:
-            check_kinds(RasterConfig, data["raster"])
-            outputs = tuple(data["raster"].pop("outputs", ("rgb",)))
-            data["raster"] = RasterConfig(outputs=outputs, **data["raster"])
-        if "levels" in data:
-            for level in data["levels"]:
-                check_kinds(Level, level)
-            data["levels"] = tuple(Level(**level) for level in data["levels"])
-        return TrainConfig(**data)
+        return _config(json.loads(text))
     except (
         *(ValueError, TypeError, KeyError, AttributeError, IndexError),
         RecursionError,
@@ -65,31 +41,63 @@ def from_json(text: str) -> TrainConfig:
         ) from error
 
 
-def check_kinds(kind: type, data: dict[str, Any]) -> None:
-    """Hold JSON values against the types of a class's fields.
+def _config(data: Any) -> TrainConfig:
+    check_types(TrainConfig, data)
+    unknown = set(data) - {f.name for f in fields(TrainConfig)}
+    if unknown:
+        raise ValueError(f"unknown settings {sorted(unknown)}")
+    if "rates" in data:  # a NamedTuple: a list in JSON
+        rates = data["rates"]
+        if len(rates) in (6, 7):  # older versions had no cooling
+            rates = [*rates, *Rates()[len(rates) :]]
+        check_types(Rates, dict(zip(Rates._fields, rates, strict=True)))
+        data["rates"] = Rates(tuple(rates[0]), *rates[1:])
+    for name, kind in (("adaptive", AdaptiveSettings), ("mcmc", McmcSettings)):
+        if name in data:
+            check_types(kind, data[name])
+            data[name] = kind(**data[name])
+    if "raster" in data:
+        raster = data["raster"]
+        for old, new in _RENAMED.items():
+            if old in raster and hasattr(RasterConfig, new):
+                raster[new] = raster.pop(old)
+        check_types(RasterConfig, raster)
+        outputs = tuple(raster.pop("outputs", ("rgb",)))
+        data["raster"] = RasterConfig(outputs=outputs, **raster)
+    if "levels" in data:
+        for level in data["levels"]:
+            check_types(Level, level)
+        data["levels"] = tuple(Level(**level) for level in data["levels"])
+    return TrainConfig(**data)
+
+
+def check_types(kind: type, data: dict[str, Any]) -> None:
+    """Check a JSON object against the annotated fields of a class.
 
     Raises:
-      ValueError: if one is of another type, or NaN.
+      ValueError: if it is no object, or a value has another type or is NaN.
     """
     if not isinstance(data, dict):
-        raise ValueError(f"{repr(data)[:80]} is no object")
+        raise ValueError(f"expected an object, got {repr(data)[:80]}")
     for name, hint in get_type_hints(kind).items():
-        if name in data and not _is_kind(data[name], hint):
-            told = getattr(hint, "__name__", str(hint))
-            raise ValueError(f"{name} is {repr(data[name])[:80]}; {told} is wanted")
+        if name in data and not _has_type(data[name], hint):
+            expected = getattr(hint, "__name__", str(hint))
+            raise ValueError(
+                f"{name}: expected {expected}, got {repr(data[name])[:80]}"
+            )
 
 
-def _is_kind(value, hint) -> bool:
+def _has_type(value, hint) -> bool:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
-        return any(_is_kind(value, argument) for argument in arguments)
+        return any(_has_type(value, argument) for argument in arguments)
     if origin is tuple:
         if not isinstance(value, list):
             return False
         if arguments[1:] == (...,):
             arguments = arguments[:1] * len(value)
-        return len(value) == len(arguments) and all(map(_is_kind, value, arguments))
-    if type(value) is int and abs(value) > _MAX_WHOLE:  # nor does float64 hold all
+        return len(value) == len(arguments) and all(map(_has_type, value, arguments))
+    if type(value) is int and abs(value) > _MAX_INTEGER:  # float64 may overflow
         return False
     if hint is float:
         return type(value) in (int, float) and not math.isnan(value)
@@ -97,4 +105,4 @@ def _is_kind(value, hint) -> bool:
         return type(value) is str
     if hint in (int, str, bool, type(None)):
         return type(value) is hint
-    return True  # made of fields that are held against their own types
+    return True  # a class whose own fields are checked separately

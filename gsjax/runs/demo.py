@@ -1,17 +1,18 @@
-"""The built-in demonstration: photographs from nothing, and a scene trained on them.
+"""The built-in demo: synthetic photographs, training on them, and a turntable movie.
 
-It goes the whole way that `gsjax train` goes with photographs of one's own.
+It takes the same path as `gsjax train` on real photographs.
 """
 
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from gsjax.data import camera_paths
 from gsjax.io import images
-from gsjax.runs.folder import RunSettings, load_data, run_files
+from gsjax.runs.folder import RunSettings, load_split, run_files
 from gsjax.runs.run import RunResult, start_run
 from gsjax.runs.scene_source import open_scene_source
-from gsjax.runs.trajectories import path_entries, write_flight
+from gsjax.runs.trajectories import path_entries, render_movie
 from gsjax.runtime.console import note
 from gsjax.runtime.files import refuse_existing
 from gsjax.synthetic.raycaster import DemoDatasetSettings, write_demo_dataset
@@ -23,7 +24,7 @@ _MAX_GAUSSIANS = 16_384
 
 
 class DemoFiles(NamedTuple):
-    """Where the demonstration writes."""
+    """Output paths of the demo."""
 
     dataset: Path
     run: Path
@@ -31,7 +32,14 @@ class DemoFiles(NamedTuple):
 
 
 class DemoSettings(NamedTuple):
-    """How much there is to do."""
+    """Size of the demo.
+
+    Attributes:
+      photos: number of photographs.
+      width, height: size of a photograph in px.
+      steps: training steps.
+      seed: seed of the initial points and of the training.
+    """
 
     photos: int = 40
     width: int = 256
@@ -41,14 +49,12 @@ class DemoSettings(NamedTuple):
 
 
 def demo_files(folder: Path) -> DemoFiles:
-    """Names inside ``folder``."""
+    """Return the output paths inside ``folder``."""
     return DemoFiles(folder / "dataset", folder / "run", folder / "turntable.webp")
 
 
 def demo_config(steps: int = STEPS, seed: int = 0) -> TrainConfig:
-    """The preset "fast", smaller still: for few Gaussians, and from the points of the
-    dataset, which are many here.
-    """
+    """Return the preset "fast" with fewer Gaussians, initialised from the points."""
     config = scaled(preset("fast"), steps)
     return config.replace(
         seed=seed,
@@ -62,48 +68,43 @@ def demo_config(steps: int = STEPS, seed: int = 0) -> TrainConfig:
 def run_demo(
     folder: Path, settings: DemoSettings, *, overwrite: bool
 ) -> tuple[DemoFiles, RunResult]:
-    """Take the photographs, train on them, evaluate, and turn the scene around.
+    """Write the dataset, train on it, evaluate, and render a turntable.
 
-    Interrupted, it stops after training; the result then says so.
+    Ctrl-C stops it after training; the result is then not ``finished``.
 
     Raises:
-      InputError: if something of it exists and ``overwrite`` is not set, or cannot be
+      InputError: if an output exists and ``overwrite`` is not set, or cannot be
         written.
       MissingExtraError: if OpenCV is absent.
     """
     images.opencv()
     files = demo_files(folder)
-    _refuse_existing(files, overwrite)
+    photos = files.dataset / "transforms.json"
+    outputs = [photos, run_files(files.run).config, files.turntable]
+    refuse_existing(outputs, overwrite, "another folder with -o")
     size = f"{settings.width} × {settings.height} px"
-    note(f"taking {settings.photos} photographs of {size} of a still life")
-    taken = DemoDatasetSettings(
+    note(f"rendering {settings.photos} photographs of {size}")
+    dataset_settings = DemoDatasetSettings(
         photos=settings.photos,
         width=settings.width,
         height=settings.height,
         points=5000,
         seed=settings.seed,
     )
-    write_demo_dataset(files.dataset, taken, overwrite=overwrite)
+    write_demo_dataset(files.dataset, dataset_settings, overwrite=overwrite)
     config = demo_config(settings.steps, settings.seed)
     run = RunSettings(dataset=files.dataset, config=config)
     result = start_run(run, files.run, overwrite=overwrite)
     if result.finished:
-        _turn(files, run, overwrite)
+        _render_turntable(files, run, overwrite)
     return files, result
 
 
-def _refuse_existing(files: DemoFiles, overwrite: bool) -> None:
-    photos = files.dataset / "transforms.json"
-    made = [photos, run_files(files.run).config, files.turntable]
-    refuse_existing(made, overwrite, "another folder with -o")
-
-
-def _turn(files: DemoFiles, run: RunSettings, overwrite: bool) -> None:
-    data = load_data(run)
-    entries = path_entries(data, "orbit", frames=_TURN_FRAMES)
-    write_flight(
-        open_scene_source(files.run, origin=data.scene.origin),
-        entries,
+def _render_turntable(files: DemoFiles, run: RunSettings, overwrite: bool) -> None:
+    dataset = load_split(run).dataset
+    render_movie(
+        open_scene_source(files.run, origin=dataset.origin),
+        path_entries(dataset, camera_paths.orbit, frames=_TURN_FRAMES),
         files.turntable,
         fps=_TURN_FRAMES / _TURN_SECONDS,
         overwrite=overwrite,

@@ -1,18 +1,18 @@
-"""The folder of a run: what it was made from, and where it keeps what.
+"""The folder of a run: its files and settings.
 
-RUN/config.json       settings, and which dataset and views
-RUN/metrics.jsonl     one line a step: loss, PSNR, counts, seconds, compilations
+RUN/config.json       settings, dataset and split
+RUN/metrics.jsonl     one line per step: loss, PSNR, counts, seconds, compilations
 RUN/checkpoints/      the two latest
 RUN/splat.ply         the scene, in the coordinates of the dataset
-RUN/cameras.json      its cameras, where they were refined
+RUN/cameras.json      refined cameras, if any
 RUN/eval.json         PSNR and SSIM of the held-out views
-RUN/held_out.jsonl    the same by step, where that was asked for
-RUN/renders/          those views
+RUN/held_out.jsonl    the same by step, with --eval-every
+RUN/renders/          renders of the held-out views
 RUN/preview.png       photograph, render, error and depth of some of them
 RUN/curves.png        PSNR by step
 
-and eval_train.json, renders_train/ and preview_train.png, where the training views were
-measured too.
+Evaluating the training views adds eval_train.json, renders_train/ and
+preview_train.png.
 """
 
 import json
@@ -27,13 +27,13 @@ import numpy as np
 
 from gsjax.data.dataset import is_dataset, load_dataset
 from gsjax.data.splits import split_views
-from gsjax.data.types import Dataset
+from gsjax.data.types import Dataset, View
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
-from gsjax.io import load, save
-from gsjax.runs.config_json import check_kinds, from_json, to_json
+from gsjax.io.formats import load, save
+from gsjax.runs.config_json import check_types, config_from_json, config_to_json
 from gsjax.runs.history import read_metrics
-from gsjax.runs.refined_cameras import with_cameras
+from gsjax.runs.refined_cameras import load_cameras
 from gsjax.runtime.files import read_json, write_json
 from gsjax.train.config import TrainConfig
 
@@ -42,18 +42,18 @@ _FORMAT = 1
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What a run is made from.
+    """Settings of a run.
 
     Attributes:
-      dataset: folder or file.
-      config: of the training.
-      images, factor, skip_missing: as for `load_dataset`.
-      every: hold out every so many-th view; 0 for none, None as the dataset says.
-      test_images: hold out these instead.
-      start: a file of Gaussians in the dataset's coordinates to start from, instead of
-        what the config says.
-      trained, held_out: names of the views, once they were split; they stay so, and
-        what a dataset holds later is held against them.
+      dataset: folder or file of the dataset.
+      config: training settings.
+      images, factor, skip_missing: arguments of `load_dataset`.
+      every: hold out every Nth view; 0 for none, None for the split of the dataset.
+      test_images: names of the views to hold out instead.
+      start: a file of Gaussians in the dataset's coordinates to initialise from,
+        instead of ``config.initial``.
+      trained, held_out: names of the views once split. They are fixed from then on, and
+        a dataset with other views is rejected.
     """
 
     dataset: Path
@@ -69,7 +69,7 @@ class RunSettings:
 
 
 class RunFiles(NamedTuple):
-    """Where a run keeps what."""
+    """Paths of the files of a run; see the module's docstring."""
 
     config: Path
     metrics: Path
@@ -83,156 +83,159 @@ class RunFiles(NamedTuple):
     curves: Path
 
 
-class Data(NamedTuple):
-    """A dataset, ready to train on.
+class SplitDataset(NamedTuple):
+    """A dataset with its split into training and held-out views.
 
     Attributes:
-      scene: all of it.
-      train, test: indices of its views.
+      dataset: all views.
+      train, test: indices of the views.
     """
 
-    scene: Dataset
+    dataset: Dataset
     train: list[int]
     test: list[int]
 
+    def views(self, which: str) -> list[View]:
+        """Return the "train" or "test" views."""
+        chosen = self.test if which == "test" else self.train
+        return [self.dataset.views[index] for index in chosen]
+
 
 def run_files(folder: Path, which: str = "test") -> RunFiles:
-    """Names inside ``folder``, of the held-out views or those that were trained on."""
-    of_views = "" if which == "test" else f"_{which}"
+    """Return the paths inside ``folder``; ``which`` views were evaluated."""
+    suffix = "" if which == "test" else f"_{which}"
     return RunFiles(
         config=folder / "config.json",
         metrics=folder / "metrics.jsonl",
         checkpoints=folder / "checkpoints",
         splat=folder / "splat.ply",
         cameras=folder / "cameras.json",
-        eval=folder / f"eval{of_views}.json",
+        eval=folder / f"eval{suffix}.json",
         held_out=folder / "held_out.jsonl",
-        renders=folder / f"renders{of_views}",
-        preview=folder / f"preview{of_views}.png",
+        renders=folder / f"renders{suffix}",
+        preview=folder / f"preview{suffix}.png",
         curves=folder / "curves.png",
     )
 
 
-def load_data(settings: RunSettings) -> Data:
-    """The dataset of a run as it was given, and which views are for what.
+def load_split(settings: RunSettings) -> SplitDataset:
+    """Load the dataset of a run with its original cameras, and split it.
 
     Raises:
-      InputError: as `load_dataset` and `split_views`; if the dataset is not where it
-        was, or holds other views than those that the run was made from.
+      InputError: as `load_dataset` and `split_views`; if the dataset has moved, or has
+        other views than the run.
     """
     if settings.trained and not settings.dataset.exists():
         raise InputError(
-            f"{settings.dataset}: does not exist, and the run was made from it; if it "
-            "was moved, tell the run once: gsjax train NEW_PLACE -o RUN --resume"
+            f"{settings.dataset}: the run was trained on it, but it does not exist; if "
+            "you moved it, pass its new place once: gsjax train NEW_PLACE -o RUN "
+            "--resume"
         )
-    scene = load_dataset(
+    dataset = load_dataset(
         settings.dataset,
         images=settings.images,
         skip_missing=settings.skip_missing,
         factor=settings.factor,
     )
     if not settings.trained:
-        split = split_views(scene.views, settings.every, settings.test_images)
-        return Data(scene, *split)
-    data, held_out = Data(scene, [], []), set(settings.held_out)
-    for index, view in enumerate(scene.views):
-        (data.test if view.name in held_out else data.train).append(index)
-    _check_same(settings, with_views(settings, data))
-    return data
+        split = split_views(dataset.views, settings.every, settings.test_images)
+        return SplitDataset(dataset, *split)
+    split, held_out = SplitDataset(dataset, [], []), set(settings.held_out)
+    for index, view in enumerate(dataset.views):
+        (split.test if view.name in held_out else split.train).append(index)
+    _check_same_views(settings, with_views(settings, split))
+    return split
 
 
-def with_views(settings: RunSettings, data: Data) -> RunSettings:
-    """The same, with the names of the views and what they are for."""
+def with_views(settings: RunSettings, split: SplitDataset) -> RunSettings:
+    """Return the settings with the names of the views of a split."""
     trained, held_out = (
-        tuple(data.scene.views[index].name for index in some)
-        for some in (data.train, data.test)
+        tuple(view.name for view in split.views(which)) for which in ("train", "test")
     )
     return replace(settings, trained=trained, held_out=held_out)
 
 
-def _check_same(then: RunSettings, now: RunSettings) -> None:
-    """See that a run's views are what they were."""
+def _check_same_views(then: RunSettings, now: RunSettings) -> None:
     names = {"trained on": (then.trained, now.trained),
              "held out": (then.held_out, now.held_out)}  # fmt: skip
-    told = []
-    for what, (old, new) in names.items():
+    differences = []
+    for role, (old, new) in names.items():
         changes = [f"+{name}" for name in sorted(set(new) - set(old))]
         changes += [f"-{name}" for name in sorted(set(old) - set(new))]
         if changes:
             few = changes[:5] + ["…"] * (len(changes) > 5)
-            told.append(f"{' '.join(few)} ({what})")
-    if told or then != now:
+            differences.append(f"{' '.join(few)} ({role})")
+    if differences or then != now:
         raise InputError(
-            f"{then.dataset}: no longer the views that the run was made from: "
-            f"{', '.join(told) or 'their order is another'}; put it back as it was, or "
-            "train again"
+            f"{then.dataset}: its views are not those of the run: "
+            f"{', '.join(differences) or 'their order differs'}; restore the dataset, "
+            "or train again"
         )
 
 
-def refined_data(data: Data, files: RunFiles) -> Data:
-    """The same with its cameras as the run left them.
+def with_refined_cameras(split: SplitDataset, files: RunFiles) -> SplitDataset:
+    """Replace the cameras by those that the run refined, if it did.
 
     Raises:
       InputError: if their file is damaged.
     """
     if not files.cameras.exists():
-        return data
-    return data._replace(scene=with_cameras(data.scene, files.cameras))
+        return split
+    return split._replace(dataset=load_cameras(split.dataset, files.cameras))
 
 
-def background_of(config: TrainConfig) -> tuple[float, float, float]:
-    """Behind the scene where it is looked at."""
+def background_color(config: TrainConfig) -> tuple[float, float, float]:
+    """Return the RGB background to evaluate and view a scene with."""
     return (1.0, 1.0, 1.0) if config.background == "white" else (0.0, 0.0, 0.0)
 
 
 def load_settings(folder: Path) -> RunSettings:
-    """The settings of a run.
+    """Return the settings of a run.
 
     Raises:
-      InputError: if the folder holds none, or they are damaged.
+      InputError: if the folder is not that of a run, or its config.json is damaged.
     """
-    path, wanted = run_files(folder).config, "what `gsjax train -o` made"
+    path, expected = run_files(folder).config, "a folder made by `gsjax train -o`"
     if not path.exists():
-        raise InputError(f"{folder}: {_no_run(folder)}; pass {wanted}")
-    data = read_json(path, wanted)
+        raise InputError(f"{folder}: {_why_not_a_run(folder)}; pass {expected}")
+    data = read_json(path, expected)
     try:
         if data["format"] != _FORMAT:
-            raise ValueError(f"format {data['format']!r}; {_FORMAT} is wanted")
+            raise ValueError(f"format: expected {_FORMAT}, got {data['format']!r}")
         rest = {k: v for k, v in data.items() if k not in ("format", "train")}
-        check_kinds(RunSettings, rest)
+        check_types(RunSettings, rest)
         rest["dataset"] = Path(rest["dataset"])
         if rest.get("start") is not None:
             rest["start"] = Path(rest["start"])
         if "trained" not in rest and rest.get("every") == 8:
-            rest["every"] = None  # an old run: the dataset's own split went before
+            rest["every"] = None  # older versions wrote their default
         for name in ("test_images", "trained", "held_out"):
             rest[name] = tuple(rest.get(name, ()))
-        config = from_json(json.dumps(data["train"]))
+        config = config_from_json(json.dumps(data["train"]))
         return RunSettings(config=config, **rest)
     except KeyError as error:
         raise InputError(
-            f"{path}: damaged: {error} is missing; pass {wanted}"
+            f"{path}: damaged: {error} is missing; pass {expected}"
         ) from error
     except (ValueError, TypeError) as error:
-        raise InputError(f"{path}: damaged: {error}; pass {wanted}") from error
+        raise InputError(f"{path}: damaged: {error}; pass {expected}") from error
 
 
-def _no_run(path: Path) -> str:
-    """What is there in place of a run's folder."""
+def _why_not_a_run(path: Path) -> str:
     if not path.exists():
         return "does not exist"
     if not path.is_dir():
-        return "a file, where the folder of a run is wanted"
+        return "expected the folder of a run, got a file"
     if is_dataset(path):
         call = shlex.join(["gsjax", "train", str(path)])
-        return f"a dataset; train on it first ({call} -o RUN)"
-    if run_files(path / "run").config.exists():  # as `gsjax demo` makes it
-        return f"no run is here, but one is in {path / 'run'}"
-    return "no run is here (config.json is missing)"
+        return f"is a dataset; train on it first ({call} -o RUN)"
+    if run_files(path / "run").config.exists():  # as `gsjax demo` writes it
+        return f"is not a run, but {path / 'run'} is"
+    return "is not a run (config.json is missing)"
 
 
 def save_settings(folder: Path, settings: RunSettings) -> None:
-    """Write what `load_settings` reads.
+    """Write the config.json that `load_settings` reads.
 
     Raises:
       InputError: if it cannot be written.
@@ -241,33 +244,33 @@ def save_settings(folder: Path, settings: RunSettings) -> None:
     for name in ("dataset", "start"):
         if data[name] is not None:
             data[name] = str(data[name].resolve())
-    train = json.loads(to_json(settings.config))
-    told = {"format": _FORMAT, **data, "train": train}
-    write_json(run_files(folder).config, told, indent=2)
+    train = json.loads(config_to_json(settings.config))
+    content = {"format": _FORMAT, **data, "train": train}
+    write_json(run_files(folder).config, content, indent=2)
 
 
 def save_scene(
-    path: Path, gaussians: Gaussians, scene: Dataset, *, overwrite: bool = False
+    path: Path, gaussians: Gaussians, dataset: Dataset, *, overwrite: bool = False
 ) -> None:
     """Write Gaussians in the coordinates of the dataset's files.
 
     Raises:
       InputError: as `gsjax.save`.
     """
-    if not np.any(scene.origin):
+    if not np.any(dataset.origin):
         save(path, gaussians, overwrite=overwrite)
         return
     with jax.enable_x64(True):
-        means = np.asarray(gaussians.params.means, np.float64) + scene.origin
+        means = np.asarray(gaussians.params.means, np.float64) + dataset.origin
         params = gaussians.params.replace(means=means)  # pyright: ignore
         save(path, gaussians.replace(params=params), overwrite=overwrite)  # pyright: ignore
 
 
-def saved_splat(folder: Path) -> Path:
-    """The Gaussians that a run has left: of its end, or of where it was stopped.
+def require_splat(folder: Path) -> Path:
+    """Return the file of the Gaussians of a run, finished or stopped.
 
     Raises:
-      InputError: if it has left none yet, with how far it is.
+      InputError: if there is none yet; reports how far the run is.
     """
     files = run_files(folder)
     if not files.splat.exists():
@@ -276,16 +279,17 @@ def saved_splat(folder: Path) -> Path:
         done = lines[-1]["step"] if lines else 0
         words = ["gsjax", "train", settings.dataset, "-o", folder, "--resume"]
         raise InputError(
-            f"{folder}: no scene yet, at step {done:,} of {settings.config.steps:,}: "
-            "wait for its end; or, if it was stopped, go on with "
+            f"{folder}: no scene yet, at step {done:,} of {settings.config.steps:,}; "
+            "wait until the run ends or, if it was stopped, resume it: "
             f"{shlex.join(map(str, words))}"
         )
     return files.splat
 
 
 def load_scene(path: Path, origin: np.ndarray) -> Gaussians:
-    """Gaussians of a file, in coordinates from which ``origin`` [3] is subtracted: of
-    one that `save_scene` wrote, those of its dataset.
+    """Load Gaussians and subtract ``origin`` [3] from their means, in float64.
+
+    With the origin of its dataset, this inverts `save_scene`.
 
     Raises:
       InputError: as `gsjax.load`.

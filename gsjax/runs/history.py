@@ -1,9 +1,9 @@
-"""What a run wrote of its steps, read back, and as a picture."""
+"""Logs of a run: .jsonl files written and read, and their plot."""
 
 import io
 import json
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -14,22 +14,21 @@ from gsjax.errors import InputError
 from gsjax.plots.curves import Mark, Series, curves_png
 from gsjax.runtime.files import append_to_file, finite_or_none, read_bytes, write_file
 
-_NEEDED = ("step", "seconds", "gaussians")
-_LINES = 20  # written together
+_REQUIRED = ("step", "seconds", "gaussians")
+_BUFFERED = 20  # lines written together
 
 
-def record_line(record: dict[str, Any]) -> str:
-    """A line of a `.jsonl`."""
-    plain = {
+def _line(record: dict[str, Any]) -> str:
+    finite = {
         k: finite_or_none(v) if isinstance(v, float) else v for k, v in record.items()
     }
-    return json.dumps(plain, allow_nan=False) + "\n"
+    return json.dumps(finite, allow_nan=False) + "\n"
 
 
-class Journal:
-    """Lines for the end of a `.jsonl`, kept in memory until they are written.
+class JsonlLog:
+    """Buffered writer that appends records to a `.jsonl` file.
 
-    What a full disk does not take is kept on, and written later if that is possible.
+    Lines that a full disk rejects stay buffered and are written later if possible.
     """
 
     def __init__(self, path: Path):
@@ -37,17 +36,17 @@ class Journal:
         self._lines: list[str] = []
 
     def add(self, record: dict[str, Any]) -> None:
-        """A line more; every so many are written, or stay for the next time."""
-        self._lines.append(record_line(record))
-        if len(self._lines) % _LINES == 0:
+        """Append a record; a failed automatic write is retried later."""
+        self._lines.append(_line(record))
+        if len(self._lines) % _BUFFERED == 0:
             with suppress(InputError):
                 self.write()
 
     def write(self) -> None:
-        """Write what is not yet.
+        """Write all buffered lines.
 
         Raises:
-          InputError: if it cannot be written.
+          InputError: if they cannot be written.
         """
         if self._lines:
             append_to_file(self.path, "".join(self._lines).encode())
@@ -55,100 +54,88 @@ class Journal:
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Records of a `metrics.jsonl` or `held_out.jsonl`; none if it is not there.
+    """Return the records of a `metrics.jsonl` or `held_out.jsonl`; [] if it is missing.
 
-    A last one that a kill cut short is left out; of what else is none, it is warned.
+    A truncated last line is ignored; other malformed lines raise a warning.
 
     Raises:
-      InputError: if it cannot be read.
+      InputError: if the file cannot be read.
     """
     if not path.exists():
         return []
-    lines, odd = [], []
-    for number, line in enumerate(_lines(path), 1):
-        record = _record(line)
+    records, malformed = [], []
+    for number, line in enumerate(io.BytesIO(read_bytes(path, "a metrics.jsonl")), 1):
+        record = _parse(line)
+        truncated = not line.endswith(b"\n") and b'{"'.startswith(line[:2])
         if record is not None:
-            lines.append(record)
-        elif not _is_cut_short(line) and line.strip():
-            odd.append(number)
-    if odd:
+            records.append(record)
+        elif not truncated and line.strip():
+            malformed.append(number)
+    if malformed:
         warnings.warn(
-            f"{path}: {len(odd)} of {len(lines) + len(odd)} lines are no records of a "
-            f"step and left out, the first: line {odd[0]}; the file is damaged: train "
-            "anew for a whole one",
+            f"{path}: {len(malformed)} of {len(records) + len(malformed)} lines are "
+            f"malformed and skipped, the first is line {malformed[0]}; train again for "
+            "a complete log",
             UserWarning,
             stacklevel=2,
         )
-    return lines
+    return records
 
 
-def _is_cut_short(line: bytes) -> bool:
-    return not line.endswith(b"\n") and b'{"'.startswith(line[:2])
-
-
-def _lines(path: Path) -> Iterator[bytes]:
-    """Of a file, whose content is not held a second time."""
-    return iter(io.BytesIO(read_bytes(path, "a metrics.jsonl")))
-
-
-def _record(line: bytes) -> dict[str, Any] | None:
-    """What a line holds; None if that is no record."""
+def _parse(line: bytes) -> dict[str, Any] | None:
+    """Return the record of a line; None if it is malformed."""
     try:
         record = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    good = isinstance(record, dict) and all(map(_is_number, _needed(record)))
-    return record if good else None
-
-
-def keep_steps(path: Path, steps: int) -> None:
-    """Drop what was logged after the checkpoint that a run goes on from.
-
-    Raises:
-      InputError: if it cannot be written.
-    """
-    if path.exists():
-        kept = [record_line(r) for r in read_metrics(path) if r["step"] <= steps]
-        write_file(path, "".join(kept).encode())
-
-
-def _needed(record: dict[str, Any]) -> list[Any]:
-    """Values that a line has; the PSNR is null where it is not finite."""
-    psnr = record.get("psnr", "missing")
-    return [record.get(key) for key in _NEEDED] + [0 if psnr is None else psnr]
+    if not isinstance(record, dict):
+        return None
+    psnr = record.get("psnr", "missing")  # null if it is not finite
+    values = [record.get(key) for key in _REQUIRED] + [0 if psnr is None else psnr]
+    return record if all(map(_is_number, values)) else None
 
 
 def _is_number(value) -> bool:
     return type(value) in (int, float) and abs(value) < 1e300
 
 
-def write_curves(
+def truncate_log(path: Path, steps: int) -> None:
+    """Drop the records after step ``steps``, at which a run resumes.
+
+    Raises:
+      InputError: if the file cannot be written.
+    """
+    if path.exists():
+        kept = [_line(r) for r in read_metrics(path) if r["step"] <= steps]
+        write_file(path, "".join(kept).encode())
+
+
+def plot_curves(
     path: Path,
     metrics: list[dict[str, Any]],
     window: int,
     held_out: Sequence[dict[str, Any]] = (),
 ) -> None:
-    """PSNR by step: of the view that each step saw, its mean, and of held-out views.
+    """Plot PSNR by step: of each training view, its running mean, and held-out views.
 
-    A thin line marks where the size of the images changed, if the records have it.
+    Steps at which the image size changes are marked.
 
     Args:
-      path: of the PNG; replaced if it exists.
+      path: PNG to write; replaced if it exists.
       metrics, held_out: see `read_metrics`.
-      window: steps of the mean: an epoch has seen all views.
+      window: steps of the running mean, e.g. one epoch.
 
     Raises:
-      InputError: if it cannot be written.
+      InputError: if the file cannot be written.
     """
     steps = np.asarray([record["step"] for record in metrics], float)
     psnr = np.asarray([record["psnr"] for record in metrics], float)
     window = max(1, min(window, len(psnr)))
-    good = np.isfinite(psnr)
-    both = np.cumsum([np.where(good, psnr, 0), good], axis=1, dtype=float)
-    both = np.pad(both, ((0, 0), (1, 0)))
-    total, count = both[:, window:] - both[:, :-window]
+    finite = np.isfinite(psnr)
+    sums = np.cumsum([np.where(finite, psnr, 0), finite], axis=1, dtype=float)
+    sums = np.pad(sums, ((0, 0), (1, 0)))
+    total, count = sums[:, window:] - sums[:, :-window]
     mean = total / np.where(count > 0, count, np.nan)
-    left = int(metrics[-1]["gaussians"]) if metrics else 0
     series = [
         Series("view of the step", steps, psnr, faint=True),
         Series(f"mean of {window}", steps[window // 2 :][: len(mean)], mean),
@@ -156,22 +143,22 @@ def write_curves(
     if held_out:
         points = [[r["step"] for r in held_out], [r["psnr"] for r in held_out]]
         series.append(Series("held out", *np.asarray(points, float)))
+    gaussians = int(metrics[-1]["gaussians"]) if metrics else 0
     curves_png(
         path,
         series,
         title="PSNR in training, dB",
-        # At the end more are dropped, those that no photograph shows.
-        x_label=f"step ({left:,} Gaussians after the last)",
-        marks=_sizes(metrics),
+        x_label=f"step ({gaussians:,} Gaussians after the last)",
+        marks=_size_changes(metrics),
     )
 
 
-def _sizes(metrics: Sequence[dict[str, Any]]) -> list[Mark]:
-    """Where images of another size began, unless all were of one."""
+def _size_changes(metrics: Sequence[dict[str, Any]]) -> list[Mark]:
+    """Return the first step of each image size; [] if there is only one size."""
     marks: list[Mark] = []
     for record in metrics:
         divisor = record.get("divisor")
-        if type(divisor) is not int:  # of an older run
+        if type(divisor) is not int:  # older runs lack it
             continue
         label = "full size" if divisor == 1 else f"1/{divisor} of the size"
         if not marks or marks[-1].label != label:

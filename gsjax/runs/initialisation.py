@@ -1,5 +1,6 @@
-"""What a run starts from: a scene that it is given, or points, of the dataset or found
-in its photographs, or random ones.
+"""Initial state of a run: from a given scene, or from points.
+
+The points are those of the dataset, denser ones found in its photographs, or random.
 """
 
 import time
@@ -12,8 +13,8 @@ from gsjax.data.extent import has_points
 from gsjax.data.types import Photo
 from gsjax.errors import InputError
 from gsjax.runs.folder import (
-    Data,
     RunSettings,
+    SplitDataset,
     load_scene,
     load_settings,
     run_files,
@@ -28,71 +29,75 @@ from gsjax.train.memory_estimate import check_memory, check_state_memory
 from gsjax.train.state import TrainState
 
 
-def resolve_initialisation(settings: RunSettings, data: Data) -> RunSettings:
-    """With what the run starts from, which it keeps when it is gone on with."""
+def resolve_initialisation(settings: RunSettings, split: SplitDataset) -> RunSettings:
+    """Resolve the initialisation "auto" and store it, so that resuming repeats it."""
     config = settings.config
     if settings.start is not None:
         return settings
-    decided = resolve_initial(subset(data.scene, data.train), config)
-    if config.initial == "auto" and decided.initial == "random":
-        note("the dataset has no points: starting from random ones (--initial random)")
-    return replace(settings, config=decided)
+    resolved = resolve_initial(subset(split.dataset, split.train), config)
+    if config.initial == "auto" and resolved.initial == "random":
+        note("the dataset has no points: initialising at random (--initial random)")
+    return replace(settings, config=resolved)
 
 
-def load_initial_state(settings: RunSettings, data: Data) -> TrainState | None:
-    """A run before its first step, where it starts from a scene.
+def load_initial_state(settings: RunSettings, split: SplitDataset) -> TrainState | None:
+    """Return the state before the first step of a run that starts from a scene.
+
+    It is None if ``settings.start`` is not set.
 
     Raises:
-      InputError: if that is not there, or damaged, or of another dataset, or more than
-        there may be.
+      InputError: if the scene is missing, damaged, of another dataset, or has more
+        Gaussians than allowed.
     """
     path, config = settings.start, settings.config
     if path is None:
         return None
-    scene = subset(data.scene, data.train)
-    gaussians = load_scene(path, scene.origin)
+    dataset = subset(split.dataset, split.train)
+    gaussians = load_scene(path, dataset.origin)
     active = np.asarray(gaussians.active)
     check_state_memory(int(active.sum()), config)
-    had, has = gaussians.sh_degree, config.sh_degree
-    cut = f", of whose SH degree {had} the run has {has} (--sh-degree)"
-    note(f"starting from the scene of {path}{cut if had > has else ''}")
+    note(f"starting from the scene of {path}")
+    if gaussians.sh_degree > config.sh_degree:
+        note(
+            f"its SH degree {gaussians.sh_degree} is reduced to {config.sh_degree} "
+            "(--sh-degree)"
+        )
     try:
-        state = initial_state(scene, config, gaussians)
+        state = initial_state(dataset, config, gaussians)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    check_in_view(scene, np.asarray(gaussians.params.means)[active], str(path))
-    _tell_seen(path, with_views(settings, data).held_out)
+    check_in_view(dataset, np.asarray(gaussians.params.means)[active], str(path))
+    warn_of_trained_views(path, with_views(settings, split).held_out)
     return state
 
 
-def _tell_seen(start: Path, held_out: tuple[str, ...]) -> None:
-    """Of held-out views that the scene to start from has learnt from, if a run made
-    it."""
+def warn_of_trained_views(start: Path, held_out: tuple[str, ...]) -> None:
+    """Warn if the run that made the scene ``start`` trained on held-out views."""
     folder = start.parent
     if run_files(folder).splat != start or not run_files(folder).config.exists():
         return
-    seen = set(load_settings(folder).trained) & set(held_out)
-    if seen:
+    trained = set(load_settings(folder).trained) & set(held_out)
+    if trained:
         note(
-            f"warning: {len(seen)} of the {len(held_out)} views held out were trained "
-            f"on by {folder}: what is measured on them is too good; hold out those "
-            "that it did (--test-images, --test-every)"
+            f"warning: {folder} was trained on {len(trained)} of the {len(held_out)} "
+            "held-out views, so their metrics are too high; hold out the views that "
+            "it did (--test-images, --test-every)"
         )
 
 
 def first_state(session: Session, photos: list[Photo]) -> TrainState:
-    """The run before its first step; what it takes counts as training."""
-    scene, config, begun = session.scene, session.config, time.perf_counter()
+    """Return the state before the first step; its time counts as training."""
+    dataset, config, start = session.dataset, session.config, time.perf_counter()
     if config.initial == "dense":
-        note("looking for points on which the photographs agree (--initial dense)")
-    dense = add_dense_points(scene, photos, config)
+        note("matching photographs for dense initial points (--initial dense)")
+    dense = add_dense_points(dataset, photos, config)
     if config.initial == "dense":
-        found = len(dense.points) - len(scene.points)
-        note(f"{found:,} more points, after {time.perf_counter() - begun:.1f} s")
+        found = len(dense.points) - len(dataset.points)
+        note(f"{found:,} points added in {time.perf_counter() - start:.1f} s")
         if not has_points(dense):
-            note("too few, and the dataset has no points: starting from random ones")
-            check_memory(scene, config.replace(initial="random"), None)
+            note("too few points, and the dataset has none: initialising at random")
+            check_memory(dataset, config.replace(initial="random"), None)
     state = initial_state(dense, config)
-    seconds = time.perf_counter() - begun
-    session.start = session.start._replace(seconds=seconds)
+    seconds = time.perf_counter() - start
+    session.resume_point = session.resume_point._replace(seconds=seconds)
     return state

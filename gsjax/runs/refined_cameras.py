@@ -1,6 +1,6 @@
-"""Cameras as a run refined them: worked out, written and read back.
+"""Cameras refined by a run: computed, written and read.
 
-Axis legend: V views that were trained on.
+Axis legend: V training views.
 """
 
 from collections.abc import Sequence
@@ -21,34 +21,37 @@ from gsjax.train.camera_refinement import CameraRefinement, refine_camera
 _RIGID_TOLERANCE = 1e-3
 
 
-def refined_scene(
-    scene: Dataset, trained: Sequence[int], refinement: CameraRefinement, extent: float
+def refine_dataset(
+    dataset: Dataset,
+    trained: Sequence[int],
+    refinement: CameraRefinement,
+    extent: float,
 ) -> Dataset:
-    """The scene with its cameras corrected.
+    """Return the dataset with corrected cameras.
 
     Args:
-      scene: all views of the dataset.
-      trained: V indices of those that the corrections are of; of the others, only the
-        intrinsics are corrected, which all have in common.
-      refinement: what was learnt.
-      extent: of the training views.
+      dataset: all views.
+      trained: indices of the V training views. Poses of other views are not corrected;
+        intrinsics are common to all views.
+      refinement: learnt corrections.
+      extent: extent of the training views.
     """
-    place = {index: row for row, index in enumerate(trained)}
-    for_all = CameraRefinement(intrinsics=refinement.intrinsics)
+    rows = {index: row for row, index in enumerate(trained)}
+    shared = CameraRefinement(intrinsics=refinement.intrinsics)
     with jax.enable_x64(True):
-        wide, wide_for_all = jax.tree.map(
-            lambda a: jnp.asarray(np.asarray(a, np.float64)), (refinement, for_all)
+        wide, wide_shared = jax.tree.map(
+            lambda a: jnp.asarray(np.asarray(a, np.float64)), (refinement, shared)
         )
         views = [
-            _refined(view, wide, place[index], extent)
-            if index in place
-            else _refined(view, wide_for_all, 0, extent)
-            for index, view in enumerate(scene.views)
+            _refine(view, wide, rows[index], extent)
+            if index in rows
+            else _refine(view, wide_shared, 0, extent)
+            for index, view in enumerate(dataset.views)
         ]
-    return replace(scene, views=tuple(views))
+    return replace(dataset, views=tuple(views))
 
 
-def _refined(view: View, refinement: CameraRefinement, row: int, extent: float) -> View:
+def _refine(view: View, refinement: CameraRefinement, row: int, extent: float) -> View:
     camera = make_camera(
         viewmat=view.viewmat[None], K=view.K[None], width=view.width, height=view.height
     )
@@ -56,12 +59,12 @@ def _refined(view: View, refinement: CameraRefinement, row: int, extent: float) 
     return replace(view, viewmat=np.asarray(moved.viewmat[0]), K=np.asarray(moved.K[0]))
 
 
-def refined_photos(
+def refine_photos(
     photos: Sequence[Photo], given: Sequence[View], refined: Sequence[View]
 ) -> list[Photo]:
-    """Photographs that were loaded for ``given`` views, for those views refined.
+    """Return photographs loaded for ``given`` views with the K of ``refined`` ones.
 
-    They are not loaded anew: what undistorts them is the lens as it was given.
+    The pixels stay: they are undistorted by the original lens.
     """
     return [
         photo._replace(K=photo.K @ np.linalg.solve(before.K, after.K))
@@ -69,43 +72,43 @@ def refined_photos(
     ]
 
 
-def save_cameras(path: Path, scene: Dataset) -> None:
+def save_cameras(path: Path, dataset: Dataset) -> None:
     """Write the cameras of all views, in the coordinates of the dataset's files.
 
     Raises:
-      InputError: if it cannot be written.
+      InputError: if they cannot be written.
     """
     views = [
         {
             "name": view.name,
-            "viewmat": _moved(view.viewmat, -scene.origin).tolist(),
+            "viewmat": _translate(view.viewmat, -dataset.origin).tolist(),
             "K": view.K.tolist(),
         }
-        for view in scene.views
+        for view in dataset.views
     ]
     write_json(path, {"views": views})
 
 
-def with_cameras(scene: Dataset, path: Path) -> Dataset:
-    """The scene with the cameras of a file that `save_cameras` wrote.
+def load_cameras(dataset: Dataset, path: Path) -> Dataset:
+    """Return the dataset with the cameras of a file of `save_cameras`.
 
     Raises:
-      InputError: if the file is damaged, or a view is not in it.
+      InputError: if the file is damaged, or lacks a view.
     """
     data = read_json(path, "the cameras.json of a run")
     try:
         found = {view["name"]: view for view in data["views"]}
         views = []
-        for view in scene.views:
+        for view in dataset.views:
             viewmat, K = (
                 np.asarray(found[view.name][name], np.float64).reshape(size, size)
                 for name, size in (("viewmat", 4), ("K", 3))
             )
             if not (_is_rigid(viewmat) and np.isfinite(K).all()):
-                raise ValueError(f"{view.name}: no rigid pose, or not finite")
-            viewmat = _moved(viewmat, scene.origin)
+                raise ValueError(f"{view.name}: expected a rigid pose and finite K")
+            viewmat = _translate(viewmat, dataset.origin)
             views.append(replace(view, viewmat=viewmat, K=K))
-        return replace(scene, views=tuple(views))
+        return replace(dataset, views=tuple(views))
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(
             f"{path}: damaged, or of another dataset: {error!r}; remove it to use the "
@@ -124,8 +127,8 @@ def _is_rigid(viewmat: np.ndarray) -> bool:
     )
 
 
-def _moved(viewmat: np.ndarray, by: np.ndarray) -> np.ndarray:
-    """The same camera where the world's origin is at ``by``."""
+def _translate(viewmat: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Return the same camera in coordinates with the origin at ``origin``."""
     moved = viewmat.copy()
-    moved[:3, 3] += viewmat[:3, :3] @ by
+    moved[:3, 3] += viewmat[:3, :3] @ origin
     return moved

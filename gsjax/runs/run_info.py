@@ -1,4 +1,4 @@
-"""How a run went, in numbers: what `gsjax info` says of a run's folder."""
+"""Progress and quality of a run, for `gsjax info`."""
 
 from pathlib import Path
 from typing import Any
@@ -10,18 +10,22 @@ from gsjax.runtime.console import decibels
 from gsjax.runtime.files import read_json
 
 _VIEWS = {"test": "held-out", "train": "training"}
-# Of an evaluation, what is told of it, and what that may be.
-_TOLD = {"which": (str,), "views": (int,), "ssim": (float, int)}
-_TOLD["psnr"] = (float, int, type(None))  # null where it is infinite
+# Reported keys of an evaluation and their types; psnr is null if it is infinite.
+_REPORTED = {
+    "which": (str,),
+    "views": (int,),
+    "ssim": (float, int),
+    "psnr": (float, int, type(None)),
+}
 
 
 def describe_run(folder: Path) -> dict[str, Any]:
-    """Settings that matter most, how far it went, and how well, ready for JSON.
+    """Return the main settings, progress and quality of a run, ready for JSON.
 
-    The latter are None as long as the run has not come to them.
+    ``evaluation`` is None if there is none yet.
 
     Raises:
-      InputError: if there is no run, or its files are damaged.
+      InputError: if the folder is not a run, or its files are damaged.
     """
     settings, files = load_settings(folder), run_files(folder)
     config = settings.config
@@ -43,22 +47,22 @@ def describe_run(folder: Path) -> dict[str, Any]:
 def _evaluation(path: Path) -> dict[str, Any] | None:
     if not path.exists():
         return None
-    told = read_json(path, "what `gsjax eval` writes anew")
-    for key, kinds in _TOLD.items():
-        value = told.get(key, "missing")
+    data = read_json(path, "the eval.json of a run")
+    for key, kinds in _REPORTED.items():
+        value = data.get(key, "missing")
         good = type(value) in kinds
         if good and type(value) in (int, float):
             good = abs(value) < 1e30
         if not good or (key == "which" and value not in _VIEWS):
             raise InputError(
-                f"{path}: damaged: {key} is {repr(value)[:80]}; `gsjax eval` writes it "
-                "anew"
+                f"{path}: damaged: {key} is {repr(value)[:80]}; write it again with "
+                "`gsjax eval`"
             )
-    return {key: told[key] for key in _TOLD}
+    return {key: data[key] for key in _REPORTED}
 
 
 def run_text(path: str, facts: dict[str, Any]) -> str:
-    """`describe_run` as lines to read."""
+    """Return `describe_run` as readable lines."""
     rows = {
         "dataset": facts["dataset"],
         "strategy": facts["strategy"],

@@ -1,4 +1,4 @@
-"""What a scene consists of, in numbers: the text behind `gsjax info`."""
+"""Statistics of a scene, for `gsjax info`."""
 
 from typing import Any
 
@@ -6,19 +6,20 @@ import jax
 import numpy as np
 
 from gsjax.gaussians import Gaussians, capacity_bucket
-from gsjax.raster.render import render_estimate
+from gsjax.raster.memory_estimate import render_estimate
 from gsjax.raster.types import RasterConfig
+from gsjax.runtime.memory import size_text
 
 _PERCENTILES = (1, 25, 50, 75, 99)
 _SIZE = (1920, 1080)
-_PAIRS = 5  # a Gaussian has about so many, where it is one of a trained scene
+_PAIRS = 5  # tile pairs per Gaussian, typical of trained scenes
 
 
 def describe(gaussians: Gaussians) -> dict[str, Any]:
-    """Counts, bounds and percentiles of the active Gaussians, ready for JSON.
+    """Return counts, bounds and percentiles of the active Gaussians, ready for JSON.
 
-    Percentiles are keyed by their number; they and the bounds are None if there is
-    no Gaussian, and a number that is not finite is None.
+    Percentiles are keyed by their number. Percentiles and bounds of no Gaussian are
+    None, as are non-finite numbers.
     """
     params = gaussians.params
     active = np.asarray(gaussians.active)
@@ -49,7 +50,6 @@ def describe(gaussians: Gaussians) -> dict[str, Any]:
 
 
 def _render_bytes(gaussians: Gaussians) -> int:
-    """What a picture of `_SIZE` takes, about, of scenes as training makes them."""
     pairs = capacity_bucket(_PAIRS * gaussians.capacity)
     config = RasterConfig(pair_capacity=min(pairs, 2**30 - 1))
     bases = gaussians.params.sh.shape[-2]
@@ -66,7 +66,7 @@ def _percentiles(values: np.ndarray) -> dict[str, float | None]:
 
 
 def _bounds(means: np.ndarray, percentiles: tuple[int, int]) -> list | None:
-    """[low, high] corners, or None if there are no points."""
+    """Return the [low, high] corners of a box; None without points."""
     if len(means) == 0:
         return None
     corners = np.percentile(means.astype(np.float64), percentiles, axis=0)
@@ -78,44 +78,36 @@ def _finite(value) -> float | None:
 
 
 def info_text(path: str, facts: dict[str, Any]) -> str:
-    """`describe`, and ``file_bytes``, as lines to read."""
+    """Return `describe`, together with ``file_bytes``, as readable lines."""
 
-    def row(name: str, value: str) -> str:
-        return f"  {name:<18}{value}"
+    def number(value: float | None) -> str:
+        return "–" if value is None else f"{value:.4g}"
 
     def spread(values: dict[str, float | None]) -> str:
-        return "   ".join(f"{key} {_number(value)}" for key, value in values.items())
+        return "   ".join(f"{key} {number(value)}" for key, value in values.items())
 
     def box(corners: list | None) -> str:
         if corners is None:
             return "–"
-        low, high = (" ".join(_number(v) for v in corner) for corner in corners)
+        low, high = (" ".join(number(v) for v in corner) for corner in corners)
         return f"[{low}] to [{high}]"
 
-    numbers = facts["numbers_per_gaussian"]
-    return "\n".join(
-        [
-            path,
-            row("Gaussians", f"{facts['count']:,}"),
-            row("SH degree", f"{facts['sh_degree']} ({numbers} numbers each)"),
-            row("bounds", box(facts["bounds"])),
-            row("bounds 1 to 99 %", box(facts["bounds_1_99"])),
-            row("opacity", spread(facts["opacity"])),
-            row("scale", spread(facts["scale"])),
-            row("longest/shortest", spread(facts["anisotropy"])),
-            row("zero quaternions", f"{facts['zero_quaternions']:,}"),
-            row("file", _size(facts["file_bytes"])),
-            row("parameters", f"{_size(facts['parameter_bytes'])} ({facts['dtype']})"),
-            row(
-                "memory to render",
-                f"about {_size(facts['render_bytes'])} at {_SIZE[0]} × {_SIZE[1]}",
-            ),
-        ]
-    )
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4g}"
+    rows = {
+        "Gaussians": f"{facts['count']:,}",
+        "SH degree": f"{facts['sh_degree']} "
+        f"({facts['numbers_per_gaussian']} numbers each)",
+        "bounds": box(facts["bounds"]),
+        "bounds 1 to 99 %": box(facts["bounds_1_99"]),
+        "opacity": spread(facts["opacity"]),
+        "scale": spread(facts["scale"]),
+        "longest/shortest": spread(facts["anisotropy"]),
+        "zero quaternions": f"{facts['zero_quaternions']:,}",
+        "file": _size(facts["file_bytes"]),
+        "parameters": f"{_size(facts['parameter_bytes'])} ({facts['dtype']})",
+        "memory to render": f"about {size_text(facts['render_bytes'])} at "
+        f"{_SIZE[0]} × {_SIZE[1]}",
+    }
+    return "\n".join([path, *(f"  {name:<18}{value}" for name, value in rows.items())])
 
 
 def _size(count: int) -> str:

@@ -1,4 +1,4 @@
-"""What the commands are given as a scene: a file, or the folder of a run."""
+"""A scene given by a file of Gaussians or the folder of a run."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,13 +10,14 @@ import numpy as np
 from gsjax.gaussians import Gaussians
 from gsjax.raster.types import RasterConfig
 from gsjax.runs.folder import (
-    background_of,
+    background_color,
     load_scene,
     load_settings,
-    saved_splat,
+    require_splat,
 )
 
-PRESETS = {
+# Render settings by their names on the command line.
+RASTER_PRESETS = {
     "compat": RasterConfig.compat,
     "accurate": RasterConfig.accurate,
     "fast": RasterConfig.fast,
@@ -24,13 +25,13 @@ PRESETS = {
 
 
 class SceneSource(NamedTuple):
-    """A scene to be rendered, and how it wants to be.
+    """A scene to render, and how.
 
     Attributes:
-      load: reads the Gaussians; called when all else is found to be well.
-      config: how to render.
-      background: RGB behind the scene.
-      budget: largest error of rgb for which to choose the settings anew, or None.
+      load: reads the Gaussians; called after all other checks.
+      config: render settings.
+      background: RGB background.
+      budget: maximum error of rgb to choose settings for, or None to use ``config``.
     """
 
     load: Callable[[], Gaussians]
@@ -39,48 +40,48 @@ class SceneSource(NamedTuple):
     budget: float | None = None
 
 
-def from_anywhere(trained: RasterConfig) -> RasterConfig:
-    """The settings of a training, for views that are not of its photographs.
+def free_view_config(trained: RasterConfig) -> RasterConfig:
+    """Return the render settings of a run with occlusion culling on.
 
-    Such a view may be filled by what stands right before the camera, and what is behind
-    it is looked for; training does not, see `TrainConfig`.
+    Training leaves it off, see `TrainConfig`; a free view may be filled by Gaussians
+    right before the camera, where it pays.
     """
     return trained.replace(occlusion=RasterConfig.occlusion)
 
 
 def is_run(path: Path) -> bool:
-    """Whether a name means a run: a folder, or nothing that is there with a suffix."""
+    """Return whether a path denotes a run: a folder, or missing and without suffix."""
     return path.is_dir() or not (path.exists() or path.suffix)
 
 
 def splat_file(path: Path) -> Path:
-    """The Gaussians of a scene: the file itself, or that of the run.
+    """Return the file of Gaussians of a scene: the path itself, or that of the run.
 
     Raises:
-      InputError: if it is a run that is none, or that has no Gaussians yet.
+      InputError: if it is a folder but not a run, or a run without Gaussians yet.
     """
     if not is_run(path):
         return path
     load_settings(path)
-    return saved_splat(path)
+    return require_splat(path)
 
 
 def open_scene_source(
     path: Path,
     *,
     origin: np.ndarray | None = None,
-    preset: str | None = None,
+    raster: RasterConfig | None = None,
     background: tuple[float, ...] | None = None,
 ) -> SceneSource:
-    """A scene by its file or run.
+    """Open a scene by its file or run.
 
     Args:
       path: a .ply or .spz file, or the folder of a run.
-      origin: [3] what is subtracted from the file's coordinates, as it is from those
-        of the cameras that `load_dataset` or `load_near_transforms` gives.
-      preset: name of the constants to render with; None takes those of the run, with
-        the search for what is hidden that training leaves out, for a file "compat".
-      background: RGB; None takes that of the run, for a file black.
+      origin: [3] to subtract from the file's coordinates, as `load_dataset` and
+        `load_near_transforms` do from those of the cameras.
+      raster: render settings, except ``antialias``, which is that of the run; None for
+        `free_view_config` of the run, or "compat" for a file.
+      background: RGB; None for that of the run, or black for a file.
 
     Raises:
       InputError: as `splat_file`.
@@ -88,10 +89,9 @@ def open_scene_source(
     config, behind = RasterConfig.compat(), (0.0, 0.0, 0.0)
     if is_run(path):
         trained = load_settings(path).config
-        config, behind = from_anywhere(trained.raster), background_of(trained)
-    if preset is not None:
-        # Opacities were learnt with or without it: no matter of taste.
-        config = PRESETS[preset](antialias=config.antialias)
+        config, behind = free_view_config(trained.raster), background_color(trained)
+    if raster is not None:  # opacities are learnt for one value of antialias
+        config = raster.replace(antialias=config.antialias)
     splat = splat_file(path)
     reader = partial(load_scene, splat, np.zeros(3) if origin is None else origin)
     return SceneSource(reader, config, behind if background is None else background)

@@ -1,4 +1,4 @@
-"""Views of a scene to image files, one or several for each camera."""
+"""Renders of a scene as image files, one or several per camera."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,8 +12,9 @@ from gsjax.data.transforms import CameraEntry
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.io import images
-from gsjax.planning.plan import plan, trimmed
-from gsjax.raster.render import exact_config, render_estimate, render_exact
+from gsjax.planning.plan import plan, trim_scene
+from gsjax.raster.exact import exact_config, render_exact
+from gsjax.raster.memory_estimate import render_estimate
 from gsjax.raster.types import RasterConfig, Render
 from gsjax.runs.scene_source import SceneSource
 from gsjax.runtime.console import note, progress, say
@@ -21,20 +22,20 @@ from gsjax.runtime.devices import replicate
 from gsjax.runtime.files import make_folder, refuse_existing, write_file
 from gsjax.runtime.memory import available, size_text
 
-_MARGIN = 1.5  # room for views that show more than the first
-_LISTED = 10  # images that are named each; of more, the first and the last
+_MARGIN = 1.5  # spare capacity for views with more pairs than the first
+_MAX_LISTED = 10  # with more images, only the first and last are listed
 
 
 class _Target(NamedTuple):
-    """One image of one camera, and the files it goes to."""
+    """One image of one camera, and its files."""
 
     kind: str
     png: Path
     npy: Path | None
 
 
-def write_views(
-    subject: SceneSource,
+def render_images(
+    source: SceneSource,
     entries: Sequence[CameraEntry],
     folder: Path,
     *,
@@ -42,100 +43,100 @@ def write_views(
     npy: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Render every camera to files of its name.
-
-    The results are a line for each image, or for many without depth, which has its
-    range there, one for all.
+    """Render every camera to files with its name, and list them on stdout.
 
     Args:
-      subject: what to render.
-      entries: the cameras.
-      folder: where the images go; created if missing.
-      kinds: of "rgb", "alpha" and "depth"; the first has the plain name.
+      source: the scene.
+      entries: cameras and their names.
+      folder: output folder; created if missing.
+      kinds: of "rgb", "alpha" and "depth"; files of the first have plain names, others
+        a suffix.
       npy: also write float32 arrays, linear and unclipped.
-      overwrite: whether images that exist may be replaced.
+      overwrite: replace existing files.
 
     Raises:
-      InputError: if the scene cannot be read, or an image exists and ``overwrite`` is
-        not set, or cannot be written.
-      CapacityError: if a view wants more memory than can be addressed.
+      InputError: if the scene cannot be read; or if an image exists without
+        ``overwrite``, would be written twice, or cannot be written.
+      CapacityError: if a view needs more memory than can be addressed.
       MissingExtraError: if OpenCV is absent.
     """
     images.opencv()
     targets = [_targets(folder, entry.name, kinds, npy) for entry in entries]
-    _refuse_conflicts(targets, overwrite)
+    _check_paths(targets, overwrite)
     cameras = [entry.camera for entry in entries]
-    gaussians, config = prepared(subject, cameras, kinds)
+    gaussians, config = prepare_render(source, cameras, kinds)
     make_folder(folder)
-    views = rendered(gaussians, cameras, config, subject.background)
-    pictures = [target.png for of_view in targets for target in of_view]
-    each = len(pictures) <= _LISTED or "depth" in kinds
-    for of_view, view in zip(progress(targets, "views"), views):
+    renders = render_cameras(gaussians, cameras, config, source.background)
+    paths = [target.png for of_view in targets for target in of_view]
+    list_each = len(paths) <= _MAX_LISTED or "depth" in kinds
+    for of_view, view in zip(progress(targets, "views"), renders):
         for target in of_view:
             line = _write(target, np.asarray(getattr(view, target.kind), np.float32))
-            if each:
+            if list_each:
                 say(line)
-    if not each:
-        say(f"{pictures[0]} … {pictures[-1].name}, {len(pictures)} images")
+    if not list_each:
+        say(f"{paths[0]} … {paths[-1].name}, {len(paths)} images")
 
 
-def prepared(
-    subject: SceneSource, cameras: Sequence[Camera], kinds: Sequence[str]
+def prepare_render(
+    source: SceneSource, cameras: Sequence[Camera], kinds: Sequence[str]
 ) -> tuple[Gaussians, RasterConfig]:
-    """The scene and how to render it: with a budget as `plan` says, and why; else
-    without what changes nothing (`trimmed`).
+    """Load a scene and choose its render settings.
+
+    With a budget, `plan` chooses and its reasons are printed; otherwise Gaussians that
+    cannot change a pixel are removed (`trim_scene`).
 
     Raises:
       InputError: if the scene cannot be read, or as `plan`.
     """
-    gaussians, config = subject.load(), subject.config.replace(outputs=tuple(kinds))
-    if subject.budget is None:
-        return trimmed(gaussians, config), config
-    made = plan(
+    gaussians, config = source.load(), source.config.replace(outputs=tuple(kinds))
+    if source.budget is None:
+        return trim_scene(gaussians, config), config
+    planned = plan(
         gaussians,
         cameras,
-        budget=subject.budget,
+        budget=source.budget,
         config=config,
-        background=subject.background,
+        background=source.background,
         outputs=kinds,
     )
-    for line in made.lines():
+    for line in planned.lines():
         note(line)
-    return made.gaussians, made.config
+    return planned.gaussians, planned.config
 
 
-def rendered(
+def render_cameras(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     config: RasterConfig,
     background: Sequence[float],
 ) -> Iterator[Render]:
-    """`render_exact` of each camera in turn.
+    """Yield `render_exact` of each camera.
 
-    The capacity fits the first view, and grows with the others: it never shrinks, so
-    that few programs are compiled.
+    The pair capacity starts from the first view and only grows, so that few programs
+    are compiled.
     """
-    behind = jnp.asarray(background, jnp.result_type(float))
+    color = jnp.asarray(background, jnp.result_type(float))
     gaussians = replicate(gaussians)
     for index, camera in enumerate(cameras):
         if index == 0 and config.pair_capacity is None:
-            fitted = exact_config(gaussians, camera, config).pair_capacity or 1
-            roomy = capacity_bucket(int(_MARGIN * fitted))
-            config = config.replace(pair_capacity=roomy)
+            needed = exact_config(gaussians, camera, config).pair_capacity or 1
+            capacity = capacity_bucket(int(_MARGIN * needed))
+            config = config.replace(pair_capacity=capacity)
         if index == 0:
-            _tell_memory(gaussians, camera, config)
-        view = render_exact(gaussians, camera, config, behind)
-        wanted = capacity_bucket(int(view.demand.capacity))
-        config = config.replace(pair_capacity=max(config.pair_capacity or 1, wanted))
+            _note_memory(gaussians, camera, config)
+        view = render_exact(gaussians, camera, config, color)
+        needed = capacity_bucket(int(view.demand.capacity))
+        config = config.replace(pair_capacity=max(config.pair_capacity or 1, needed))
         yield view
 
 
-def _tell_memory(gaussians: Gaussians, camera: Camera, config: RasterConfig) -> None:
+def _note_memory(gaussians: Gaussians, camera: Camera, config: RasterConfig) -> None:
     bases, size = gaussians.params.sh.shape[1], (camera.width, camera.height)
     estimate = render_estimate(gaussians.capacity, bases, size, config)
     free = available()
-    told = "" if free is None else f"; {size_text(free)} is free"
-    note(f"memory: about {size_text(estimate.total)} a view{told}")
+    of_free = "" if free is None else f" of {size_text(free)} available"
+    note(f"memory: about {size_text(estimate.total)} per view{of_free}")
 
 
 def _targets(folder: Path, name: str, kinds: Sequence[str], npy: bool) -> list[_Target]:
@@ -147,8 +148,8 @@ def _targets(folder: Path, name: str, kinds: Sequence[str], npy: bool) -> list[_
     return out
 
 
-def _refuse_conflicts(targets: list[list[_Target]], overwrite: bool) -> None:
-    """Raise unless every file has a name of its own that may be written."""
+def _check_paths(targets: list[list[_Target]], overwrite: bool) -> None:
+    """Raise if two files have the same name, or one exists without ``overwrite``."""
     flat = [target for of_view in targets for target in of_view]
     paths = [path for t in flat for path in (t.png, t.npy) if path is not None]
     seen: set[str] = set()
@@ -156,14 +157,14 @@ def _refuse_conflicts(targets: list[list[_Target]], overwrite: bool) -> None:
         if str(path).casefold() in seen:
             raise InputError(
                 f"{path}: two images would have this name; rename the frames in the "
-                "camera file, or ask for one kind of image at a time"
+                "camera file, or render one kind of image at a time"
             )
         seen.add(str(path).casefold())
     refuse_existing(paths, overwrite, "another folder with -o")
 
 
 def _write(target: _Target, image: np.ndarray) -> str:
-    """Write the files of an image; returns what is said of it."""
+    """Write the files of an image and return a line that describes them."""
     line = str(target.png)
     if target.kind == "depth":
         depth = images.depth_picture(image)

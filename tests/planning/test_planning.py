@@ -8,19 +8,20 @@ from conftest import LIGHT, camera_of, frustum_points, gaussians_at
 
 import gsjax
 from gsjax import RasterConfig
-from gsjax.cli.common import UsageError, parse_budget
+from gsjax.cli.options import parse_budget
 from gsjax.errors import InputError
 from gsjax.math.sh import sh_basis
 from gsjax.planning import accuracy, bounds
 from gsjax.planning import plan as planning
 from gsjax.raster import render as render_module
-from gsjax.raster.render import count_demand, render_at_cut
+from gsjax.raster.exact import count_demand
+from gsjax.raster.render import render_at_cut
 from gsjax.runs.scene_source import SceneSource
-from gsjax.runs.views import prepared
+from gsjax.runs.views import prepare_render
 
 SIZE, BUDGET, BEHIND = 32, 1 / 255, (0.2, 0.5, 0.9)
 CONFIG = RasterConfig(**LIGHT, outputs=("rgb",))
-EXACT = RasterConfig.accurate(**LIGHT, outputs=("rgb",), alpha_min=1e-7, stop=1e-7)
+EXACT = RasterConfig.accurate(**LIGHT, outputs=("rgb",), alpha_min=1e-7, transmittance_min=1e-7)
 
 
 def looking(count, seed):
@@ -162,7 +163,7 @@ def test_without_a_budget_nothing_changes():
     made = planned(padded, view)
     assert (made.gaussians.sh_degree, made.gaussians.capacity) == (0, 200)
     assert made.error == 0
-    same = ("alpha_min", "alpha_max", "stop", "stop_rule", "dilation", "antialias")
+    same = ("alpha_min", "alpha_max", "transmittance_min", "stop_rule", "dilation", "antialias")
     assert all(getattr(made.config, n) == getattr(CONFIG, n) for n in same)
     wanted = gsjax.render_exact(padded, view, CONFIG).rgb
     found = gsjax.render_exact(made.gaussians, view, made.config)
@@ -321,7 +322,7 @@ def test_budgets_are_read(text, value):
 
 @pytest.mark.parametrize("text", ["", "0", "-1", "1/0", "1/", "a", "nan", "1e999/1"])
 def test_budgets_are_refused(text):
-    with pytest.raises(UsageError, match="--budget"):
+    with pytest.raises(ValueError, match="an error above 0"):
         parse_budget(text)
 
 
@@ -329,7 +330,7 @@ def test_budgets_are_refused(text):
 def test_render_takes_the_plan_and_says_why(capsys):
     scene = gsjax.grow(gaussians_at([[0, 0, 4]], 0.5, 0.7, degree=0), 9)
     subject = SceneSource(lambda: scene, CONFIG, BEHIND, budget=0.05)
-    found, config = prepared(subject, looking(1, 0), ("rgb", "alpha"))
+    found, config = prepare_render(subject, looking(1, 0), ("rgb", "alpha"))
     made = planned(scene, looking(1, 0), budget=0.05, outputs=("rgb", "alpha"))
     assert (found.capacity, config) == (1, made.config)
     told = capsys.readouterr().err.splitlines()
@@ -344,7 +345,7 @@ def test_render_leaves_out_what_shows_in_no_picture():
     sh = scene.params.sh.at[:, 4:].set(0)
     scene = gsjax.grow(scene.replace(params=scene.params.replace(sh=sh)), 9)
     subject = SceneSource(lambda: scene, CONFIG, BEHIND)
-    found, config = prepared(subject, looking(1, 0), ("rgb",))
+    found, config = prepare_render(subject, looking(1, 0), ("rgb",))
     assert config == CONFIG.replace(outputs=("rgb",))
     assert (found.capacity, found.sh_degree) == (4, 1)
     (camera,) = looking(1, 0)
@@ -357,5 +358,5 @@ def test_render_leaves_out_what_shows_in_no_picture():
     sh = full.params.sh.at[:, 1:].set(0).at[2, 15, 1].set(1e-9)
     full = full.replace(params=full.params.replace(sh=sh))
     subject = SceneSource(lambda: full, CONFIG, BEHIND)
-    found, _ = prepared(subject, looking(1, 0), ("rgb",))
+    found, _ = prepare_render(subject, looking(1, 0), ("rgb",))
     assert (found.capacity, found.sh_degree) == (3, 3)

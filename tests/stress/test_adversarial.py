@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 import pytest
-from captures import save_photo, scene_of_views
+from captures import dataset_of_views, save_photo
 from hostile import HOSTILE, harmless, write_hostile
 
 import gsjax
@@ -25,6 +25,7 @@ import gsjax.runs.session as sitting_module
 import gsjax.train.loop as fit_module
 from gsjax.cli.main import main
 from gsjax.cli.train import TrainCommand
+from gsjax.data import camera_paths
 from gsjax.data.colmap_writer import write_colmap
 from gsjax.data.dataset import load_dataset
 from gsjax.data.photos import load_photos
@@ -34,12 +35,12 @@ from gsjax.errors import CapacityError, DivergedError, InputError
 from gsjax.init.gaussians import init_gaussians
 from gsjax.raster.types import RasterConfig
 from gsjax.runs.checkpoint import load_checkpoint
-from gsjax.runs.folder import Data, RunSettings
-from gsjax.runs.held_out import evaluate_run
+from gsjax.runs.evaluation import evaluate_run
+from gsjax.runs.folder import RunSettings
 from gsjax.runs.history import read_metrics
 from gsjax.runs.run import resume_run, start_run
 from gsjax.runs.scene_source import splat_file
-from gsjax.runs.trajectories import path_entries
+from gsjax.runs.trajectories import path_entries, view_entries
 from gsjax.runtime import memory
 from gsjax.train.config import TrainConfig
 from gsjax.train.evaluation import evaluate
@@ -131,7 +132,7 @@ def in_units(scene, unit: float):
 
 def test_a_unit_too_large_is_told():
     """Of points alone: what is too near would never be drawn, nor ever move."""
-    scene = scene_of_views(count=3)
+    scene = dataset_of_views(count=3)
     check_points(scene)
     small = in_units(scene, 1e-4)
     with pytest.raises(InputError, match=r"nearer than 0\.01 .* one unit of length"):
@@ -149,7 +150,7 @@ def test_a_dataset_may_be_in_any_unit(unit, tmp_path):
     seen = {}
     for factor in (0.1, unit):  # of an extent below the usual one
         folder = tmp_path / str(factor)
-        scene = in_units(scene_of_views(count=3), factor)
+        scene = in_units(dataset_of_views(count=3), factor)
         write_colmap(folder / "sparse/0", scene)
         for view in scene.views:
             save_photo(folder / "images" / view.name)
@@ -159,9 +160,9 @@ def test_a_dataset_may_be_in_any_unit(unit, tmp_path):
         first = next(evaluate(gaussians, found.views, photos))
         frames = make_frames(found.views, photos)
         cameras = [frames.camera]
-        for path in ("train", "orbit"):
-            entries = path_entries(Data(found, [0, 1], []), path, frames=2)
-            cameras += [entry.camera for entry in entries]
+        entries = view_entries(found.views[:2])
+        entries += path_entries(found, camera_paths.orbit, frames=2)
+        cameras += [entry.camera for entry in entries]
         near = np.concatenate([np.atleast_1d(camera.near) for camera in cameras])
         seen[factor] = first.render, near / factor
     (wanted, usual), (render, near) = seen.values()
@@ -241,9 +242,9 @@ def test_what_counts_as_diverging():
     def run(bad, steps=1000, start=1):
         health = Health(steps)
         for step in range(start):
-            health.look(metrics_of(step))
+            health.check(metrics_of(step))
         for step in range(start, start + 50):
-            health.look(metrics_of(step, **bad))
+            health.check(metrics_of(step, **bad))
         return health
 
     nothing = {"pairs": 0}
@@ -261,14 +262,14 @@ def test_what_counts_as_diverging():
         assert run(fine).bad == 0
     health = run({})
     for step in range(200):
-        health.look(metrics_of(step, finite=bool(step % 40)))
+        health.check(metrics_of(step, finite=bool(step % 40)))
     assert health.bad == 0
     for step in range(200):
-        health.look(metrics_of(step, pairs=step % 2))
+        health.check(metrics_of(step, pairs=step % 2))
     for step in range(99):
-        health.look(metrics_of(step, finite=bool(step % 2 == 0)))
+        health.check(metrics_of(step, finite=bool(step % 2 == 0)))
     with pytest.raises(DivergedError, match=r"in 50 of the last 100 steps"):
-        health.look(metrics_of(99, finite=False))
+        health.check(metrics_of(99, finite=False))
 
 
 # --- memory ---

@@ -161,7 +161,7 @@ def test_exit_codes(monkeypatch, capsys):
     told = "no case; there are a/well, c/over; more with --full\n"
     assert capsys.readouterr().err.endswith(told)
     assert stress(monkeypatch, "well full", "--only", "full") == 2
-    assert "--only 'full': only with --full: f/full" in capsys.readouterr().err
+    assert "--only 'full': no such case; pass --full for f/full" in capsys.readouterr().err
     assert stress(monkeypatch, "well full", "--full", "--only", "z") == 2
     assert "there are a/well, f/full\n" in capsys.readouterr().err
 
