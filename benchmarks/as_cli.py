@@ -6,7 +6,7 @@ takes it, calls that may pile up, as is the library's default.
 import sys
 
 import gsjax
-from gsjax.runtime.machine import restart_with_large_pages
+from gsjax.runtime.setup import restart_with_large_pages
 
 QUEUED = "--queued" in sys.argv
 restart_with_large_pages()

@@ -14,8 +14,8 @@ from jax.core import Tracer
 
 from gsjax.errors import InputError
 from gsjax.math import sh as sh_lib
-from gsjax.math.numerics import exp_log_scale, real_floats, to_device
-from gsjax.runtime.devices import replicate
+from gsjax.math.numerics import exp_log_scale, real_floats
+from gsjax.runtime.devices import place
 from gsjax.runtime.settings import whole
 
 Array = jax.Array
@@ -175,10 +175,7 @@ def make_gaussians(
     traced = any(isinstance(array, Tracer) for array in arrays.values())
     active = (jnp if traced else np).arange(slots) < count
     gaussians = Gaussians(params=GaussianParams(**padded), active=active)  # pyright: ignore
-    gaussians = to_device(gaussians)
-    if traced or jax.config.jax_default_device is not None:  # pyright: ignore
-        return gaussians
-    return replicate(gaussians)
+    return place(gaussians)
 
 
 def _padded(array: Array | np.ndarray, extra: int, value) -> Array | np.ndarray:

@@ -26,6 +26,7 @@ hypothesis.settings.register_profile("gate", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("gate")
 # Commands keep what they compile: for as long as these tests run, and not at home.
 _CACHE = tempfile.TemporaryDirectory(prefix="gsjax-tests-")
+os.environ["GSJAX_AUTO_SETUP"] = "0"
 os.environ["XDG_CACHE_HOME"] = _CACHE.name
 # What a shell starts in the background ignores Ctrl-C, and so would our processes.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -34,7 +35,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 import jax.numpy as jnp
 
 import gsjax
-import gsjax.runtime.devices
+import gsjax.runtime.setup
 from gsjax import Gaussians, RasterConfig
 from gsjax.cameras.camera import Camera
 from gsjax.stress.scenes import fields_at
@@ -42,8 +43,8 @@ from gsjax.stress.scenes import fields_at
 # What is traced are objects by the million, and few of them in cycles.
 gc.set_threshold(200_000, 20, 50)
 # Thousands of programs of all sizes in one process: memory kept would only pile up.
-gsjax.runtime.devices.keep_memory = lambda: False
-gsjax.runtime.devices.make_kernels_of_loops()  # as the command line does
+gsjax.runtime.setup.keep_memory = lambda: False
+gsjax.runtime.setup.compile_loops_as_kernels()  # as the command line does
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -185,8 +186,10 @@ def shared_programs():
     compiled, compile_one = {}, fit_module._Run.program
 
     def program(self, state, frames, raster):
-        extent = np.float32(fit_module.extent_of(self.scene))
-        key = (Programs.kind, as_compiled(self.config), extent, frames.valid is None)
+        setup = self.setup
+        parts = (setup.strategy.plan.__qualname__, setup.loss_terms, id(setup.model))
+        extent, settings = np.float32(setup.extent), as_compiled(self.config)
+        key = (Programs.kind, settings, extent, frames.valid is None, parts)
         compiler = self.compiler
         compiler.by_sizes, compiler.by_slots = compiled.setdefault(key, ({}, {}))
         return compile_one(self, state, frames, raster)
@@ -205,7 +208,7 @@ def in_a_process():
     def printed(code: str, option: bool = True) -> str:
         folder = Path(__file__).parent
         path = os.pathsep.join(map(str, (folder, folder.parent)))
-        bare = "import gsjax.runtime.devices as d; d.make_kernels_of_loops = lambda: None; "
+        bare = "import gsjax.runtime.setup as d; d.compile_loops_as_kernels = lambda: None; "
         done = subprocess.run(
             [sys.executable, "-c", code if option else bare + code],
             env={**os.environ, "XLA_FLAGS": "", "PYTHONPATH": path},
@@ -245,7 +248,7 @@ def reference(
 ) -> dict[str, jax.Array]:
     """`gsjax.reference_render`, jitted, of scenes without inactive slots."""
     if config is not None:  # only these matter; the rest would compile it again
-        names = ("alpha_min", "alpha_max", "stop", "stop_rule", "dilation", "antialias")
+        names = ("alpha_min", "alpha_max", "transmittance_min", "stop_rule", "dilation", "antialias")
         config = RasterConfig(**{name: getattr(config, name) for name in names})
     return _reference(gaussians, camera, config, background, features)
 

@@ -18,8 +18,8 @@ from importlib import import_module
 
 from gsjax.errors import CapacityError, GsjaxError, InputError
 from gsjax.runtime.console import one_line, warnings_as_lines
-from gsjax.runtime.setup import restart_with_large_pages
 from gsjax.runtime.memory import unlimited
+from gsjax.runtime.setup import restart_with_large_pages
 
 _MAX_CHARACTERS = 2000  # of an error, whose end states the remedy
 _XLA_OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"

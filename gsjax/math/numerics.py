@@ -81,7 +81,7 @@ def safe_sqrt(x: Array) -> Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
 
 
-def held(mask: Array) -> Array:
+def materialize_mask(mask: Array) -> Array:
     """``mask``, on a CPU worked out once.
 
     By a division: XLA's CPU backend (jax 0.10.2) takes all that leads to a mask for so
@@ -93,8 +93,8 @@ def held(mask: Array) -> Array:
     return one / jnp.where(mask, one, np.float32(np.inf)) > 0
 
 
-def once(values: tuple[Array, ...], mask: Array) -> tuple[Array, ...]:
-    """``values``, and what is derived by them, on a CPU worked out once, as `held` is.
+def materialize(values: tuple[Array, ...], mask: Array) -> tuple[Array, ...]:
+    """``values``, and what is derived by them, on a CPU worked out once, as `materialize_mask` is.
 
     Args:
       values: equally shaped arrays.
@@ -126,7 +126,7 @@ def near_one(components: tuple[Array, ...], fallback: tuple[float, ...]):
     # A NaN fails both comparisons: guards are phrased positively.
     good = (size >= limits.tiny) & (size < jnp.inf)
     # The largest numbers would be rounded to infinity: those stay below 4. A division,
-    # not a product with the inverse, for the reason that `held` gives.
+    # not a product with the inverse, for the reason that `materialize_mask` gives.
     below = jnp.minimum(jnp.where(good, size, 1), 2.0 ** (limits.maxexp - 2))
     scale = jax.lax.reduce_precision(below, limits.nexp, 0)
     scaled = tuple(jnp.where(good, c, f) / scale for c, f in zip(components, fallback))

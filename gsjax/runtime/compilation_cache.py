@@ -1,4 +1,4 @@
-"""The folder of compiled programs that JAX keeps: not too large, and of whole files."""
+"""Care of JAX's folder of compiled programs: its size, and truncated files."""
 
 import stat
 import zlib
@@ -7,62 +7,52 @@ from pathlib import Path
 _ZSTD, _ZLIB = b"\x28\xb5\x2f\xfd", b"\x78"
 
 
-def remove_oldest(folder: Path, most: int) -> None:
-    """Remove the files longest not written until ``most`` bytes are left."""
+def remove_oldest(folder: Path, limit: int) -> None:
+    """Remove the files written longest ago until at most ``limit`` bytes are left."""
     files = [(path, path.stat()) for path in folder.iterdir() if path.is_file()]
     total = sum(found.st_size for _, found in files)
     for path, found in sorted(files, key=lambda file: file[1].st_mtime):
-        if total <= most:
+        if total <= limit:
             return
         path.unlink(missing_ok=True)
         total -= found.st_size
 
 
 def remove_truncated(folder: Path) -> None:
-    """Remove programs that a kill or a full disk cut off.
+    """Remove programs that a killed process or a full disk truncated.
 
-    JAX (0.10.2) writes them in place, and never again where a file is: it would warn
-    of what is torn, and compile anew, at every start. What is found whole is made
-    read-only, and not looked at again. One that another process is just writing may
-    be removed too; the next start compiles it.
+    JAX (0.10.2) writes programs in place and never overwrites them: it would warn and
+    compile anew at every start. Complete files are made read-only and not checked
+    again. A program that another process is writing may be removed as well; the next
+    start compiles it.
     """
     for path in folder.glob("*-cache"):
         try:
             if not path.stat().st_mode & stat.S_IWUSR:
                 continue
-            if is_whole(path.read_bytes()):
+            if is_complete(path.read_bytes()):
                 path.chmod(0o444)
             else:
                 path.unlink()
-        except OSError:  # another process was first, or it is another's file
+        except OSError:  # removed meanwhile, or owned by another user
             continue
 
 
-def is_whole(program: bytes) -> bool:
-    """Whether a compressed program goes on to its end; of another kind, it may."""
+def is_complete(program: bytes) -> bool:
+    """Return whether a compressed program can be decompressed; True if unknown."""
     if len(program) <= len(_ZSTD) or not any(program):
         return False
-    if program.startswith(_ZSTD):
-        return _zstd_ends(program)
-    if program.startswith(_ZLIB):
-        try:
+    try:
+        if program.startswith(_ZSTD):
+            import zstandard  # which wrote it, as an optional dependency of JAX
+
+            zstandard.ZstdDecompressor().decompress(program)
+        elif program.startswith(_ZLIB):
             zlib.decompress(program)
-        except zlib.error:
-            return False
+    except ImportError:
+        return True
+    except Exception as error:
+        if isinstance(error, MemoryError):
+            raise
+        return False
     return True
-
-
-def _zstd_ends(frame: bytes) -> bool:
-    """By the lengths of its blocks (RFC 8878, 3.1.1); they are not decompressed."""
-    flags = frame[4]
-    single = flags >> 5 & 1  # segment: without a byte for the size of a window
-    dictionary, size = (0, 1, 2, 4)[flags & 3], (single, 2, 4, 8)[flags >> 6]
-    at = 5 + (1 - single) + dictionary + size
-    while at + 3 <= len(frame):
-        header = int.from_bytes(frame[at : at + 3], "little")
-        last, kind, length = header & 1, header >> 1 & 3, header >> 3
-        at += 3 + (1 if kind == 1 else length)  # kind 1: one byte, repeated
-        if last:
-            checksum = 4 * (flags >> 2 & 1)
-            return at + checksum <= len(frame)
-    return False

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import sequential_vmap
 
-from gsjax.runtime.devices import KERNEL_BYTES
+from gsjax.runtime.setup import KERNEL_BYTES
 
 Array = jax.Array
 
@@ -35,7 +35,7 @@ def large_are_kernels() -> bool:
     numbers = jax.ShapeDtypeStruct((KERNEL_BYTES // 9,), jnp.float32)  # 8 bytes each
 
     def loop(x):
-        return each(0, 9, lambda _, x: 2 * x + 1, x)
+        return fori_loop(0, 9, lambda _, x: 2 * x + 1, x)
 
     with jax.disable_jit(False):
         program = jax.jit(loop).lower(numbers).compile().as_text() or ""
@@ -69,7 +69,7 @@ def _put(values: Array, number: Array, index: Array) -> Array:
     return with_part(values, number, (index[0],))
 
 
-def each(start, end, turn, state):
+def fori_loop(start, end, turn, state):
     """A `lax.fori_loop` that counts in 32 bits."""
     return lax.fori_loop(jnp.int32(start), jnp.int32(end), turn, state)
 
@@ -91,7 +91,7 @@ def cumulative_sum(counts: Array) -> Array:
         return total, out
 
     init = (jnp.zeros(1, jnp.int32), jnp.zeros_like(counts))
-    return each(0, counts.shape[0] // _ADDED, turn, init)[1][:size]
+    return fori_loop(0, counts.shape[0] // _ADDED, turn, init)[1][:size]
 
 
 @sequential_vmap
@@ -118,7 +118,7 @@ def append(
         return count + _at(numbers, i[None]), kept
 
     numbers = chosen.astype(jnp.int32)
-    return each(0, numbers.shape[0], turn, (count, kept))
+    return fori_loop(0, numbers.shape[0], turn, (count, kept))
 
 
 @sequential_vmap
@@ -145,15 +145,15 @@ def places(chosen: Array, some: Array, index: Array) -> tuple[Array, Array]:
     def of_stretch(i, state):
         start = i * STRETCH
         end = jnp.minimum(start + _at(lengths, i[None])[0], numbers.shape[0])
-        return each(start, end, turn, state)
+        return fori_loop(start, end, turn, state)
 
     init = (jnp.zeros(1, jnp.int32), index)
-    count, found = each(0, lengths.shape[0], of_stretch, init)
+    count, found = fori_loop(0, lengths.shape[0], of_stretch, init)
     return _put(found, index[-1:], count), count[0]
 
 
 @sequential_vmap
-def deal(kept: Array, items: Array, place: Array, out: Array) -> Array:
+def scatter_items(kept: Array, items: Array, place: Array, out: Array) -> Array:
     """Deal the values of items to lists; the lists of a counting sort.
 
     Args:
@@ -182,4 +182,4 @@ def deal(kept: Array, items: Array, place: Array, out: Array) -> Array:
         *_, place, out = lax.while_loop(lambda s: s[0][0] < s[1][0], one, state)
         return place, out
 
-    return each(0, items, of_item, (place, out))[1]
+    return fori_loop(0, items, of_item, (place, out))[1]

@@ -1,9 +1,7 @@
 """What of its machine this process may use: cores, and the control groups that limit
 it, as a container does; and memory in large pages."""
 
-import contextlib
 import os
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor
 from pathlib import Path
@@ -52,36 +50,6 @@ def _of_groups(root: Path) -> Iterator[int]:
         if len(words) == 2 and all(map(str.isdecimal, words)) and int(words[1]):
             quota, period = map(int, words)
             yield -(-quota // period)
-
-
-def restart_with_large_pages(root: Path = ROOT) -> None:
-    """Start this program anew, with its memory in pages of 2 MB, where it must ask.
-
-    XLA takes the temporaries of a program anew at each call, those of a large picture
-    from the system, and that hands them out page by page, of the usual 4 kB slowly.
-    Linux has larger ones, in most distributions for who asks ("madvise"), and glibc
-    (from 2.35; others do not mind) asks if GLIBC_TUNABLES says so when a process
-    starts. So call this first thing in a program that lies in a file, or is a module;
-    what is typed, or read from stdin, could not be read again, and goes on as it is. So
-    does what has been started by this, and where there is nothing to ask for.
-    ``GLIBC_TUNABLES=glibc.malloc.hugetlb=0`` in the environment keeps it from starting
-    anything.
-
-    Args:
-      root: under which /sys lies.
-    """
-    name = "glibc.malloc.hugetlb"
-    known = os.environ.get("GLIBC_TUNABLES", "")
-    choice = text_of(root / "sys/kernel/mm/transparent_hugepage/enabled")
-    if "[madvise]" not in choice or name in known or not sys.executable:
-        return
-    typed = len(sys.orig_argv) < 2 or sys.argv[0] in ("", "-")  # or read from stdin
-    if typed or "ipykernel" in sys.modules:
-        return
-    tunables = f"{known}:{name}=1".lstrip(":")
-    command = [sys.executable, *sys.orig_argv[1:]]
-    with contextlib.suppress(OSError):  # it is as well without
-        os.execve(sys.executable, command, {**os.environ, "GLIBC_TUNABLES": tunables})
 
 
 def control_groups(kind: str, root: Path = ROOT) -> Iterator[tuple[int, Path]]:

@@ -38,7 +38,7 @@ def test_deal_is_a_counting_sort(seed):
     lengths = np.array([len(each) for each in wanted], np.int32)
     start = np.cumsum(lengths, dtype=np.int32) - lengths
     kept = np.stack([value, first, count], 1)
-    out = jax.jit(loops.deal)(kept, np.int32(used), start, jnp.full(250, -1, jnp.int32))
+    out = jax.jit(loops.scatter_items)(kept, np.int32(used), start, jnp.full(250, -1, jnp.int32))
     flat = [v for each in wanted for v in each]
     np.testing.assert_array_equal(out[: len(flat)], flat)
     assert (np.asarray(out[len(flat) :]) == -1).all()
@@ -80,7 +80,7 @@ def compiled(name: str) -> str:
         "cumulative_sum": (many,),
         "append": (one, rows, (many, many, many), some),
         "places": (some, jnp.ones(-(-SIZE // loops.STRETCH), bool), many),
-        "deal": (rows, jnp.int32(SIZE), many, many),
+        "scatter_items": (rows, jnp.int32(SIZE), many, many),
     }[name]
     return jax.jit(getattr(loops, name)).lower(*arguments).compile().as_text()
 
@@ -91,7 +91,7 @@ def test_each_is_one_kernel_that_copies_nothing_in_a_turn(in_a_process):
     array is copied. Where this fails, a turn takes a hundred times as long. So it is
     where XLA is told nothing, as in a program that has not called `use_all_cores`.
     """
-    names = "cumulative_sum", "append", "places", "deal"
+    names = "cumulative_sum", "append", "places", "scatter_items"
     code = f"import test_loops; print(chr(0).join(map(test_loops.compiled, {names})))"
     programs = in_a_process(code, option=False).split(chr(0))
     assert len(programs) == len(names)

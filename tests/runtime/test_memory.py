@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from captures import save_photo, scene_of_views
+from captures import dataset_of_views, save_photo
 from conftest import LIGHT, camera_of, frustum_points, gaussians_at, write_files
 
 import gsjax
 import gsjax.raster.render as render_module
 from gsjax import CapacityError, RasterConfig
 from gsjax.io.point_cloud import read_point_cloud
-from gsjax.raster.render import render_estimate
+from gsjax.raster.memory_estimate import render_estimate
 from gsjax.raster.types import Demand
 from gsjax.runtime import memory
 from gsjax.runtime.memory import (
@@ -28,7 +28,7 @@ from gsjax.runtime.memory import (
 )
 from gsjax.train.capacity_policy import slots_for
 from gsjax.train.config import preset
-from gsjax.train.losses import photometric_spread
+from gsjax.train.losses import photometric_batch
 from gsjax.train.memory_estimate import check_memory, run_estimate, trained_sizes
 
 GB = 10**9
@@ -220,7 +220,7 @@ def test_the_estimate_of_pictures_is_what_the_loss_reserves(devices, report):
     width, height = 320, 240
 
     def loss(images, targets):
-        return photometric_spread(images, targets, devices=devices).sum()
+        return photometric_batch(images, targets, devices=devices).sum()
 
     shape = jax.ShapeDtypeStruct((1, height, width, 3), jnp.float64)
     compiled = jax.jit(jax.value_and_grad(loss)).lower(shape, shape).compile()
@@ -252,7 +252,7 @@ MEASURED = [
 @pytest.mark.parametrize(("name", "changes", "measured"), MEASURED)
 def test_the_estimate_of_a_run_is_what_runs_took(name, changes, measured, report):
     config = preset(name).replace(**changes)
-    made = scene_of_views(21, points=20_000)
+    made = dataset_of_views(21, points=20_000)
     views = tuple(replace(view, width=800, height=600) for view in made.views)
     count = config.initial_count if config.initial == "random" else 20_000
     slots = slots_for(count, 0, config)
@@ -267,7 +267,7 @@ def test_the_estimate_of_a_run_is_what_runs_took(name, changes, measured, report
 def test_photographs_count_as_their_files_have_them(tmp_path):
     """Whatever size their camera is for: copies made smaller, or larger originals."""
     config = preset("default").replace(max_size=1600)
-    made = scene_of_views(2)
+    made = dataset_of_views(2)
 
     def bytes_of(width, height, camera):
         path = save_photo(tmp_path / f"{width}.png", np.zeros((height, width, 3), "u1"))
@@ -300,7 +300,7 @@ def test_what_does_not_count_takes_a_byte_a_pixel():
 def test_one_is_told_as_one(capsys):
     config = preset("fast")
     few = config.replace(mcmc=replace(config.mcmc, max_gaussians=1))
-    check_memory(scene_of_views(), few, None)
+    check_memory(dataset_of_views(), few, None)
     told = capsys.readouterr().err
     assert "for 1 Gaussian, " in told
     assert "1 Gaussians" not in told

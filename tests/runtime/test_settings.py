@@ -95,7 +95,7 @@ def test_what_is_of_another_kind(kind, name, value, told):
 
 def test_an_array_is_no_number():
     with pytest.raises(InputError, match=r"RasterConfig\.stop = "):
-        RasterConfig(stop=jnp.ones(2))  # pyright: ignore
+        RasterConfig(transmittance_min=jnp.ones(2))  # pyright: ignore
 
 
 def test_none_stays_where_it_may_be():

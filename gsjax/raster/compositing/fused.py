@@ -1,13 +1,14 @@
-"""Front-to-back compositing on a CPU, Gaussian by Gaussian: one compiled kernel.
+"""Fused compositing on CPUs, Gaussian by Gaussian: one compiled kernel.
 
-As plain code would have it: for each tile, for each Gaussian of its list, until no
-pixel of the tile is open. It needs no schedule, looks up each Gaussian when it is due,
-and keeps the sums of a tile in the nearest cache. It is fast where XLA makes one kernel
-of the loops (`gsjax.runtime.loops`), which it does of larger turns than by default only
-if the process was started so, as `gsjax.use_all_cores` does; `suits` tells. The way
-back, for gradients, is `gsjax.raster.compositing.fused_vjp`.
+For each tile, for each Gaussian of its list, until no pixel of the tile is open. It needs
+no schedule, looks up each Gaussian when it is due, and keeps the sums of a tile in the
+nearest cache. It is fast if XLA makes one kernel of the loops (`gsjax.runtime.loops`),
+which it does for turns of this size only in a process that was started so
+(`gsjax.runtime.devices`); `suits` tells. Its reverse pass is `fused_vjp`.
 
-Axis legend: T tiles, P pixels of a tile, C channels, R ranks, L looks.
+This file and `fused_vjp` can be removed together with the entry in `compositor`.
+
+Axis legend: T tiles, P pixels of a tile, C channels, R ranks, L blocks of Gaussians.
 """
 
 from typing import NamedTuple
@@ -18,33 +19,35 @@ from jax import lax
 
 from gsjax.raster.compositing.alpha import alphas, pixel_centres
 from gsjax.raster.compositing.blending import columns_of, pass_through, table_of
-from gsjax.raster.lists.binning import Grid, Lists, corners
+from gsjax.raster.compositing.types import Images, Task, Tiles
+from gsjax.raster.lists.binning import Grid, corners
 from gsjax.raster.lists.counting import cumulative_sum
-from gsjax.raster.types import Array, Projected, RasterConfig
+from gsjax.raster.types import Array, RasterConfig
 from gsjax.runtime import loops
-from gsjax.runtime.devices import KERNEL_BYTES
 from gsjax.runtime.loops import part_at, with_part
+from gsjax.runtime.setup import KERNEL_BYTES
 
-TURN = 2  # Gaussians: the sums are fetched and stored once for so many
-LOOK = 8  # Gaussians from one look at who is open to the next; a multiple of TURN
-_FEWEST = 64  # pixels: of fewer XLA hardly makes vector instructions
-# What a turn (of two) touches at most: arrays [P] that have no channels, and for each
-# channel. XLA counts what every kernel reads and writes, in the loops around as well.
-_ARRAYS, _OF_CHANNEL = 64, 8
+TURN = 2  # Gaussians per turn: the sums are loaded and stored once per turn
+BLOCK = 8  # Gaussians between two checks for open pixels; a multiple of TURN
+_FEWEST = 64  # pixels: for fewer XLA hardly makes vector instructions
+# Upper limit of the arrays [P] that a turn touches, without channels and per channel.
+# XLA counts everything that the kernel reads and writes, in the loops around as well.
+_ARRAYS, _PER_CHANNEL = 64, 8
 
 
 class Reading(NamedTuple):
-    """What the loops read.
+    """Inputs of the loops.
 
     Attributes:
-      rows: [R + 1, columns] the Gaussians; the last is nothing.
-      widths: how many columns are u, v, inv_sx, slope, inv_sy, opacity; the channels;
-        and the depth, where a median is asked for.
+      rows: [R + 1, columns] the Gaussians; the last is empty.
+      widths: numbers of columns of the splat (u, v, inv_sx, slope, inv_sy, opacity), of
+        the channels, and of the depth if a median is asked for.
       ranks: the lists, one behind the other.
       start, end: [T] where each begins and ends.
       left, top: [T] corners of the tiles, px.
       pixels: [2, P] x and y of a tile's pixels, from its corner.
       ones: [P] that XLA does not know to be 1.
+      alpha_min: [] in place of that of the config, or None.
     """
 
     rows: Array
@@ -56,10 +59,10 @@ class Reading(NamedTuple):
     top: Array
     pixels: np.ndarray
     ones: Array
+    alpha_min: Array | None
 
     def row(self, place: Array, end: Array) -> tuple[Array, Array]:
-        """(Rank [1], row [columns]) of what stands at ``place`` [1] of the lists, or
-        nothing from ``end`` [1] on."""
+        """Return (rank [1], row [columns]) at ``place`` [1]; the empty one from ``end``."""
         none = self.rows.shape[0] - 1
         rank = part_at(self.ranks, (place[0],), (1,))
         rank = jnp.where(place < end, rank, none)
@@ -67,55 +70,53 @@ class Reading(NamedTuple):
         return rank, part_at(self.rows, (rank[0], jnp.int32(0)), (1, columns))[0]
 
     def alpha(self, splat: Array, tile: Array, config: RasterConfig) -> Array:
-        """α [P] of a Gaussian [6] at the pixels of a tile []."""
+        """Return α [P] of a splat [6] at the pixels of a tile []."""
         u, v, *shape = (number[0] for number in lax.split(splat, [1] * 6))
         offset = u - number_at(self.left, tile)[0], v - number_at(self.top, tile)[0]
-        # XLA would evaluate it anew for each channel, were it not for a division.
-        return alphas((*shape, *offset), self.pixels, config) / self.ones
+        # The division keeps XLA from evaluating α again for each channel.
+        alpha = alphas((*shape, *offset), self.pixels, config, self.alpha_min)
+        return alpha / self.ones
 
 
 class Residuals(NamedTuple):
-    """What the way back needs of the way forward.
+    """Values of the forward pass that the reverse pass needs.
 
     Attributes:
-      carried: [L, P] transmittance before each look, of one tile after the other; 0
-        where a pixel has stopped.
-      first: [T] the first look of each tile.
-      looks: [T] how many were made.
+      carried: [L, P] transmittance before each block, one tile after the other; 0 for
+        pixels that have stopped.
+      first: [T] first block of each tile.
+      blocks: [T] number of blocks blended.
     """
 
     carried: Array
     first: Array
-    looks: Array
+    blocks: Array
 
 
-def suits(colors: int, width: int, grid: Grid) -> bool:
-    """Whether the loops are one kernel here, which vector instructions are made of;
-    ``width`` is the bytes of a number, beside ``colors`` of which depth may be asked
-    for, and the median."""
-    channels = colors + 3  # depth, ones, the median
-    touched = width * grid.tile**2 * (_ARRAYS + _OF_CHANNEL * channels)
-    fits = grid.tile**2 >= _FEWEST and touched <= KERNEL_BYTES
-    return fits and loops.large_are_kernels()
+def suits(task: Task) -> bool:
+    """Return whether the loops are one kernel here, made of vector instructions."""
+    channels = task.colors + 3  # depth, ones, the median
+    pixels = task.grid.tile**2
+    touched = task.itemsize * pixels * (_ARRAYS + _PER_CHANNEL * channels)
+    fits = pixels >= _FEWEST and touched <= KERNEL_BYTES
+    on_cpu = task.platform == "cpu"
+    return on_cpu and task.gaussian_form and fits and loops.large_are_kernels()
 
 
-def look_capacity(capacity: int, grid: Grid) -> int:
-    """Room for as many looks as the lists of so many pairs may want."""
-    return capacity // LOOK + grid.tiles
+def block_capacity(capacity: int, grid: Grid) -> int:
+    """Return the largest number of blocks of lists with ``capacity`` pairs."""
+    return capacity // BLOCK + grid.tiles
 
 
-def reading_of(
-    projected: Projected,
-    lists: Lists,
-    device: Array,
-    grid: Grid,
-    config: RasterConfig,
-) -> Reading:
-    """What the loops read, of one device's tiles."""
-    columns = columns_of(projected._replace(probe=None), config)
-    # In one table: a Gaussian is looked up once.
+def reading_of(tiles: Tiles, task: Task) -> Reading:
+    """Return the inputs of the loops."""
+    grid, lists = task.grid, tiles.lists
+    channels = tiles.channels._replace(probe=None)
+    columns = columns_of(tiles.splat, channels, task.config)
+    # One table: a Gaussian is looked up once.
     rows = table_of([column for some in columns.values() for column in some])
-    left, top = corners(lax.iota(jnp.int32, grid.tiles), grid, device, rows.dtype).T
+    tile = lax.iota(jnp.int32, grid.tiles)
+    left, top = corners(tile, grid, tiles.device, rows.dtype).T
     pixels = pixel_centres(grid.tile, rows.dtype)
     return Reading(
         rows=rows,
@@ -127,23 +128,21 @@ def reading_of(
         top=top,
         pixels=pixels,
         ones=lax.optimization_barrier(jnp.ones_like(pixels[0])),
+        alpha_min=channels.alpha_min,
     )
 
 
 def composite_fused(
-    projected: Projected,
-    lists: Lists,
-    device: Array,
-    grid: Grid,
-    config: RasterConfig,
-    keeping: bool = False,
-) -> tuple[dict[str, Array], Residuals | None]:
-    """Images of one device's tiles, before the background, and, if ``keeping``, what
-    the way back needs.
+    tiles: Tiles, task: Task, keep: bool = False
+) -> tuple[Images, Residuals | None]:
+    """Composite one device's tiles; see `Compositor.forward`.
 
-    As `gsjax.raster.compositing.compositor.composite`; no derivative can be taken of it backward.
+    Args:
+      tiles, task: as there.
+      keep: return the residuals of the reverse pass, too.
     """
-    read = reading_of(projected, lists, device, grid, config)
+    grid, config = task.grid, task.config
+    read = reading_of(tiles, task)
     empty = jnp.zeros_like(read.ones)
     nothing = {"sums": jnp.zeros((read.widths[1], len(empty)), empty.dtype)}
     if "median_depth" in config.outputs:
@@ -152,7 +151,7 @@ def composite_fused(
         name: jnp.zeros((grid.tiles, *one.shape), one.dtype)
         for name, one in nothing.items()
     }
-    kept = _nothing_kept(read, empty, grid) if keeping else None
+    kept = _no_residuals(read, empty, grid) if keep else None
 
     def of_tile(tile, state):
         images, kept = state
@@ -162,9 +161,9 @@ def composite_fused(
             _, row = read.row(place, end)
             splat, values, *depth = lax.split(row, read.widths)
             alpha = read.alpha(splat, tile, config)
-            # Stopped pixels carry nothing on, and are given nothing.
+            # Pixels that have stopped carry 0.
             passed = pass_through(carried, alpha)
-            behind = jnp.where(passed > config.stop, passed, 0)
+            behind = jnp.where(passed > config.transmittance_min, passed, 0)
             weight = carried * alpha
             if config.stop_rule == "before":
                 weight = jnp.where(behind > 0, weight, 0)
@@ -187,10 +186,10 @@ def composite_fused(
         def several(state):
             (place, _, carried, _), kept = state
             if kept is not None:
-                look = number_at(kept.first, tile) + (place - start) // LOOK
-                rows = with_part(kept.carried, carried[None], (look[0], jnp.int32(0)))
+                block = number_at(kept.first, tile) + (place - start) // BLOCK
+                rows = with_part(kept.carried, carried[None], (block[0], jnp.int32(0)))
                 kept = kept._replace(carried=rows)
-            until = jnp.minimum(place + LOOK, end)
+            until = jnp.minimum(place + BLOCK, end)
             place, _, *blended = lax.while_loop(
                 unfinished, turn, (place, until, *state[0][2:])
             )
@@ -202,31 +201,31 @@ def composite_fused(
         begun = start, end, jnp.ones_like(empty), nothing
         (place, *_, image), kept = lax.while_loop(open_, several, (begun, kept))
         if kept is not None:
-            made = (place - start + LOOK - 1) // LOOK
-            kept = kept._replace(looks=with_part(kept.looks, made, (tile,)))
+            made = (place - start + BLOCK - 1) // BLOCK
+            kept = kept._replace(blocks=with_part(kept.blocks, made, (tile,)))
         images = {name: _with_image(images[name], image[name], tile) for name in images}
         return images, kept
 
-    tiles = jnp.int32(0), jnp.int32(grid.tiles)
-    return lax.fori_loop(*tiles, of_tile, (images, kept))
+    zero, count = jnp.int32(0), jnp.int32(grid.tiles)
+    return lax.fori_loop(zero, count, of_tile, (images, kept))
 
 
 def number_at(values: Array, tile: Array) -> Array:
-    """[1] what stands in ``values`` [T] for a tile []."""
+    """Return the number [1] of a tile [] in ``values`` [T]."""
     return part_at(values, (tile,), (1,))
 
 
-def _nothing_kept(read: Reading, empty: Array, grid: Grid) -> Residuals:
-    wanted = -(-(read.end - read.start) // LOOK)
-    room = look_capacity(read.ranks.shape[0], grid)
+def _no_residuals(read: Reading, empty: Array, grid: Grid) -> Residuals:
+    needed = -(-(read.end - read.start) // BLOCK)
+    room = block_capacity(read.ranks.shape[0], grid)
     return Residuals(
         carried=jnp.zeros((room, len(empty)), empty.dtype),
-        first=cumulative_sum(wanted) - wanted,
-        looks=jnp.zeros_like(wanted),
+        first=cumulative_sum(needed) - needed,
+        blocks=jnp.zeros_like(needed),
     )
 
 
 def _with_image(images: Array, image: Array, tile: Array) -> Array:
-    """``images`` [T, …] with that of a tile."""
+    """Return ``images`` [T, …] with that of one tile replaced."""
     start = tile, *(jnp.int32(0) for _ in image.shape)
     return with_part(images, image[None], start)
