@@ -1,4 +1,4 @@
-"""The coarsest α cut, cap and stop that keep within an error."""
+"""The coarsest accuracy settings whose error stays within a budget."""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -12,176 +12,186 @@ from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.planning import bounds
 from gsjax.planning.types import Reason
-from gsjax.raster.render import render_at_cut
+from gsjax.raster.exact import render_exact
 from gsjax.raster.types import Demand, RasterConfig
 
-# Two roundings of one picture in float32 were up to 2e-5 apart.
-ROUNDING = 2e-5
+ROUNDING = 2e-5  # largest difference of two float32 roundings of one image
 _ROUNDS = 5
-_STOP_SHARE = 1 / 16
-_CAP = 1 - 1e-6
-_REFERENCE_CUT, _LEAST_STOP = 1e-5, 1e-6
-_LARGEST_CUT = 0.05
-_TILES = 8  # of a Gaussian, to begin with
+_STOP_SHARE = 1 / 16  # share of the budget for stopping early
+_ALPHA_MAX = 1 - 1e-6
+_REFERENCE_ALPHA_MIN, _LEAST_TRANSMITTANCE = 1e-5, 1e-6
+_LARGEST_ALPHA_MIN = 0.05
+_PAIRS_PER_GAUSSIAN = 8  # first guess of the capacity
 
 
 class Measured(NamedTuple):
-    """What was found with an α cut.
+    """Measurements with one α cutoff.
 
     Attributes:
-      error: largest of a colour, on the cameras given.
-      demands: what each of these views wants.
+      error: largest error of a colour on the cameras given.
+      demands: counts that each of these views needs.
     """
 
     error: float
     demands: list[Demand]
 
 
-def within_budget(
+def fit_budget(
     gaussians: Gaussians,
     views: list[Camera],
     config: RasterConfig,
     background: Sequence[float],
     budget: float,
 ) -> tuple[RasterConfig, list[Reason], Measured | None]:
-    """``config`` with the coarsest cut and stop that keep within ``budget``, why, and
-    what was measured with these; None where bounds alone decided.
+    """Return ``config`` with the coarsest cutoffs within ``budget``, and the reasons.
+
+    The third result holds the measurements with these cutoffs; it is None if bounds
+    alone decided.
 
     Raises:
-      InputError: if colours are so far apart that not even the finest do.
+      InputError: if the colour range is too large for the finest cutoffs.
     """
     spread = bounds.color_range(gaussians, background)
     share = _STOP_SHARE * budget
-    stop = float(np.clip(share / max(spread, 1e-9), _LEAST_STOP, 1e-2))
+    stop = float(np.clip(share / max(spread, 1e-9), _LEAST_TRANSMITTANCE, 1e-2))
     stop = _rounded(stop)
-    config = config.replace(alpha_max=_CAP, stop=stop, stop_rule="after")
-    stopping = bounds.stop_error(stop, "after", _CAP, spread)
-    capping = bounds.cap_error(_CAP, spread)
-    told = [
-        Reason(
-            "stop",
-            f"after T = {stop:g}: what is behind weighs less, colours span "
-            f"{spread:.3g}",
-            stopping,
-            "bound",
-        ),
-        Reason("alpha_max", f"1 − {1 - _CAP:.0e}", capping, "bound"),
+    config = config.replace(
+        alpha_max=_ALPHA_MAX, transmittance_min=stop, stop_rule="after"
+    )
+    stop_error = bounds.stop_error(stop, "after", _ALPHA_MAX, spread)
+    alpha_max_error = bounds.alpha_max_error(_ALPHA_MAX, spread)
+    why = f"{stop:g}: the weight behind is less; the colour range is {spread:.3g}"
+    reasons = [
+        Reason("transmittance_min", why, stop_error, "bound"),
+        Reason("alpha_max", f"1 − {1 - _ALPHA_MAX:.0e}", alpha_max_error, "bound"),
     ]
     single = gaussians.params.means.dtype == jnp.float32
     if single:
-        told.append(Reason("rounding", "float32", ROUNDING, "rounding"))
-    fixed = stopping + capping + ROUNDING * single
+        reasons.append(Reason("rounding", "float32", ROUNDING, "rounding"))
+    fixed = stop_error + alpha_max_error + ROUNDING * single
     if not fixed < budget:
         raise InputError(
-            f"{budget:.2g} is left of the budget, and where to stop, the cap and "
-            f"rounding alone may come to {fixed:.2g}: colours span {spread:.3g}, in "
-            "some direction; ask for more, or drop what is so bright"
+            f"budget: expected more than {fixed:.2g} to be left for transmittance_min, "
+            f"alpha_max and rounding, got {budget:.2g} with a colour range of "
+            f"{spread:.3g}; raise the budget, or remove the brightest Gaussians"
         )
     budget -= fixed
-    cut = _bounded_cut(gaussians, spread, budget)
-    if cut is not None:
-        error = bounds.cut_error(gaussians, cut, spread)
-        why = f"{cut:g}: even all the splats over one another hide no more"
-        told.append(Reason("alpha_min", why, error, "bound"))
-        return config.replace(alpha_min=cut), told, None
-    # A heuristic: of 20 random cameras of a trained scene the worst was 1.7 times as
-    # far off as the worst of 12 others.
+    cutoff = _bounded_alpha_min(gaussians, spread, budget)
+    if cutoff is not None:
+        error = bounds.alpha_min_error(gaussians, cutoff, spread)
+        why = f"{cutoff:g}: holds even if all splats overlap"
+        reasons.append(Reason("alpha_min", why, error, "bound"))
+        return config.replace(alpha_min=cutoff), reasons, None
+    # A heuristic: other cameras of a trained scene had 1.7 times the error of 12 of it.
     margin = 1.5 + 2 / np.sqrt(len(views))
-    least = _reference_cut(gaussians, spread, budget)
-    cut, measured = _measured_cut(
+    least = _reference_alpha_min(gaussians, spread, budget)
+    cutoff, measured = _measured_alpha_min(
         gaussians, views, config, background, (budget / margin, least)
     )
+    cameras = f"{len(views)} camera{'s' * (len(views) != 1)}"
     why = (
-        f"{cut:.3g}: {255 * measured.error:.3g}/255 off at most on {len(views)} "
-        f"camera{'s' * (len(views) != 1)}, times {margin:.2g} for those not seen"
+        f"{cutoff:.3g}: largest error {255 * measured.error:.3g}/255 on {cameras}, "
+        f"times {margin:.2g} for other cameras"
     )
-    told.append(Reason("alpha_min", why, margin * measured.error, "estimate"))
-    return config.replace(alpha_min=cut), told, measured
+    reasons.append(Reason("alpha_min", why, margin * measured.error, "estimate"))
+    return config.replace(alpha_min=cutoff), reasons, measured
 
 
 def _rounded(value: float) -> float:
-    """Down to two digits: close plans share compiled programs."""
+    """Round down to two digits, so that close plans share compiled programs."""
     power = 10.0 ** (np.floor(np.log10(value)) - 1)
     return float(f"{np.floor(value / power * (1 + 1e-9)) * power:.2g}")
 
 
-def _bounded_cut(gaussians: Gaussians, spread: float, budget: float) -> float | None:
-    """A cut that is no finer than the field's and within ``budget`` for every camera;
-    None if there is none."""
-    for cut in (_LARGEST_CUT, 0.02, 0.01, 1 / 255):
-        if bounds.cut_error(gaussians, cut, spread) <= budget:
-            return cut
+def _bounded_alpha_min(
+    gaussians: Gaussians, spread: float, budget: float
+) -> float | None:
+    """Return a cutoff of at least 1/255 with a proven error within ``budget``.
+
+    None if there is none.
+    """
+    for cutoff in (_LARGEST_ALPHA_MIN, 0.02, 0.01, 1 / 255):
+        if bounds.alpha_min_error(gaussians, cutoff, spread) <= budget:
+            return cutoff
     return None
 
 
-def _reference_cut(gaussians: Gaussians, spread: float, budget: float) -> float:
-    """Cut of the picture to measure against: `RasterConfig.accurate`'s, or finer where
-    splats that are fainter than that could add up to a tenth of the budget."""
-    cut = min(_REFERENCE_CUT, budget / 400)
+def _reference_alpha_min(gaussians: Gaussians, spread: float, budget: float) -> float:
+    """Return the cutoff of the reference image.
+
+    It is that of `RasterConfig.accurate`, or finer if fainter splats could add up to a
+    tenth of the budget.
+    """
+    cutoff = min(_REFERENCE_ALPHA_MIN, budget / 400)
     opacity = bounds.opacities(gaussians)
-    while cut > 1e-12 and spread * opacity[opacity < cut].sum() > 0.1 * budget:
-        cut /= 10
-    return cut
+    while cutoff > 1e-12 and spread * opacity[opacity < cutoff].sum() > 0.1 * budget:
+        cutoff /= 10
+    return cutoff
 
 
-def _measured_cut(
+def _measured_alpha_min(
     gaussians: Gaussians,
     views: list[Camera],
     config: RasterConfig,
     background: Sequence[float],
     limits: tuple[float, float],
 ) -> tuple[float, Measured]:
-    """The coarsest cut found with an error of at most ``limits[0]``.
+    """Return the coarsest cutoff found with an error of at most ``limits[0]``.
 
-    The error is nearly in proportion to the cut, so a few rounds do. ``limits[1]`` is
-    the cut of the reference, and what remains if none does.
+    The error is nearly proportional to the cutoff, so a few rounds suffice.
+    ``limits[1]`` is the cutoff of the reference, and the result if no other fits.
     """
     allowed, least = limits
-    draw = partial(_pictures, gaussians, views, config, background)
-    # Of all cuts the finest wants most: what it has room for is enough for the others.
-    room = capacity_bucket(_TILES * gaussians.capacity)
-    wanted, demands = zip(*draw(room, least))
-    room = max(room, *(capacity_bucket(int(demand.capacity)) for demand in demands))
+    draw = partial(_renders, gaussians, views, config, background)
+    # The finest cutoff needs the most pairs: its capacity is enough for the others.
+    capacity = capacity_bucket(_PAIRS_PER_GAUSSIAN * gaussians.capacity)
+    references, demands = zip(*draw(capacity, least))
+    needed = (capacity_bucket(int(demand.capacity)) for demand in demands)
+    capacity = max(capacity, *needed)
     best, found = least, Measured(float("inf"), list(demands))
-    # Coarser has failed, or would be coarser than is sensible.
-    failed, cut = _LARGEST_CUT * 1.01, _rounded(max(allowed / 12, 2 * least))
+    # The coarsest cutoff known to fail, or beyond what is sensible.
+    failed = _LARGEST_ALPHA_MIN * 1.01
+    cutoff = _rounded(max(allowed / 12, 2 * least))
     for _ in range(_ROUNDS):
         largest, demands = 0.0, []
-        for (picture, demand), exactly in zip(draw(room, cut), wanted):
-            largest = max(largest, float(np.abs(picture - exactly).max()))
+        for (image, demand), reference in zip(draw(capacity, cutoff), references):
+            largest = max(largest, float(np.abs(image - reference).max()))
             demands.append(demand)
-        # The error is about in proportion to the cut, and so is the reference's own.
-        largest *= cut / (cut - least)
+        # Corrected for the reference's own error.
+        largest *= cutoff / (cutoff - least)
         if largest <= allowed:
-            best, found = cut, Measured(largest, demands)
+            best, found = cutoff, Measured(largest, demands)
             if largest > 0.7 * allowed:
                 break
         else:
-            failed = cut
+            failed = cutoff
             if best == least:
-                found = found._replace(error=largest * least / cut)
-        step = 0.9 * allowed / max(largest, allowed / 20)
-        aim = min(cut * step, np.sqrt(best * failed) if failed < cut * step else 1)
-        cut = _rounded(float(np.clip(aim, best, _LARGEST_CUT)))
-        if cut <= best * 1.05:
+                found = found._replace(error=largest * least / cutoff)
+        step = cutoff * (0.9 * allowed / max(largest, allowed / 20))
+        step = min(step, np.sqrt(best * failed) if failed < step else 1)
+        cutoff = _rounded(float(np.clip(step, best, _LARGEST_ALPHA_MIN)))
+        if cutoff <= best * 1.05:
             break
     return best, found
 
 
-def _pictures(
+def _renders(
     gaussians: Gaussians,
     views: list[Camera],
     config: RasterConfig,
     background: Sequence[float],
-    room: int,
-    cut: float,
+    capacity: int,
+    cutoff: float,
 ) -> Iterator[tuple[np.ndarray, Demand]]:
-    """rgb [H, W, 3] of each camera with an α cut, by one program for any, and what it
-    wants; with ``room`` for pairs, or more."""
+    """Yield rgb [H, W, 3] and demand of each camera, with at least ``capacity`` pairs.
+
+    The cutoff is traced, so all of them share one program.
+    """
     behind = jnp.asarray(background, gaussians.params.means.dtype)
     config = config.replace(num_size_buckets=1, outputs=("rgb",), visible_capacity=None)
+    alpha_min = jnp.asarray(cutoff, behind.dtype)
     for view in views:
-        config = config.replace(pair_capacity=room)
-        result = render_at_cut(gaussians, view, config, behind, cut)
-        room = max(room, capacity_bucket(int(result.demand.capacity)))
+        config = config.replace(pair_capacity=capacity)
+        result = render_exact(gaussians, view, config, behind, alpha_min=alpha_min)
+        capacity = max(capacity, capacity_bucket(int(result.demand.capacity)))
         yield np.asarray(result.rgb), result.demand

@@ -1,10 +1,8 @@
-"""What a caller passes: to `render`, its shape checked, and with the leading axis of a
-batch; and to whoever decides by numbers, that they are known. Each raises InputError
-if a shape does not fit, or a number is complex, or not known.
-"""
+"""Checks of the arguments of `render` and of functions that need concrete values."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,121 +11,147 @@ from gsjax.cameras.camera import Camera
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.math.sh import degree_of
-from gsjax.raster.types import Array, RasterConfig
+from gsjax.raster.types import Array, Inputs, RasterConfig
 
 _UNKNOWN = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
 
 
 @contextmanager
 def requires_concrete_values() -> Iterator[None]:
-    """Within, or of a function that this decorates: InputError says what to do under a
-    transformation that leaves numbers open.
-    """
+    """Turn errors about traced values into an InputError that names the remedy."""
     try:
         yield
     except _UNKNOWN as error:
         raise InputError(
-            "render_exact, exact_config and plan decide by numbers, which are not "
-            "known under jax.jit, vmap or scan: call them before, and inside render "
-            "with the config that exact_config or plan gave"
+            "render_exact, exact_config and plan need concrete values; call them "
+            "outside jit, vmap and scan, and pass the config that exact_config or plan "
+            "returns to render"
         ) from error
 
 
+def check_types(gaussians: Any, camera: Any, config: Any) -> None:
+    """Check the classes of the arguments of `render`.
+
+    Raises:
+      InputError: if one is of another class, with the likely remedy.
+    """
+    if not isinstance(gaussians, Gaussians):
+        raise InputError(
+            f"gaussians: expected gsjax.Gaussians, got {_told(gaussians)}; build them "
+            "with gsjax.make_gaussians or gsjax.load"
+        )
+    if not isinstance(camera, Camera):
+        several = isinstance(camera, (list, tuple))
+        remedy = "stack them with gsjax.stack_cameras" if several else (
+            "build it with gsjax.make_camera"
+        )  # fmt: skip
+        raise InputError(
+            f"camera: expected gsjax.Camera, got {_told(camera)}; {remedy}"
+        )
+    if not isinstance(config, RasterConfig):
+        raise InputError(
+            f"config: expected gsjax.RasterConfig, got {_told(config)}; the background "
+            "is the argument behind it"
+        )
+
+
+def _told(value: Any) -> str:
+    if isinstance(value, (list, tuple)) and value:
+        return f"a {type(value).__name__} of {type(value[0]).__name__}"
+    return type(value).__name__
+
+
 def check_gaussians(gaussians: Gaussians) -> None:
-    """A row of every parameter for each slot: JAX takes the last for what is beyond."""
+    """Check that every parameter has one row per slot.
+
+    JAX reads the last row for indices beyond the end, so a short array would pass.
+    """
     active, params = gaussians.active, gaussians.params
     if active.ndim != 1 or active.dtype != bool:
         raise InputError(
-            f"active has shape {active.shape} of {active.dtype}; (N,) of bool is "
-            "wanted: jax.vmap goes over several scenes"
+            f"active: expected bool of shape (N,), got {active.dtype} of shape "
+            f"{active.shape}; use jax.vmap for several scenes"
         )
     slots = gaussians.capacity
     if slots < 1:
-        raise InputError("there are no slots: at least one is wanted")
+        raise InputError("gaussians: expected at least one slot, got none")
     bases = params.sh.shape[1] if params.sh.ndim == 3 else "K"
-    wanted = {
+    shapes = {
         "means": (slots, 3),
         "quats": (slots, 4),
         "log_scales": (slots, 3),
         "logit_opacities": (slots,),
         "sh": (slots, bases, 3),
     }
-    for name, shape in wanted.items():
+    for name, shape in shapes.items():
         array = getattr(params, name)
         if array.shape != shape:
-            raise InputError(
-                f"{name} has shape {array.shape}; {shape} is wanted, of {slots} slots"
-            )
+            raise InputError(f"{name}: expected shape {shape}, got {array.shape}")
         check_real(name, array)
     degree_of(params.sh.shape[1])
 
 
 def check_camera(camera: Camera) -> None:
+    """Check the shapes of a camera, which may not come from `make_camera`."""
     batch = camera.viewmat.shape[:-2]
-    wanted = {"viewmat": (*batch, 4, 4), "K": (*batch, 3, 3), "near": batch}
-    for name, shape in {**wanted, "far": batch}.items():
+    shapes = {"viewmat": (*batch, 4, 4), "K": (*batch, 3, 3), "near": batch}
+    for name, shape in {**shapes, "far": batch}.items():
         array = getattr(camera, name)
         if jnp.shape(array) != shape or len(batch) > 1:
             raise InputError(
-                f"{name} of the camera has shape {jnp.shape(array)}; one camera, or a "
-                "batch with a leading axis on every array, is wanted: see make_camera"
+                f"camera: expected one camera or a batch with a leading axis on every "
+                f"array, got {name} of shape {jnp.shape(array)}; see make_camera"
             )
         check_real(name, array)
     if 0 in batch:
-        raise InputError("there are no cameras: at least one is wanted")
-
-
-def check_config(config: RasterConfig) -> None:
-    if not isinstance(config, RasterConfig):
+        raise InputError("camera: expected at least one camera, got an empty batch")
+    visible = camera.visible_size
+    if visible is not None and jnp.shape(visible) != (*batch, 2):
         raise InputError(
-            f"config is of {type(config).__name__}; a RasterConfig is wanted, and the "
-            "background after it"
+            f"visible_size: expected shape {(*batch, 2)}, got {jnp.shape(visible)}"
         )
 
 
 def check_real(name: str, array) -> None:
+    """Check that an array is not complex."""
     if jnp.issubdtype(jnp.result_type(array), jnp.complexfloating):
-        raise InputError(f"{name} is complex; pass real numbers")
+        raise InputError(f"{name}: expected real numbers, got complex ones")
 
 
-def with_batch(name: str, probe, gaussians: Gaussians, camera: Camera):
-    """``probe`` as [B, N, 2], or None."""
-    if probe is None:
-        return None
-    wanted = (*camera.viewmat.shape[:-2], gaussians.capacity, 2)
-    if probe.shape != wanted:
-        raise InputError(f"{name} has shape {probe.shape}; {wanted} is wanted")
-    return probe if camera.batched else probe[None]
+def batched_inputs(inputs: Inputs) -> Inputs:
+    """Return checked inputs; those that differ by camera gain a leading axis B.
+
+    Raises:
+      InputError: if a shape does not match.
+    """
+    gaussians, camera = inputs.gaussians, inputs.camera
+    check_camera(camera)
+    check_gaussians(gaussians)
+    batch = camera.viewmat.shape[:-2]
+    probe, mask, features = inputs.probe, inputs.mask, inputs.features
+    if probe is not None:
+        _require_shape("probe", probe, (*batch, gaussians.capacity, 2))
+    if mask is not None:
+        _require_shape("mask", mask, (*batch, camera.height, camera.width))
+        if mask.dtype != bool:
+            raise InputError(f"mask: expected bool, got {mask.dtype}")
+    if features is not None:
+        shape = features.shape
+        if len(shape) != 2 or shape[0] != gaussians.capacity or shape[1] < 1:
+            raise InputError(
+                f"features: expected shape ({gaussians.capacity}, C), got {shape}"
+            )
+        check_real("features", features)
+    if camera.visible_size is not None:
+        size = jnp.asarray(camera.visible_size).astype(camera.K.dtype)
+        camera = camera.replace(visible_size=size)
+    by_camera = (camera, probe, mask)
+    if not camera.batched:
+        by_camera = jax.tree.map(lambda a: a[None], by_camera)
+    camera, probe, mask = by_camera
+    return inputs._replace(camera=camera, probe=probe, mask=mask)
 
 
-def checked_mask(mask: Array | None, camera: Camera) -> Array | None:
-    """``mask`` as [B, H, W], or None."""
-    if mask is None:
-        return None
-    wanted = (*camera.viewmat.shape[:-2], camera.height, camera.width)
-    if mask.shape != wanted or mask.dtype != bool:
-        raise InputError(
-            f"mask has shape {mask.shape} of {mask.dtype}; {wanted} of bool is wanted"
-        )
-    return mask if camera.batched else mask[None]
-
-
-def checked_size(size: Array | None, camera: Camera) -> Array | None:
-    """``size`` as [B, 2], or None."""
-    if size is None:
-        return None
-    wanted = (*camera.viewmat.shape[:-2], 2)
-    if size.shape != wanted:
-        raise InputError(f"size has shape {size.shape}; {wanted} is wanted")
-    return size if camera.batched else size[None]
-
-
-def check_features(features, gaussians: Gaussians) -> None:
-    if features is None:
-        return
-    shape = features.shape
-    if len(shape) != 2 or shape[0] != gaussians.capacity or shape[1] < 1:
-        raise InputError(
-            f"features has shape {shape}; ({gaussians.capacity}, C) is wanted, C ≥ 1"
-        )
-    check_real("features", features)
+def _require_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
+    if array.shape != shape:
+        raise InputError(f"{name}: expected shape {shape}, got {array.shape}")

@@ -1,8 +1,8 @@
-"""Dense reference: every Gaussian at every pixel, no tiles, no capacity.
+"""Dense reference: every Gaussian at every pixel, without tiles or capacities.
 
-Slow and obviously right; run it in float64. The cut-offs of a `RasterConfig` apply
-only if one is given. Deliberately shares nothing with the fast path but the
-parameters: matrices instead of components, an inverse instead of factors.
+Slow and simple; run it in float64. The limits of a `RasterConfig` apply only if one is
+given. It shares only the parameters and the lens with the renderer: it uses matrices
+instead of components, and an inverse instead of factors.
 """
 
 import jax
@@ -19,8 +19,8 @@ from gsjax.raster.types import Array, RasterConfig
 def reference_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.3):
     """Project by matrices: means2d [N, 2], depth [N], cov2d [N, 2, 2], ratio [N], seen.
 
-    ``cov2d`` includes the dilation; ``ratio`` is det before it over det after;
-    ``seen`` [N] tells what lies between near and far (the rest is set to z = 1).
+    ``cov2d`` includes the dilation; ``ratio`` is the determinant before it over that
+    after it; ``seen`` [N] is True between near and far (others are moved to z = 1).
     """
     p = gaussians.params
     rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
@@ -31,12 +31,10 @@ def reference_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.
     world = covariance(p.quats, jnp.exp(p.log_scales))
 
     def lens(point):
-        return jnp.stack(camera.model.project(camera.K, tuple(point)))
+        return jnp.stack(camera.project(tuple(point)))
 
     def limited(point):
-        return jnp.stack(
-            camera.model.linearise(camera.K, camera.width, camera.height, tuple(point))
-        )
+        return jnp.stack(camera.linearise(tuple(point)))
 
     jacobian = jax.vmap(lambda point: jax.jacfwd(lens)(limited(point)))(points)
     half = jnp.einsum("nij,jk->nik", jacobian, rotation, precision="highest")
@@ -47,8 +45,10 @@ def reference_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.
 
 
 def reference_colors(gaussians: Gaussians, camera: Camera) -> Array:
-    """SH colour [N, 3] of each Gaussian seen from the camera; where that is, as along
-    the world's z."""
+    """Return the SH colour [N, 3] of each Gaussian seen from the camera.
+
+    A Gaussian at the camera itself is seen along the world's z axis.
+    """
     offset = gaussians.params.means - camera_centre(camera.viewmat)
     there = jnp.any(offset != 0, axis=-1, keepdims=True)
     offset = jnp.where(there, offset, jnp.asarray([0.0, 0.0, 1.0]))
@@ -71,15 +71,15 @@ def reference_render(
     Args:
       gaussians: the active mask must be concrete (not traced).
       camera: a single camera; near and far cull.
-      config: its cut, cap, stop and dilation apply; None means no cut-off at all,
-        with ``dilation`` and ``antialias`` as given.
+      config: its limits and its dilation apply; None means no limits, with
+        ``dilation`` and ``antialias`` as given.
       background: [C], default black.
       features: [N, C] in place of the SH colour.
 
     Returns:
       "rgb" [H, W, C], "alpha", "depth", "median_depth" [H, W], and "margin" [H, W]:
-      the smallest relative distance of the pixel from any threshold (α from the cut,
-      T from the stop), to tell where two renderers may differ by a whole Gaussian.
+      the smallest relative distance of the pixel from any threshold (α from alpha_min,
+      T from transmittance_min). Two renderers may differ by a Gaussian where it is 0.
     """
     if config is not None:
         dilation, antialias = config.dilation, config.antialias
@@ -96,7 +96,7 @@ def reference_render(
         reference_colors(gaussians, camera) if features is None else features[slots]
     )
     colors, depth, inside = colors[order], depth[order], inside[order]
-    colors = jnp.where(inside[:, None], colors, 0)  # of which nothing is blended
+    colors = jnp.where(inside[:, None], colors, 0)  # never blended
     means2d, opacity = means2d[order], jnp.where(inside, opacity[order], 0)
     inverse = jnp.linalg.inv(cov2d[order])
 
@@ -106,17 +106,17 @@ def reference_render(
     alpha = opacity[:, None] * jnp.exp(-0.5 * power)  # [N, pixels]
     margin = jnp.full(alpha.shape[1], jnp.inf)
     if config is not None:
-        from_cut = jnp.abs(alpha / config.alpha_min - 1)
-        margin = jnp.min(from_cut, axis=0, initial=jnp.inf)
+        from_limit = jnp.abs(alpha / config.alpha_min - 1)
+        margin = jnp.min(from_limit, axis=0, initial=jnp.inf)
         alpha = jnp.where(alpha < config.alpha_max, alpha, config.alpha_max)
         alpha = jnp.where(alpha >= config.alpha_min, alpha, 0)
     after = jnp.cumprod(1 - alpha, axis=0)
     before = jnp.concatenate([jnp.ones_like(after[:1]), after[:-1]])
     if config is not None:
         tested = after if config.stop_rule == "before" else before
-        blended = tested > config.stop
-        if config.stop > 0:
-            near_stop = jnp.abs(tested / config.stop - 1)
+        blended = tested > config.transmittance_min
+        if config.transmittance_min > 0:
+            near_stop = jnp.abs(tested / config.transmittance_min - 1)
             nearest = jnp.min(near_stop, axis=0, initial=jnp.inf)
             margin = jnp.minimum(margin, nearest)
     else:

@@ -1,81 +1,60 @@
-"""The picture of one camera: order, project, rasterise; then what lies behind it.
+"""The render of one camera: bounds, order, projection, tiles; then the background.
 
 Axis legend: N Gaussians (capacity), H W image, B cameras, C channels.
 """
 
-from dataclasses import dataclass, fields
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gsjax.cameras.camera import Camera
 from gsjax.errors import InputError
-from gsjax.gaussians import Gaussians
 from gsjax.math.numerics import safe_divide
 from gsjax.raster.argument_checks import check_real
-from gsjax.raster.lists import binning
+from gsjax.raster.compositing.types import Images
+from gsjax.raster.lists import binning, occlusion_culling
+from gsjax.raster.lists.blocks import by_blocks
 from gsjax.raster.lists.depth_order import depth_order
-from gsjax.raster.primitives.ellipsoid import project
-from gsjax.raster.tile_render import device_count, rasterise
-from gsjax.raster.types import COLOR_LIMIT, Array, Demand, RasterConfig
+from gsjax.raster.primitives.ellipsoid import ELLIPSOID
+from gsjax.raster.tile_render import device_count, render_tiles
+from gsjax.raster.types import (
+    COLOR_LIMIT,
+    Array,
+    Bounds,
+    Demand,
+    Inputs,
+    Primitive,
+    RasterConfig,
+    nan_like,
+)
 from gsjax.runtime.devices import on_cpu, shard_rows
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("viewmat", "K", "near", "far", "size"),
-    meta_fields=("width", "height", "model"),
-)
-@dataclass(frozen=True)
-class _Corner(Camera):
-    """A camera of whose image the upper left corner is shown alone.
+def render_camera(
+    inputs: Inputs, config: RasterConfig
+) -> tuple[Images, Array, Demand, Array]:
+    """Return images before the background, radii [N], demand and overflow.
 
-    Attributes:
-      size: [2] its width and height, px.
+    Args:
+      inputs: Gaussians, a single camera and what is drawn with them.
+      config: static settings.
     """
-
-    size: Array | None = None
-
-    @property
-    def shown(self) -> tuple[Array, Array]:
-        assert self.size is not None
-        return self.size[0], self.size[1]
-
-
-def _corner(camera: Camera, size: Array) -> _Corner:
-    given = {field.name: getattr(camera, field.name) for field in fields(camera)}
-    return _Corner(**given, size=size.astype(camera.K.dtype))
-
-
-def draw(
-    gaussians: Gaussians,
-    config: RasterConfig,
-    features: Array | None,
-    camera: Camera,
-    probe: Array | None,
-    abs_probe: Array | None,
-    mask: Array | None,
-    size: Array | None,
-) -> tuple[dict[str, Array], Array, Demand, Array]:
-    """One camera: images before the background, radii [N], demand, overflowed."""
-    if size is not None:
-        camera = _corner(camera, size)
+    gaussians, camera = inputs.gaussians, inputs.camera
+    primitive = config.primitive or ELLIPSOID
     # The names that a profile shows.
     with jax.named_scope("order"):
-        order, visible = depth_order(gaussians, camera, config, features)
-    if features is None and gaussians.sh_degree > 0 and on_cpu():
-        # Colours that turn with the view are worth what it costs to bring the parts
-        # together again; a mean and a covariance alone are not.
+        order, visible = visible_order(primitive, inputs, config)
+    if inputs.features is None and gaussians.sh_degree > 0 and on_cpu():
+        # Colours that depend on the view are worth the cost of joining the parts again;
+        # a mean and a covariance alone are not.
         order = shard_rows(order, device_count(config), fill=gaussians.capacity)
     with jax.named_scope("project"):
-        out = project(
-            gaussians, camera, config, order, visible, features, probe, abs_probe
-        )
-    radii = jnp.zeros(gaussians.capacity, out.u.dtype)
-    seen = binning.radii(lax.stop_gradient(out), *camera.shown)
-    sums, demand, overflowed = rasterise(out, camera.width, camera.height, config, mask)
+        out = primitive.project(inputs, config, order, visible)
+    radii = jnp.zeros(gaussians.capacity, out.splat.u.dtype)
+    seen = binning.radii(lax.stop_gradient(out.footprint), *camera.visible)
+    size = camera.width, camera.height
+    sums, demand, overflowed = render_tiles(out, size, config, inputs.mask)
     room = min(config.visible_capacity or gaussians.capacity, gaussians.capacity)
     return (
         sums,
@@ -85,10 +64,47 @@ def draw(
     )
 
 
+def visible_order(
+    primitive: Primitive, inputs: Inputs, config: RasterConfig
+) -> tuple[Array, Array]:
+    """Return the slots that may be visible, front to back, and their number.
+
+    Conservative: a slot that is left out has no pixel with α at or above the limit, or,
+    with ``config.occlusion``, lies behind pixels that have all stopped. No derivative
+    is taken. See `depth_order` for the shapes.
+    """
+    inputs = lax.stop_gradient(inputs._replace(mask=None, probe=None))
+    camera, params = inputs.camera, inputs.gaussians.params
+
+    def bound(active: Array, values) -> Bounds:
+        return primitive.bounds(active, values, camera, config, inputs.alpha_min)
+
+    def none(active: Array, values) -> Bounds:
+        shapes = jax.eval_shape(bound, active, values)
+        nothing = jax.tree.map(jnp.zeros_like, shapes)
+        return nothing._replace(z=jnp.full_like(nothing.z, jnp.inf))
+
+    values = (params.means, params.log_scales, params.logit_opacities)
+    bounds = by_blocks(bound, none, inputs.gaussians.active, values)
+    z = bounds.z
+    if config.occlusion and primitive.occluders is not None:
+        occluders = partial(primitive.occluders, inputs, config)
+        size = camera.width, camera.height
+        z = occlusion_culling.cull(bounds, occluders, size, config)
+
+    def exact_depth(slots: Array | None) -> Array:
+        means = params.means
+        if slots is not None:
+            means = means.at[slots].get(mode="clip")
+        return primitive.order_depth(means, camera)
+
+    return depth_order(z, exact_depth, config)
+
+
 def finish(
-    sums: dict[str, Array], config: RasterConfig, background, cameras: int, colors: int
-) -> dict[str, Array]:
-    """Background and normalisation: sums [B, H, W, C] to named images."""
+    sums: Images, config: RasterConfig, background, cameras: int, colors: int
+) -> Images:
+    """Add the background and normalise: sums [B, H, W, C] to named images."""
     total = sums["sums"]
     alpha = total[..., -1]
     out = {}
@@ -99,10 +115,10 @@ def finish(
             background = jnp.asarray(background, rgb.dtype)
             if background.shape not in ((colors,), (cameras, colors)):
                 raise InputError(
-                    f"background has shape {background.shape}; ({colors},) or "
-                    f"({cameras}, {colors}) is wanted"
+                    f"background: expected shape ({colors},) or ({cameras}, {colors}), "
+                    f"got {background.shape}"
                 )
-            # What is not finite would show through wherever the scene is not opaque.
+            # A component that is not finite would show through the scene.
             background = jnp.where(jnp.abs(background) < COLOR_LIMIT, background, 0)
             background = jnp.broadcast_to(background, (cameras, colors))
             # As a product: its transpose is one too, not a sum over few channels.
@@ -117,3 +133,15 @@ def finish(
     if "median_depth" in config.outputs:
         out["median_depth"] = sums["median"]
     return out
+
+
+def mark_overflow(images: Images, overflowed: Array, config: RasterConfig) -> Images:
+    """Return images [B, …], filled with NaN on overflow if the config says so."""
+    if config.on_overflow == "flag":
+        return images
+
+    def one(image: Array) -> Array:
+        flags = overflowed.reshape(-1, *(1,) * (image.ndim - 1))
+        return jnp.where(flags, nan_like(image), image)
+
+    return {name: one(image) for name, image in images.items()}

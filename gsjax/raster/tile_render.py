@@ -104,7 +104,7 @@ def _render_local(
     task: Task,
     capacity: int,
 ):
-    """Render one device's tiles; ``device`` is [1]. Results gain a leading device axis."""
+    """Render one device's tiles; results gain a leading device axis."""
     device, grid = device[0], task.grid
     # The names that a profile shows.
     with jax.named_scope("lists"):

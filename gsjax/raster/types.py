@@ -1,69 +1,80 @@
-"""Settings and results of the rasteriser's stages.
+"""Settings and results of the rasteriser, and the values that its stages exchange.
 
-Axis legend: N Gaussians (capacity), R visible ranks (front to back), P pairs,
-S steps, G tiles of a step, K Gaussians of a chunk, H W image, B cameras, C channels.
+Axis legend: N Gaussians (capacity), R visible ranks (front to back), H W image,
+B cameras, C channels.
 """
 
-from copy import copy
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.experimental import checkify
 
+from gsjax.errors import CapacityError
 from gsjax.runtime.settings import require_ranges, settle
 
+if TYPE_CHECKING:
+    from gsjax.cameras.camera import Camera
+    from gsjax.gaussians import Gaussians
+
 Array = jax.Array
-COLOR_LIMIT = 1e32  # a coefficient or feature from there on counts as infinite
+COLOR_LIMIT = 1e32  # a coefficient or feature from here on counts as infinite
 
 OUTPUTS = ("rgb", "alpha", "depth", "median_depth")
 STOP_RULES = ("before", "after")
+OVERFLOW_RULES = ("flag", "nan")
 
 
 @dataclass(frozen=True)
 class RasterConfig:
     """Static settings of a render; hashable, so pass it as a static argument.
 
-    Accuracy. What is left out at a pixel changes it by at most D · Σ α of the
-    Gaussians left out, D being the colour range including the background.
+    Accuracy. Gaussians that are left out of a pixel change it by at most D · Σ α, where
+    D is the colour range including the background.
 
     Attributes:
-      alpha_min: a Gaussian is left out of a pixel where its α is below this; it
-        also sets the extent, sqrt(2 ln(opacity / alpha_min)) standard deviations.
-      alpha_max: α is at most this; at most 1.
-      stop: a pixel stops once its transmittance T has fallen to this.
-      stop_rule: "before": a Gaussian that would bring T to ``stop`` is not blended
-        (the field's rule); "after": it is blended, then the pixel stops.
+      alpha_min: a Gaussian is left out of a pixel where its α is below this. It also
+        sets the extent, sqrt(2 ln(opacity / alpha_min)) standard deviations.
+      alpha_max: upper limit of α; at most 1.
+      transmittance_min: a pixel stops once its transmittance T has fallen to this.
+      stop_rule: "before": a Gaussian that would bring T to ``transmittance_min`` is not
+        blended (the rule of Kerbl et al. 2023); "after": it is blended, then the pixel
+        stops.
       dilation: px² added to the diagonal of the projected covariance.
       antialias: compensate the opacity for the dilation (Mip-Splatting).
-      outputs: what to compute, of `OUTPUTS`; the rest is not in the program.
-      absgrad: let ``abs_probe`` of `render` collect per-pixel absolute gradients;
-        reverse mode only.
+      outputs: images to compute, of `OUTPUTS`; others are not in the program.
+      absgrad: make the gradient by ``probe`` of `render` the sum of absolute per-pixel
+        gradients (reverse mode only).
+      primitive: the `Primitive` that is drawn; None for ellipsoids (EWA splatting).
 
     Size and speed. None of these changes the image beyond rounding.
 
     Attributes:
-      tile_size: pixels along the side of a tile.
-      chunk_size: Gaussians of a tile composited in one go, where it goes by chunks.
-      tiles_per_step: chunks of tiles composited side by side; None chooses by
-        platform.
-      pair_capacity: room for (tile, Gaussian) pairs of a camera; None chooses from
-        the sizes. If it is too small, `Render.overflowed` is set and `Render.demand`
-        says what was wanted; `render_exact` regrows. Unused room costs memory, and
-        time, most of all in a gradient: fit it with `exact_config`.
-      visible_capacity: room for Gaussians in view (of each camera); None means all
-        slots. Reported and regrown like ``pair_capacity``.
-      occlusion: leave out, before sorting, what lies behind pixels that have all
-        stopped. Bit-equal on a CPU; pays where something opaque fills part of the view.
-      num_size_buckets: how many sizes, each a quarter of the one before, sorting by depth is
-        compiled for; the smallest that fits is run. Sorting pairs, on accelerators,
-        has sizes between them; from 2 on there is a small size of projecting, from 4 on
-        the gradient of compositing by chunks has sizes too, two fewer, and on
-        accelerators from 3 on all of compositing, one fewer. Each takes seconds to
-        compile, and saves time where a view needs a quarter of its capacity or less.
-      devices: how many devices share the tiles (and on CPUs the projection, where
-        colours turn with the view); None means all local ones. Within a
-        `jax.shard_map` of your own: 1, and ``check_vma=False`` there; within
-        `jax.pmap` or `jax.set_mesh`: 1.
+      tile_size: side of a tile in px.
+      chunk_size: Gaussians of a tile that chunked compositing blends together.
+      tiles_per_step: chunks of tiles composited side by side; None chooses by platform.
+      pair_capacity: room for (tile, Gaussian) pairs of a camera; None chooses from the
+        sizes. If it is too small, `Render.overflowed` is set and `Render.demand`
+        reports the capacity needed; `render_exact` grows it. Unused room costs memory,
+        and time in a gradient; `exact_config` fits it.
+      visible_capacity: room for Gaussians in view of each camera; None for all slots.
+        Reported and grown like ``pair_capacity``.
+      on_overflow: "flag" sets `Render.overflowed` only; "nan" also fills the images
+        with NaN, so that an incomplete image cannot go unnoticed under jit.
+      occlusion: before sorting, cull Gaussians behind pixels that have all stopped. The
+        image does not change on a CPU. Pays off where something opaque fills much of
+        the view; compiling takes longer.
+      num_size_buckets: number of array sizes, each a quarter of the one before, that
+        sorting and projection are compiled for; the smallest that fits runs. More than
+        one pays off for views that need less than a quarter of their capacity, and
+        costs seconds of compiling.
+      devices: number of devices that share the tiles; None for all local devices. Use
+        1 inside your own `jax.shard_map` (with ``check_vma=False``), `jax.pmap` or
+        `jax.set_mesh`.
 
     Raises:
       InputError: if a setting is out of its range.
@@ -71,19 +82,21 @@ class RasterConfig:
 
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99
-    stop: float = 1e-4
+    transmittance_min: float = 1e-4
     stop_rule: str = "before"
     dilation: float = 0.3
     antialias: bool = False
     outputs: tuple[str, ...] = ("rgb", "alpha", "depth")
     absgrad: bool = False
+    primitive: "Primitive | None" = None
     tile_size: int = 8
     chunk_size: int = 32
     tiles_per_step: int | None = None
     pair_capacity: int | None = None
     visible_capacity: int | None = None
-    occlusion: bool = True
-    num_size_buckets: int = 3
+    on_overflow: str = "flag"
+    occlusion: bool = False
+    num_size_buckets: int = 1
     devices: int | None = None
 
     def __post_init__(self):
@@ -91,9 +104,9 @@ class RasterConfig:
         checks = {
             "alpha_min": 0 < self.alpha_min < 1,
             "alpha_max": self.alpha_min < self.alpha_max <= 1,
-            "stop": 0 <= self.stop < 1,
+            "transmittance_min": 0 <= self.transmittance_min < 1,
             "stop_rule": self.stop_rule in STOP_RULES,
-            "dilation": 0 <= self.dilation <= 1e9,  # its square is one of float32
+            "dilation": 0 <= self.dilation <= 1e9,  # its square fits float32
             "outputs": isinstance(self.outputs, tuple)
             and len(self.outputs) > 0
             and set(self.outputs) <= set(OUTPUTS),
@@ -104,6 +117,7 @@ class RasterConfig:
             or 1 <= self.pair_capacity < 2**30,
             "visible_capacity": self.visible_capacity is None
             or self.visible_capacity >= 1,
+            "on_overflow": self.on_overflow in OVERFLOW_RULES,
             "num_size_buckets": self.num_size_buckets >= 1,
             "devices": self.devices is None or self.devices >= 1,
         }
@@ -111,86 +125,183 @@ class RasterConfig:
 
     @classmethod
     def compat(cls, **changes) -> "RasterConfig":
-        """The field's constants: cut 1/255, cap 0.99, stop before 1e-4."""
+        """The constants of Kerbl et al. (2023): α in 1/255 … 0.99, stop before 1e-4."""
         return cls(**changes)
 
     @classmethod
     def accurate(cls, **changes) -> "RasterConfig":
-        """Within 0.5/255 of the exact image: cut 1e-5, blend then stop at 1e-5."""
+        """Within 0.5/255 of the exact image: α from 1e-5, blend then stop at 1e-5.
+
+        Use it where poses are optimised: pose gradients of `compat` can be off by half.
+        """
         settings = {
             "alpha_min": 1e-5,
             "alpha_max": 1 - 1e-6,
-            "stop": 1e-5,
+            "transmittance_min": 1e-5,
             "stop_rule": "after",
         }
         return cls(**{**settings, **changes})
 
     @classmethod
     def fast(cls, **changes) -> "RasterConfig":
-        """Cut 1/255, blend then stop at 1e-3: stops earlier, and yet errs less."""
-        settings = {"alpha_max": 0.999, "stop": 1e-3, "stop_rule": "after"}
+        """α from 1/255, blend then stop at 1e-3: faster than `compat`, errs less."""
+        settings = {"alpha_max": 0.999, "transmittance_min": 1e-3, "stop_rule": "after"}
         return cls(**{**settings, **changes})
 
     def replace(self, **changes) -> "RasterConfig":
-        """A copy with some settings changed."""
+        """Return a copy with some settings changed."""
         return replace(self, **changes)
 
-    def at_cut(self, alpha_min: Array) -> "RasterConfig":
-        """A copy with an α cut that is traced, for use within what traces it alone: see
-        `gsjax.raster.render.render_at_cut`."""
-        config = copy(self)
-        object.__setattr__(config, "alpha_min", alpha_min)
-        return config
 
+class Footprint(NamedTuple):
+    """Ellipses on the image plane, [R] each, front to back; all that lists see.
 
-class Projected(NamedTuple):
-    """Gaussians on the image plane, [R] each unless said, front to back.
-
-    The 2D covariance is [[a, b], [b, c]] (dilation included), held in a form whose
-    exponent cannot turn negative: with dx, dy the offset of a pixel from the mean,
-    y1 = inv_sx · dx, y2 = inv_sy · (dy − slope · dx), Q = y1² + y2² and
-    α = opacity · exp(−Q / 2).
+    The ellipse is Q ≤ reach, with Q = y1² + y2², y1 = inv_sx · dx and
+    y2 = √(a / det) · (dy − slope · dx), for the 2D covariance [[a, b], [b, c]].
 
     Attributes:
-      u, v: pixel coordinates of the mean.
-      depth: camera z.
+      u, v: centre in px.
       inv_sx: 1 / √a.
       slope: b / a.
-      inv_sy: √(a / det).
       var_y: c.
       det: determinant of the covariance.
-      opacity: after the sigmoid and, where asked for, the compensation.
-      reach: Q at which α falls to the cut; 0 for what cannot be seen.
-      colors: [C, R] colour or features.
-      compensation: factor that antialiasing puts on the opacity.
-      probe: [2, R] zeros or None; collects the absolute gradient.
+      reach: largest Q that is drawn; 0 for what cannot be seen.
     """
 
     u: Array
     v: Array
-    depth: Array
     inv_sx: Array
     slope: Array
-    inv_sy: Array
     var_y: Array
     det: Array
-    opacity: Array
     reach: Array
+
+
+class Splat(NamedTuple):
+    """Numbers from which α follows at a pixel, [R] each, front to back.
+
+    Attributes:
+      u, v: centre in px.
+      shape: further numbers, in the order that `Primitive.alpha` expects. Ellipsoids
+        have inv_sx, slope, inv_sy and opacity, so that with dx, dy the offset of a
+        pixel y1 = inv_sx · dx, y2 = inv_sy · (dy − slope · dx), Q = y1² + y2² and
+        α = opacity · exp(−Q / 2): the exponent cannot turn positive.
+    """
+
+    u: Array
+    v: Array
+    shape: tuple[Array, ...]
+
+
+class Channels(NamedTuple):
+    """Values that are blended, front to back.
+
+    Attributes:
+      colors: [C, R] colour or features.
+      depth: [R] depth by which Gaussians are ordered.
+      probe: [2, R] zeros that collect the absolute gradient, or None.
+      alpha_min: [] replaces `RasterConfig.alpha_min`, or None; no derivative is taken.
+    """
+
     colors: Array
-    compensation: Array
-    probe: Array | None
+    depth: Array
+    probe: Array | None = None
+    alpha_min: Array | None = None
+
+
+class Projection(NamedTuple):
+    """Gaussians on the image plane: what a primitive returns."""
+
+    footprint: Footprint
+    splat: Splat
+    channels: Channels
+
+
+class Box(NamedTuple):
+    """Boxes on the image plane, [K] each, px.
+
+    Attributes:
+      u, v: centres.
+      half_width, half_height: extent to either side.
+    """
+
+    u: Array
+    v: Array
+    half_width: Array
+    half_height: Array
+
+
+class Bounds(NamedTuple):
+    """Conservative bounds of Gaussians in view, [K] each.
+
+    Attributes:
+      z: depth; infinity for a Gaussian that cannot be visible.
+      box: box that holds all pixels with α at or above the limit.
+      wide: whether the Gaussian is wide and opaque enough to hide others.
+    """
+
+    z: Array
+    box: Box
+    wide: Array
+
+
+class Inputs(NamedTuple):
+    """Inputs of one camera's render.
+
+    Attributes:
+      gaussians: N slots.
+      camera: a single camera.
+      features: [N, C] in place of SH colours, or None.
+      probe: [N, 2] added to the projected means, or the zeros that collect the absolute
+        gradient; or None.
+      mask: [H, W] bool, pixels to draw; or None for all.
+      alpha_min: [] in place of `RasterConfig.alpha_min`, or None.
+    """
+
+    gaussians: "Gaussians"
+    camera: "Camera"
+    features: Array | None = None
+    probe: Array | None = None
+    mask: Array | None = None
+    alpha_min: Array | None = None
+
+
+class Primitive(NamedTuple):
+    """A kind of thing that is drawn, as pure functions; see `gsjax.raster.primitives`.
+
+    Attributes:
+      name: the name in files and messages.
+      bounds: (active [K], (means, log_scales, logit_opacities), camera, config,
+        alpha_min) → `Bounds`; cheap and conservative, for every slot, without
+        derivative.
+      order_depth: (means [K, 3], camera) → what `Bounds.z` is sorted by, in full
+        precision; see `gsjax.raster.lists.sorting`.
+      project: (inputs, config, order [R], count []) → `Projection` of the slots
+        ``order``, of which the first ``count`` are used. Differentiable.
+      occluders: (inputs, config, slots [K], count []) → `Splat` of candidates for
+        occlusion culling; or None if the primitive does not support it.
+      alpha: (shape, dx, dy) → α before its limits, from the numbers of `Splat.shape`
+        and the offset of a pixel from the centre, px. None for the Gaussian form of
+        `Splat`, which has kernels of its own. Differentiated by JAX.
+    """
+
+    name: str
+    bounds: Callable[..., Bounds]
+    order_depth: Callable[..., Any]
+    project: Callable[..., Projection]
+    occluders: Callable[..., Splat] | None = None
+    alpha: Callable[..., Array] | None = None
 
 
 class Demand(NamedTuple):
-    """Counts wanted, int32; a count of 2³⁰ or more is reported as 2³¹ − 1.
+    """Counts needed, int32; 2³⁰ or more is reported as 2³¹ − 1.
 
     Attributes:
-      visible: Gaussians that may be in the view, of the camera that sees most; the
-        ``visible_capacity`` that would have been enough.
-      pairs: (tile, Gaussian) pairs, of all cameras.
-      capacity: the ``pair_capacity`` that would have been enough, of the camera that
-        wants most. Where ``visible`` did not fit, this and ``pairs`` count only those
-        that did.
+      visible: Gaussians that may be in view, of the camera that sees most; the
+        ``visible_capacity`` that would be enough.
+      pairs: (tile, Gaussian) pairs of all cameras.
+      capacity: the ``pair_capacity`` that would be enough for the camera that needs
+        most. If ``visible`` did not fit, ``pairs`` and this count only those that did.
     """
 
     visible: Array
@@ -199,19 +310,18 @@ class Demand(NamedTuple):
 
 
 class Render(NamedTuple):
-    """What a render returns; a batch of cameras adds a leading axis B to the images.
+    """Result of a render; a batch of cameras adds a leading axis B to the images.
 
     Attributes:
       rgb: [H, W, C] colour or features over the background, or None.
       alpha: [H, W] accumulated opacity, or None.
-      depth: [H, W] expected camera z, Σ w z / Σ w; 0 where nothing is. Or None.
-      median_depth: [H, W] z of the Gaussian at which T falls through 1/2; 0 where
+      depth: [H, W] expected depth Σ w z / Σ w; 0 where nothing is. Or None.
+      median_depth: [H, W] depth of the Gaussian at which T falls through 1/2; 0 where
         it never does. Or None.
-      radii: [N] half the longer side, in px, of the box that the Gaussian covers;
-        0 where it is out of the view, or left out by ``config.occlusion``.
-      demand: the counts wanted.
-      overflowed: [] bool; True if the capacity was too small, and the image
-        therefore is not exact.
+      radii: [N] half the longer side, in px, of the box that a Gaussian covers; 0 if it
+        is out of view or culled by ``config.occlusion``.
+      demand: counts needed.
+      overflowed: [] bool; True if a capacity was too small and the image is incomplete.
     """
 
     rgb: Array | None
@@ -224,5 +334,32 @@ class Render(NamedTuple):
 
     @property
     def visible(self) -> Array:
-        """[N] bool: which Gaussians are in the view; see ``radii``."""
+        """[N] bool, True for Gaussians in view; see ``radii``."""
         return self.radii > 0
+
+    def check(self) -> "Render":
+        """Return the result itself if nothing overflowed.
+
+        Under `jax.jit`, functionalise the caller with `jax.experimental.checkify`.
+
+        Raises:
+          CapacityError: if a capacity was too small; the message names the setting.
+        """
+        message = (
+            "render: RasterConfig.pair_capacity or visible_capacity is too small; use "
+            "gsjax.exact_config(gaussians, camera, config)"
+        )
+        if isinstance(self.overflowed, Tracer):
+            checkify.check(~self.overflowed, message)
+        elif np.any(np.asarray(self.overflowed)):
+            demand = self.demand
+            raise CapacityError(
+                f"{message}, or set pair_capacity to at least {int(demand.capacity)} "
+                f"and visible_capacity to at least {int(demand.visible)}"
+            )
+        return self
+
+
+def nan_like(image: Array) -> Array:
+    """Return an array of NaN."""
+    return jnp.full_like(image, jnp.nan)

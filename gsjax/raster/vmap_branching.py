@@ -1,8 +1,8 @@
-"""Decisions that a batch takes as one.
+"""Branch decisions that a batch takes together.
 
-Under `jax.vmap` a `lax.cond` or `lax.switch` on what differs from one element of the
-batch to the next runs every branch for all of them, and picks. On what these return it
-runs the one branch that will do for all.
+Under `jax.vmap`, `lax.cond` or `lax.switch` on a value that differs from element to
+element runs every branch for all elements and selects. On the values returned here it
+runs the one branch that serves all of them.
 """
 
 from collections.abc import Callable
@@ -14,8 +14,8 @@ from jax.custom_batching import custom_vmap
 from gsjax.raster.types import Array
 
 
-def _as_one(decide: Callable[[Array], Array]) -> Callable[[Array], Array]:
-    """The value itself; in a batch what ``decide`` makes of all values, for each."""
+def _together(decide: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """Return the identity, which in a batch gives ``decide`` of all values to each."""
 
     @custom_vmap
     def same(value: Array) -> Array:
@@ -23,20 +23,20 @@ def _as_one(decide: Callable[[Array], Array]) -> Callable[[Array], Array]:
 
     @same.def_vmap
     def _of_batch(size, batched, value):
-        del size, batched  # called for a batch alone
+        del size, batched  # called for batches only
         return same(decide(value)), False
 
     return same
 
 
-_any, _least = (_as_one(partial(f, axis=0)) for f in (jnp.any, jnp.min))
+_any, _min = (_together(partial(f, axis=0)) for f in (jnp.any, jnp.min))
 
 
 def any_in_batch(flag: Array) -> Array:
-    """Whether any of the batch has it, of each flag of a bool array."""
+    """Return the flag itself; in a batch, whether any element has it set."""
     return _any(flag)
 
 
 def min_in_batch(index: Array) -> Array:
-    """The smallest of the batch []."""
-    return _least(index)
+    """Return the index [] itself; in a batch, the smallest of all elements."""
+    return _min(index)

@@ -30,7 +30,7 @@ from gsjax.stress.types import Case, Measured
 _EXACT = RasterConfig(
     alpha_min=1e-7,
     alpha_max=1 - 1e-6,
-    stop=0.0,
+    transmittance_min=0.0,
     outputs=("rgb",),
     num_size_buckets=1,
     devices=1,
@@ -102,7 +102,7 @@ def stop(rule: str, epsilon: float):
         bound = spread * epsilon * np.ones(alpha.shape[1:])
         if rule == "before":
             bound = bound / (1 - alpha.max(0))
-        share = _share(_EXACT.replace(stop=epsilon, stop_rule=rule), bound)
+        share = _share(_EXACT.replace(transmittance_min=epsilon, stop_rule=rule), bound)
         return Measured(share, f"bound {bound.max():.1e} at most")
 
     return measure

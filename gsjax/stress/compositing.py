@@ -11,9 +11,10 @@ from gsjax.math.numerics import in_float64
 from gsjax.math.sh import dc_to_rgb
 from gsjax.raster.compositing.alpha import alphas
 from gsjax.raster.compositing.blending import running_product, transmittance
+from gsjax.raster.exact import render_exact
 from gsjax.raster.lists.counting import total_count
 from gsjax.raster.reference import reference_render
-from gsjax.raster.render import render, render_exact
+from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig
 from gsjax.stress.scenes import (
     BACKGROUND,

@@ -9,7 +9,8 @@ from gsjax.gaussians import Gaussians, num_active
 from gsjax.math.numerics import logit
 from gsjax.math.rotations import quaternion_to_matrix
 from gsjax.raster.lists.binning import make_grid, row_spans
-from gsjax.raster.primitives.ellipsoid import project
+from gsjax.raster.primitives.ellipsoid import ELLIPSOID
+from gsjax.raster.types import Inputs
 from gsjax.stress.scenes import (
     BACKGROUND,
     COMPAT,
@@ -152,7 +153,8 @@ def depth_of_nan(full: bool) -> Measured:
 def _rows_of_wild(gaussians: Gaussians, camera, value):
     """Rows of tiles that Gaussians moved to ± ``value`` px are given."""
     order = jnp.arange(SLOTS)
-    out = project(gaussians, camera, COMPAT, order, num_active(gaussians))
+    inputs, count = Inputs(gaussians, camera), num_active(gaussians)
+    out = ELLIPSOID.project(inputs, COMPAT, order, count).footprint
     grid = make_grid(SIZE, SIZE, COMPAT.tile_size, 1)
     sign = jnp.where(order % 2 == 0, value, -value)
     rows = [

@@ -9,8 +9,9 @@ import numpy as np
 from gsjax.cameras.camera import Camera
 from gsjax.gaussians import Gaussians, num_active
 from gsjax.math.numerics import in_float64
-from gsjax.raster.primitives.ellipsoid import project
+from gsjax.raster.primitives.ellipsoid import ELLIPSOID
 from gsjax.raster.reference import reference_project
+from gsjax.raster.types import Inputs
 from gsjax.stress.scenes import (
     COMPAT,
     FIELDS,
@@ -116,8 +117,10 @@ def projected(gaussians: Gaussians, camera: Camera):
     """Of every slot: mean px [N, 2], compensation [N], opacity [N] (0 if culled)."""
     order, count = jnp.arange(SLOTS), num_active(gaussians)
     sharp = COMPAT.replace(alpha_min=1e-30, antialias=True)
-    out = project(gaussians, camera, sharp, order, count)
-    return jnp.stack([out.u, out.v], -1), out.compensation, out.opacity
+    splat = ELLIPSOID.project(Inputs(gaussians, camera), sharp, order, count).splat
+    opacity = splat.shape[3]
+    ratio = opacity / jax.nn.sigmoid(gaussians.params.logit_opacities)
+    return jnp.stack([splat.u, splat.v], -1), ratio, opacity
 
 
 @jax.jit

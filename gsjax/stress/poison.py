@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsjax.cameras.camera import ORTHOGRAPHIC, Camera
+from gsjax.cameras.camera import Camera
+from gsjax.cameras.lenses import ORTHOGRAPHIC
 from gsjax.gaussians import Gaussians
 from gsjax.raster.types import RasterConfig
 from gsjax.stress.scenes import (
@@ -127,7 +128,7 @@ def settings() -> dict[str, dict[str, Any]]:
         pair_capacity=COMPAT.pair_capacity,
         outputs=outputs,
     )
-    level = {"focal": 6.0, "model": ORTHOGRAPHIC}
+    level = {"focal": 6.0, "lens": ORTHOGRAPHIC}
     return {
         "usual": {},
         "antialiased": {"config": COMPAT.replace(antialias=True)},

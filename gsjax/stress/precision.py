@@ -13,7 +13,8 @@ from gsjax.data.types import Dataset, View
 from gsjax.gaussians import Gaussians, num_active
 from gsjax.math.numerics import in_float64
 from gsjax.math.rotations import quaternion_to_matrix
-from gsjax.raster.primitives.ellipsoid import project
+from gsjax.raster.primitives.ellipsoid import ELLIPSOID
+from gsjax.raster.types import Inputs
 from gsjax.stress.needles import projected
 from gsjax.stress.scenes import (
     COMPAT,
@@ -150,9 +151,11 @@ def far_world(offset: float):
 def _numbers(gaussians: Gaussians, camera: Camera, weigh) -> jax.Array:
     """A smooth number that every output of the projection has a part in."""
     order = jnp.arange(SLOTS)
-    out = project(gaussians, camera, COMPAT, order, num_active(gaussians))
-    parts = (out.u, out.v, jnp.log(out.inv_sx), out.slope, jnp.log(out.inv_sy))
-    rows = jnp.stack([*parts, jnp.log(out.var_y), *out.colors])
+    inputs, count = Inputs(gaussians, camera), num_active(gaussians)
+    footprint, splat, channels = ELLIPSOID.project(inputs, COMPAT, order, count)
+    inv_sx, slope, inv_sy, _ = splat.shape
+    parts = (splat.u, splat.v, jnp.log(inv_sx), slope, jnp.log(inv_sy))
+    rows = jnp.stack([*parts, jnp.log(footprint.var_y), *channels.colors])
     return jnp.sum(weigh * rows)
 
 
@@ -205,7 +208,8 @@ def off_axis(full: bool) -> Measured:
 @jax.jit
 def _covariances(gaussians: Gaussians, camera: Camera) -> tuple[jax.Array, ...]:
     """Of the slots: xx, xy, yy of the projection, and whether it is drawn."""
-    out = project(gaussians, camera, COMPAT, jnp.arange(SLOTS), num_active(gaussians))
+    inputs, count = Inputs(gaussians, camera), num_active(gaussians)
+    out = ELLIPSOID.project(inputs, COMPAT, jnp.arange(SLOTS), count).footprint
     xx = 1 / jnp.square(out.inv_sx)
     return xx, xx * out.slope, out.var_y, out.reach > 0
 

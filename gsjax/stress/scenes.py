@@ -28,7 +28,7 @@ WIDE = 125
 COMPAT = RasterConfig(num_size_buckets=1, devices=1, pair_capacity=WIDE * 16)
 # No threshold that an error of rounding could carry a whole Gaussian across.
 SMOOTH = COMPAT.replace(
-    alpha_min=1e-6, alpha_max=1 - 1e-6, stop=0.0, outputs=("alpha",)
+    alpha_min=1e-6, alpha_max=1 - 1e-6, transmittance_min=0.0, outputs=("alpha",)
 )
 BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
 # A pixel this near a threshold, relatively, may rightly differ by a whole Gaussian.

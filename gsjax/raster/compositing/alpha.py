@@ -1,10 +1,10 @@
-"""α of Gaussians at pixels, with a derivative of its own, and the absolute gradient.
+"""α of splats at pixels, with a derivative rule, and the absolute gradient.
 
 Axis legend: G tiles of a step, K Gaussians of a chunk, P pixels of a tile.
 
-α is one elementwise kernel forward. Its derivative is α times that of log α, a
-quadratic polynomial of the pixel: so what comes back from the pixels to a Gaussian is
-six moments, one matrix product [G K, P] × [P, 6].
+α is one elementwise kernel. In the Gaussian form its derivative is α times that of
+log α, a quadratic polynomial of the pixel. So the cotangents of all pixels reduce to
+six moments per Gaussian, by one matrix product [G K, P] × [P, 6].
 """
 
 from functools import partial
@@ -21,42 +21,79 @@ _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
 
 
 def pixel_centres(tile: int, dtype) -> np.ndarray:
-    """[2, P] x and y of the pixels of a tile, from its upper left corner.
+    """Return x and y [2, P] of the pixels of a tile, from its upper left corner.
 
-    A constant, each row contiguous: as part of the kernels it costs nothing.
+    A host constant with contiguous rows: as part of the kernels it costs nothing.
     """
     centre = np.arange(tile) + 0.5
     y, x = np.meshgrid(centre, centre, indexing="ij")
     return np.stack([x.ravel(), y.ravel()]).astype(dtype)
 
 
+def alphas(
+    splats: tuple[Array, ...],
+    pixels: np.ndarray,
+    config: RasterConfig,
+    alpha_min: Array | None = None,
+) -> Array:
+    """Return α [G, K, P] of Gaussians at the pixels of their tiles.
+
+    Args:
+      splats: [G, K] each: the numbers of `Splat.shape`, then the centre's x, y relative
+        to the corner of the tile.
+      pixels: [2, P] x and y, relative to the corner as well.
+      config: primitive, alpha_max and alpha_min are used.
+      alpha_min: [] in place of that of ``config``, or None.
+    """
+    primitive = config.primitive
+    if primitive is not None and primitive.alpha is not None:
+        *shape, x, y = (value[..., None] for value in splats)
+        raw = primitive.alpha(tuple(shape), pixels[0] - x, pixels[1] - y)
+        return _limited(raw, config, alpha_min)
+    if alpha_min is not None:
+        return _limited(_gaussian(splats, pixels), config, alpha_min)
+    return _gaussian_alphas(splats, pixels, config)
+
+
+def _limited(raw: Array, config: RasterConfig, alpha_min: Array | None) -> Array:
+    """Apply the upper and the lower limit of α."""
+    lowest = config.alpha_min if alpha_min is None else alpha_min
+    capped = jnp.where(raw < config.alpha_max, raw, config.alpha_max)
+    return jnp.where(capped >= lowest, capped, 0)
+
+
 def _offsets(splats: tuple[Array, ...], pixels: np.ndarray) -> tuple[Array, Array]:
-    """y1, y2 [G, K, P] of Gaussians at the pixels [2, P], x and y."""
+    """Return y1, y2 [G, K, P] of Gaussians at the pixels [2, P]."""
     inv_sx, slope, inv_sy, _, x, y = (value[..., None] for value in splats)
     dx, dy = pixels[0] - x, pixels[1] - y
     return inv_sx * dx, inv_sy * (dy - slope * dx)
 
 
+def _gaussian(splats: tuple[Array, ...], pixels: np.ndarray) -> Array:
+    y1, y2 = _offsets(splats, pixels)
+    return splats[3][..., None] * exp_negative(-0.5 * (y1 * y1 + y2 * y2))
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(1, 2))
-def alphas(
+def _gaussian_alphas(
     splats: tuple[Array, ...], pixels: np.ndarray, config: RasterConfig
 ) -> Array:
-    """α [G, K, P] of Gaussians at the pixels of their tiles.
+    return _limited(_gaussian(splats, pixels), config, None)
 
-    Args:
-      splats: [G, K] each: inv_sx, slope, inv_sy, opacity, and the mean's x, y relative
-        to the corner of the tile.
-      pixels: [2, P] x and y, relative to the corner as well.
-      config: its cap and its cut.
-    """
-    y1, y2 = _offsets(splats, pixels)
-    raw = splats[3][..., None] * exp_negative(-0.5 * (y1 * y1 + y2 * y2))
-    capped = jnp.where(raw < config.alpha_max, raw, config.alpha_max)
-    return jnp.where(capped >= config.alpha_min, capped, 0)
+
+@_gaussian_alphas.defjvp
+def _gaussian_alphas_jvp(pixels, config, primals, tangents):
+    """dα = α d(log α); zero at or above the upper limit and below the lower one."""
+    alpha = _gaussian_alphas(primals[0], pixels, config)
+    half = config.tile_size / 2
+    polynomial = partial(_log_coefficients, half)
+    _, rate = jax.jvp(polynomial, primals[0], tangents[0])
+    rate = _einsum("gkm,mp->gkp", rate, _monomials(half, pixels))
+    return alpha, jnp.where(alpha < config.alpha_max, alpha, 0) * rate
 
 
 def _log_coefficients(half: float, *splats: Array) -> Array:
-    """[G, K, 6]: log α as a polynomial of `_monomials`."""
+    """Return log α as coefficients [G, K, 6] of `_monomials`."""
     inv_sx, slope, inv_sy, opacity, x, y = splats
     x, y = x - half, y - half
     # y1 = a · (x, 1) and y2 = b · (x, y, 1).
@@ -75,22 +112,12 @@ def _log_coefficients(half: float, *splats: Array) -> Array:
 
 
 def _monomials(half: float, pixels: np.ndarray) -> np.ndarray:
-    """[6, P]: x², xy, y², x, y, 1 of the pixels, from the middle of the tile: there
-    the terms of a sum cancel least.
+    """Return x², xy, y², x, y, 1 [6, P] of the pixels, from the middle of the tile.
+
+    Around the middle the terms of the sum cancel least.
     """
     x, y = pixels - half
     return np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)])
-
-
-@alphas.defjvp
-def _alphas_jvp(pixels, config, primals, tangents):
-    """dα = α d(log α); at the cap, and at the tie with it, and below the cut, zero."""
-    alpha = alphas(primals[0], pixels, config)
-    half = config.tile_size / 2
-    polynomial = partial(_log_coefficients, half)
-    _, rate = jax.jvp(polynomial, primals[0], tangents[0])
-    rate = _einsum("gkm,mp->gkp", rate, _monomials(half, pixels))
-    return alpha, jnp.where(alpha < config.alpha_max, alpha, 0) * rate
 
 
 def collect_absolute(
@@ -100,15 +127,15 @@ def collect_absolute(
     probe: Array,
     config: RasterConfig,
 ) -> Array:
-    """``alpha`` [G, K, P], which is `alphas` of the rest, unchanged.
+    """Return ``alpha`` [G, K, P] unchanged.
 
-    As the gradient by ``probe`` [G, K, 2] comes Σ over pixels of |∂L/∂mean|.
+    The gradient by ``probe`` [G, K, 2] is Σ over pixels of |∂L/∂mean|.
     """
     return _collect(alpha, splats, probe, pixels, config)
 
 
 def _slopes_by_mean(alpha, splats, pixels, config) -> tuple[Array, Array]:
-    """∂α/∂x and ∂α/∂y [G, K, P], the mean's x and y."""
+    """Return ∂α/∂x and ∂α/∂y [G, K, P] by the centre's x and y."""
     inv_sx, slope, inv_sy, *_ = (value[..., None] for value in splats)
     y1, y2 = _offsets(splats, pixels)
     free = jnp.where(alpha < config.alpha_max, alpha, 0)
@@ -117,7 +144,6 @@ def _slopes_by_mean(alpha, splats, pixels, config) -> tuple[Array, Array]:
 
 @partial(jax.custom_vjp, nondiff_argnums=(3, 4))
 def _collect(alpha, splats, probe, pixels, config) -> Array:
-    """``alpha``; the probe receives the sums of |slope · cotangent|."""
     del splats, probe, pixels, config
     return alpha
 

@@ -1,181 +1,172 @@
-"""Front-to-back compositing of sorted tile lists on a CPU, and which way it goes; see
-`gsjax.raster.compositing.parallel` for accelerators.
+"""The one place that chooses a compositing kernel, for every platform.
 
-Gaussian by Gaussian (`gsjax.raster.compositing.fused`), and back so for a gradient
-(`gsjax.raster.compositing.fused_vjp`), where XLA makes one kernel of that. Else chunk by chunk
-(`gsjax.raster.compositing.chunked`), as what is differentiated forward, or more than once, always
-goes: then JAX differentiates, and both ways agree to rounding.
+`COMPOSITORS` lists the kernels in order of preference. A kernel that JAX differentiates
+runs as it stands. A kernel with a reverse pass of its own runs with a rule: gradients
+go through its reverse pass; forward mode, second order and everything beyond go through
+the first kernel that JAX differentiates, so that all of them agree to rounding.
 
 Axis legend: T tiles, P pixels of a tile, C channels, R ranks.
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 from jax.custom_batching import sequential_vmap
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 
-from gsjax.raster.compositing import fused, fused_vjp
-from gsjax.raster.compositing.chunked import composite_chunks, composite_steps
-from gsjax.raster.compositing.fused import Residuals, composite_fused
-from gsjax.raster.compositing.schedules import Schedule
-from gsjax.raster.lists.binning import Grid, Lists
-from gsjax.raster.types import Array, Projected, RasterConfig
+from gsjax.raster.compositing.chunked import CHUNKED
+from gsjax.raster.compositing.fused_vjp import FUSED
+from gsjax.raster.compositing.parallel import PARALLEL
+from gsjax.raster.compositing.types import Compositor, Images, Task, Tiles
+from gsjax.raster.types import Array, Channels, Splat
 from gsjax.runtime.custom_transpose import custom_transpose, jvp_of_active
 
-# Under `jax.vmap`: side by side each would wait for the longest, and every turn of a
-# loop copy the images of all.
+COMPOSITORS = (FUSED, CHUNKED, PARALLEL)
+
+# Under `jax.vmap`, side by side, each element would wait for the longest, and every
+# turn of a loop would copy the images of all.
 _one_by_one = sequential_vmap
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6))
-def composite(
-    projected: Projected,
-    lists: Lists,
-    schedule: Schedule,
-    device: Array,
-    grid: Grid,
-    room: int,
-    config: RasterConfig,
-) -> dict[str, Array]:
-    """Images of one device's tiles, before the background.
+def choose(task: Task) -> Compositor:
+    """Return the kernel that draws."""
+    return next(each for each in COMPOSITORS if each.suits(task))
+
+
+def choose_differentiable(task: Task) -> Compositor:
+    """Return the kernel that JAX differentiates."""
+    return next(x for x in COMPOSITORS if x.differentiable and x.suits(task))
+
+
+def choose_for_gradient(task: Task) -> Compositor:
+    """Return the kernel whose reverse pass a gradient goes through."""
+    chosen = choose(task)
+    own = chosen.reverse is not None and chosen.reverse.suits(task)
+    return chosen if own else choose_differentiable(task)
+
+
+def composite(tiles: Tiles, task: Task) -> tuple[Images, Array]:
+    """Return the images of one device's tiles, and the pair capacity needed.
 
     Args:
-      projected: [R].
-      lists: of the tiles.
-      schedule: of the lists.
-      device: [] its number.
-      grid: its tiles.
-      room: steps there is room for where a derivative is taken.
-      config: static settings.
+      tiles: what is composited.
+      task: static description.
 
     Returns:
-      "sums" [T, C, P]: colour, depth where asked for, alpha; "median" [T, P] where
-      asked for. T in the grid's order.
+      Images before the background; see `Compositor`. [] int32 pair capacity.
     """
-    del room
+    chosen = choose(task)
+    needed = choose_for_gradient(task).capacity(tiles.lists, task)
+    if chosen.differentiable is chosen.forward:
+        return chosen.forward(tiles, task), needed
+    return _composite(tiles, task), needed
 
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _composite(tiles: Tiles, task: Task) -> Images:
     @_one_by_one
-    def one(projected, lists, schedule, device):
-        if fused.suits(*_sizes(projected), grid):
-            return composite_fused(projected, lists, device, grid, config)[0]
-        return composite_chunks(projected, lists, schedule, device, grid, config)
+    def one(tiles):
+        return choose(task).forward(tiles, task)
 
-    return one(projected, lists, schedule, device)
+    return one(tiles)
 
 
-@partial(composite.defjvp, symbolic_zeros=True)
-def _composite_jvp(grid, room, config, primals, tangents):
-    """By what is differentiated alone."""
-    projected, lists, schedule, device = primals
-    leaves, tree = jax.tree.flatten(primals)
-    slopes = tree.flatten_up_to(tangents)
+@partial(_composite.defjvp, symbolic_zeros=True)
+def _composite_jvp(task, primals, tangents):
+    (tiles,) = primals
+    leaves, tree = jax.tree.flatten(tiles)
+    slopes = tree.flatten_up_to(tangents[0])
+    own = choose_for_gradient(task) is choose(task)
+    automatic = _automatic(task._replace(room_for_all=own))
 
     def stepped(*leaves):
-        projected, lists, schedule, device = jax.tree.unflatten(tree, leaves)
-        return composite_steps(projected, lists, schedule, device, grid, room, config)
+        return automatic(jax.tree.unflatten(tree, leaves))
 
-    if not fused_vjp.suits(*_sizes(projected), grid, config):
+    if not own:
         return jvp_of_active(stepped, leaves, slopes, SymbolicZero)
-    images, kept = _keeping(projected, lists, schedule, device, grid, room, config)
-    moving = [i for i, s in enumerate(slopes) if not isinstance(s, SymbolicZero)]
-    count, by = len(leaves), _kinds(moving)
-    kept, of_kept = jax.tree.flatten(kept)
+    images, residuals = _with_residuals(tiles, task)
+    active = [i for i, s in enumerate(slopes) if not isinstance(s, SymbolicZero)]
+    count, kinds = len(leaves), _kinds(tiles, active)
+    residuals, of_residuals = jax.tree.flatten(residuals)
 
     def forward(*values):
-        slopes = dict(zip(moving, values[count + len(kept) :]))
+        slopes = dict(zip(active, values[count + len(residuals) :]))
         slopes = [slopes.get(i) for i in range(count)]
         return [jvp_of_active(stepped, values[:count], slopes, type(None))[1]["sums"]]
 
     def transpose(*values):
-        primals = jax.tree.unflatten(tree, values[:count])
-        kept = jax.tree.unflatten(of_kept, values[count:-1])
-        back = _pulled_back(*primals, kept, values[-1], grid, room, config, by)
-        return [jax.tree.leaves(back)[i] for i in moving]
+        tiles = jax.tree.unflatten(tree, values[:count])
+        residuals = jax.tree.unflatten(of_residuals, values[count:-1])
+        back = _backward(tiles, residuals, values[-1], task, kinds)
+        return [jax.tree.leaves(back)[i] for i in active]
 
-    slopes = [slopes[i] for i in moving]
-    like = [images["sums"]]
-    (sums,) = custom_transpose(forward, transpose, (*leaves, *kept), slopes, like)
+    slopes, like = [slopes[i] for i in active], [images["sums"]]
+    (sums,) = custom_transpose(forward, transpose, (*leaves, *residuals), slopes, like)
     return images, {"sums": sums}
 
 
-def _sizes(projected: Projected) -> tuple[int, int]:
-    """(Colours, bytes of a number)."""
-    return projected.colors.shape[0], projected.u.dtype.itemsize
+def _automatic(task: Task):
+    """Return the kernel that JAX differentiates, as a function of `Tiles`."""
+    differentiable = choose_differentiable(task).differentiable
+    assert differentiable is not None
+    return partial(differentiable, task=task)
 
 
-def _kinds(moving: list[int]) -> frozenset[str]:
-    """What `fused_vjp.vjp` is asked for, given which fields of `Projected`, its
-    probe None, are differentiated by."""
-    fields = {Projected._fields[i] for i in moving}
-    channels = {"colors", "depth"}
-    kinds = {"splats": fields - channels, "channels": fields & channels}
-    return frozenset(kind for kind, some in kinds.items() if some)
+def _kinds(tiles: Tiles, active: list[int]) -> frozenset[str]:
+    """Return the kinds of cotangents needed, from the indices of active leaves."""
+    of_splat = len(jax.tree.leaves(tiles.splat))
+    kinds = {"splats" if i < of_splat else "channels" for i in active}
+    return frozenset(kinds)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(4, 5, 6))
-def _keeping(
-    projected: Projected,
-    lists: Lists,
-    schedule: Schedule,
-    device: Array,
-    grid: Grid,
-    room: int,
-    config: RasterConfig,
-) -> tuple[dict[str, Array], Residuals]:
-    """`composite`, one by one, and what the way back needs, of which no derivative is
-    taken."""
-    del schedule, room
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _with_residuals(tiles: Tiles, task: Task) -> tuple[Images, Any]:
+    """Return the images and the residuals, of which no derivative is taken."""
+    reverse = choose(task).reverse
+    assert reverse is not None
 
     @_one_by_one
-    def one(projected, lists, device):
-        return composite_fused(projected, lists, device, grid, config, keeping=True)
+    def one(tiles):
+        return reverse.forward(tiles, task)
 
-    return one(projected, lists, device)
-
-
-@partial(_keeping.defjvp, symbolic_zeros=True)
-def _keeping_jvp(grid, room, config, primals, tangents):
-    images, kept = _keeping(*primals, grid, room, config)
-    _, slopes = _composite_jvp(grid, room, config, primals, tangents)
-    return (images, kept), (slopes, jax.tree.map(zero_from_primal, kept))
+    return one(tiles)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(6, 7, 8, 9))
-def _pulled_back(
-    projected: Projected,
-    lists: Lists,
-    schedule: Schedule,
-    device: Array,
-    kept: Residuals,
-    cotangent: Array,
-    grid: Grid,
-    room: int,
-    config: RasterConfig,
-    by: frozenset[str],
-) -> Projected:
-    """`fused_vjp.vjp`, whose own derivative is that of the steps."""
-    del schedule, room
+@partial(_with_residuals.defjvp, symbolic_zeros=True)
+def _with_residuals_jvp(task, primals, tangents):
+    images, residuals = _with_residuals(*primals, task)
+    _, slopes = _composite_jvp(task, primals, tangents)
+    return (images, residuals), (slopes, jax.tree.map(zero_from_primal, residuals))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(3, 4))
+def _backward(
+    tiles: Tiles, residuals: Any, cotangent: Array, task: Task, kinds: frozenset[str]
+) -> tuple[Splat, Channels]:
+    """Return the reverse pass; its own derivative is that of the automatic kernel."""
+    reverse = choose(task).reverse
+    assert reverse is not None
 
     @_one_by_one
-    def one(projected, lists, device, kept, cotangent):
-        given = projected, lists, device, kept, cotangent
-        return fused_vjp.vjp(*given, grid, config, by)
+    def one(tiles, residuals, cotangent):
+        return reverse.backward(tiles, residuals, cotangent, task, kinds)
 
-    return one(projected, lists, device, kept, cotangent)
+    return one(tiles, residuals, cotangent)
 
 
-@_pulled_back.defjvp
-def _pulled_back_jvp(grid, room, config, by, primals, tangents):
-    projected, lists, schedule, device, _, cotangent = primals
+@_backward.defjvp
+def _backward_jvp(task, kinds, primals, tangents):
+    tiles, _, cotangent = primals
+    automatic = _automatic(task._replace(room_for_all=True))
 
-    def by_transpose(projected, cotangent):
-        def sums(projected):
-            given = projected, lists, schedule, device
-            return composite_steps(*given, grid, room, config)["sums"]
+    def by_transpose(splat, channels, cotangent):
+        def sums(splat, channels):
+            return automatic(tiles._replace(splat=splat, channels=channels))["sums"]
 
-        return jax.vjp(sums, projected)[1](cotangent)[0]
+        return jax.vjp(sums, splat, channels)[1](cotangent)
 
-    given, slopes = (projected, cotangent), (tangents[0], tangents[-1])
-    back = _pulled_back(*primals, grid, room, config, by)
+    given = tiles.splat, tiles.channels, cotangent
+    slopes = tangents[0].splat, tangents[0].channels, tangents[2]
+    back = _backward(*primals, task, kinds)
     return back, jax.jvp(by_transpose, given, slopes)[1]

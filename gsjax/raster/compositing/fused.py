@@ -1,10 +1,10 @@
 """Fused compositing on CPUs, Gaussian by Gaussian: one compiled kernel.
 
-For each tile, for each Gaussian of its list, until no pixel of the tile is open. It needs
-no schedule, looks up each Gaussian when it is due, and keeps the sums of a tile in the
-nearest cache. It is fast if XLA makes one kernel of the loops (`gsjax.runtime.loops`),
-which it does for turns of this size only in a process that was started so
-(`gsjax.runtime.devices`); `suits` tells. Its reverse pass is `fused_vjp`.
+For each tile, for each Gaussian of its list, until no pixel of the tile is open. It
+needs no schedule, looks up each Gaussian when it is due, and keeps the sums of a tile
+in the nearest cache. It is fast if XLA makes one kernel of the loops
+(`gsjax.runtime.loops`), which it does for turns of this size only in a process that was
+started so (`gsjax.runtime.devices`); `suits` tells. Its reverse pass is `fused_vjp`.
 
 This file and `fused_vjp` can be removed together with the entry in `compositor`.
 
@@ -62,7 +62,7 @@ class Reading(NamedTuple):
     alpha_min: Array | None
 
     def row(self, place: Array, end: Array) -> tuple[Array, Array]:
-        """Return (rank [1], row [columns]) at ``place`` [1]; the empty one from ``end``."""
+        """Return (rank [1], row [columns]) at ``place``; the empty one from ``end``."""
         none = self.rows.shape[0] - 1
         rank = part_at(self.ranks, (place[0],), (1,))
         rank = jnp.where(place < end, rank, none)

@@ -1,16 +1,16 @@
-"""Compositing for accelerators: the chunks of all tiles side by side.
+"""Parallel compositing for accelerators: the chunks of all tiles side by side.
 
-A loop through the lists waits at every turn for launches, as often as the longest list
-has chunks, and most tiles wait for the longest. So here each chunk of a list is
-blended by itself, many at a time, and then joined with what is in front of it:
+A loop through the lists would wait for launches as often as the longest list has
+chunks, and most tiles would wait for the longest. So each chunk of a list is blended by
+itself, many at a time, and then joined with the chunks in front of it:
 
     (C₁, T₁) ∘ (C₂, T₂) = (C₁ + T₁ C₂, T₁ T₂).
 
-Where a pixel stops goes by what is in front. So the transmittance of every chunk is
-found first, by itself and without derivative; what lies behind pixels that have all
-stopped is left out of the second pass, which blends, and is differentiated as it
-stands. No sum depends on the order in which threads come: pictures are the same bit for
-bit, where gradients, which are scattered to the Gaussians, are not.
+Where a pixel stops depends on what is in front. So the transmittance of every chunk is
+found first, without derivative; chunks behind pixels that have all stopped are left out
+of the second pass, which blends and is differentiated by JAX. No sum depends on the
+order of threads: images are reproducible bit for bit. Gradients are scattered to the
+Gaussians and are not.
 
 Axis legend: E entries (chunks of lists), B entries of a batch, K Gaussians of a chunk,
 P pixels of a tile, C channels, T tiles, R ranks.
@@ -33,7 +33,14 @@ from gsjax.raster.compositing.blending import (
     sums_behind,
 )
 from gsjax.raster.compositing.schedules import ranks_at
-from gsjax.raster.lists.binning import Grid, Lists, corners
+from gsjax.raster.compositing.types import (
+    Compositor,
+    Images,
+    Task,
+    Tiles,
+    listed_pairs,
+)
+from gsjax.raster.lists.binning import Grid, corners
 from gsjax.raster.lists.counting import (
     compact_indices,
     cumulative_sum,
@@ -41,20 +48,23 @@ from gsjax.raster.lists.counting import (
     take,
 )
 from gsjax.raster.size_buckets import run_at_bucket
-from gsjax.raster.types import Array, Projected, RasterConfig
+from gsjax.raster.types import Array, RasterConfig
 from gsjax.raster.vmap_branching import any_in_batch
 
 T = TypeVar("T")
 
-_BATCH = 2**25  # Gaussians at pixels, half a gigabyte at work: launches are then few
+_BATCH = 2**25  # Gaussians at pixels in a batch; half a gigabyte, few launches
+# Numbers of a Gaussian in a chunk beside its channels, and how many more the backward
+# pass makes of it; numbers of a Gaussian at a pixel while a chunk is blended.
+_IN_CHUNK, _IN_CHUNK_BACKWARD, _IN_STEP = 7, 8, 3
 
 
 class Entries(NamedTuple):
     """Chunks of lists, those of a tile one after another, front to back; [E] each.
 
     Attributes:
-      tile: whose; T past the last.
-      level: which chunk of its list.
+      tile: tile of the list; T past the last entry.
+      level: number of the chunk in its list.
     """
 
     tile: Array
@@ -62,32 +72,19 @@ class Entries(NamedTuple):
 
 
 def entry_capacity(capacity: int, grid: Grid, chunk: int) -> int:
-    """Entries that lists of ``capacity`` pairs come to, at most."""
+    """Return the largest number of entries of lists with ``capacity`` pairs."""
     return capacity // chunk + grid.tiles
 
 
 def batch_size(config: RasterConfig) -> int:
-    """B: 16,384 with 8 × 8 pixels and 32 Gaussians."""
+    """Return B: 16,384 with 8 × 8 pixels and 32 Gaussians."""
     each = config.chunk_size * config.tile_size**2
     return config.tiles_per_step or max(1, _BATCH // each)
 
 
-def composite_parallel(
-    projected: Projected, lists: Lists, device: Array, grid: Grid, config: RasterConfig
-) -> dict[str, Array]:
-    """Images of one device's tiles, before the background.
-
-    Args:
-      projected: [R].
-      lists: of the tiles.
-      device: [] its number.
-      grid: its tiles.
-      config: static settings.
-
-    Returns:
-      "sums" [T, C, P]: colour, depth where asked for, alpha; "median" [T, P] where
-      asked for.
-    """
+def composite_parallel(tiles: Tiles, task: Task) -> Images:
+    """Composite all chunks side by side; see `Compositor.differentiable`."""
+    config, grid, lists = task.config, task.grid, tiles.lists
     room = entry_capacity(lists.ranks.shape[0], grid, config.chunk_size)
     length = jnp.where(lists.fit, lists.length, 0)
     chunks = -(-length // config.chunk_size)
@@ -95,12 +92,12 @@ def composite_parallel(
     tile = segment_ids(ends, room)
     level = lax.iota(jnp.int32, room) - take(ends - chunks, tile)
     entries = Entries(tile, level)
-    columns = columns_of(projected, config)
+    columns = columns_of(tiles.splat, tiles.channels, config)
     tables = Parts(**{name: jnp.stack(some, -1) for name, some in columns.items()})
-    chunk_of = partial(_chunk_of, lists=lists, device=device, grid=grid, config=config)
+    chunk_of = partial(_chunk_of, tiles=tiles, task=task)
     bare = lax.stop_gradient(tables)
-    carried, left = _transmittances(bare, entries, chunk_of, grid, config)
-    live = jnp.any(carried > config.stop, axis=1) & (tile < grid.tiles)
+    carried, left = _transmittances(bare, entries, chunk_of, tiles, task)
+    live = jnp.any(carried > config.transmittance_min, axis=1) & (tile < grid.tiles)
     index, count = compact_indices(live, room)
     # The last of each tile that is live: the first is, wherever there is one.
     last = jnp.where(chunks > 0, take(cumulative_sum(live), ends - 1) - 1, room)
@@ -111,7 +108,7 @@ def composite_parallel(
         tile_of = jnp.where(there, tile.at[some].get(mode="clip"), grid.tiles)
         mine = Entries(tile_of, take(level, some))
         through = take(carried, some), take(left, some)
-        added = _blended(tables, mine, through, chunk_of, grid, config)
+        added = _blended(tables, mine, through, chunk_of, tiles, task)
         sums = {"sums": _along_lists(jnp.add, mine, added["sums"])}
         if "median" in added:
             sums["median"] = _along_lists(_first, mine, added["median"])
@@ -120,47 +117,42 @@ def composite_parallel(
     return run_at_bucket(count, room, max(1, config.num_size_buckets - 1), of_size)
 
 
-def _chunk_of(
-    tables: Parts,
-    entries: Entries,
-    lists: Lists,
-    device: Array,
-    grid: Grid,
-    config: RasterConfig,
-) -> Chunk:
-    """What is to be blended, [E, K, …]; zeros, so opacity 0, past the end of a list."""
+def _chunk_of(tables: Parts, entries: Entries, tiles: Tiles, task: Task) -> Chunk:
+    """Return the chunks [E, K, …]; zeros, so opacity 0, past the end of a list."""
     # Past the last row, so that no gradient goes to one: threads would wait there.
     none = tables.splats.shape[0]
-    tile = entries.tile[:, None]
-    ranks = ranks_at(lists, tile, entries.level, config.chunk_size, none)[:, 0]
+    tile, size = entries.tile[:, None], task.config.chunk_size
+    ranks = ranks_at(tiles.lists, tile, entries.level, size, none)[:, 0]
     parts = jax.tree.map(lambda table: take(table, ranks), tables)
-    return Chunk(parts, corners(entries.tile, grid, device, tables.splats.dtype))
+    corner = corners(entries.tile, task.grid, tiles.device, tables.splats.dtype)
+    return Chunk(parts, corner)
 
 
 def _transmittances(
     tables: Parts,
     entries: Entries,
     chunk_of: Callable[[Parts, Entries], Chunk],
-    grid: Grid,
-    config: RasterConfig,
+    tiles: Tiles,
+    task: Task,
 ) -> tuple[Array, Array]:
-    """Transmittance [E, P] in front of each entry, and that behind it: what is behind
-    one is, bit for bit, in front of the next.
+    """Return the transmittance [E, P] in front of each entry, and that behind it.
 
-    By logarithms: their sums, in whatever order, are off by less than products of 1 − α
-    where there are many faint Gaussians.
+    The value behind an entry is, bit for bit, the value in front of the next. Sums of
+    logarithms are off by less, in any order, than products of 1 − α over many faint
+    Gaussians.
     """
+    grid, config, alpha_min = task.grid, task.config, tiles.channels.alpha_min
     bare = Parts(tables.splats, tables.channels[:, :0])
     pixels = pixel_centres(grid.tile, tables.splats.dtype)
 
     def through(entries: Entries) -> Array:
-        alpha = alphas_of(chunk_of(bare, entries), pixels, config)
+        alpha = alphas_of(chunk_of(bare, entries), pixels, config, alpha_min)
         return jnp.sum(jnp.log1p(-alpha), axis=1)
 
     there = entries.tile < grid.tiles
     log_total = _in_batches(through, there, entries, batch_size(config))
     left = jnp.exp(_along_lists(jnp.add, entries, log_total))
-    # Else what is asked of it would be computed anew from the steps of the sum.
+    # Without a barrier its users would compute it again from the steps of the sum.
     left = lax.optimization_barrier(left)
     return _before(entries, left, 1), left
 
@@ -170,17 +162,20 @@ def _blended(
     entries: Entries,
     through: tuple[Array, Array],
     chunk_of: Callable[[Parts, Entries], Chunk],
-    grid: Grid,
-    config: RasterConfig,
+    tiles: Tiles,
+    task: Task,
 ) -> dict[str, Array]:
-    """What each entry adds to its tile's image, [E, …]; ``through`` as of
-    `_transmittances`."""
+    """Return what each entry adds to its tile's image, [E, …].
+
+    ``through`` is the result of `_transmittances`.
+    """
+    grid, config, alpha_min = task.grid, task.config, tiles.channels.alpha_min
     pixels = pixel_centres(grid.tile, tables.splats.dtype)
 
     @jax.checkpoint
     def blend(inputs) -> tuple[Array, dict[str, Array]]:
         (carried, left), chunk = inputs
-        alpha = alphas_of(chunk, pixels, config)
+        alpha = alphas_of(chunk, pixels, config, alpha_min)
         return sums_behind(carried, alpha, chunk.parts, config, left)
 
     # Ahead of the loop, so that the transpose is one scatter-add and not one a batch.
@@ -193,11 +188,10 @@ def _blended(
 
 @jax.custom_jvp
 def _in_front(total: Array, carried: Array, entries: Entries) -> Array:
-    """``carried`` [E, P], with its derivative by the transmittance ``total`` [E, P] of
-    each entry.
+    """Return ``carried`` [E, P], differentiable by the transmittance ``total`` [E, P].
 
-    dT_c = T_c Σ_{b<c} dT_b / T_b along a list. Where a factor is 0, what lies behind is
-    0 too, and stopped.
+    dT_c = T_c Σ_{b<c} dT_b / T_b along a list. Where a factor is 0, everything behind
+    it is 0 too, and stopped.
     """
     del total, entries
     return carried
@@ -212,7 +206,7 @@ def _in_front_jvp(primals, tangents):
 
 
 def _in_batches(run: Callable[[Any], T], needed: Array, inputs: Any, size: int) -> T:
-    """``run`` of ``size`` entries at a time, zeros where none of them is needed.
+    """Return ``run`` of ``size`` entries at a time, zeros where none of them is needed.
 
     Args:
       run: from arrays [B, …] to arrays [B, …].
@@ -241,7 +235,7 @@ def _in_batches(run: Callable[[Any], T], needed: Array, inputs: Any, size: int) 
 def _along_lists(
     join: Callable[[Array, Array], Array], entries: Entries, values: Array
 ) -> Array:
-    """What the values [E, …] come to along each list, each with those before it."""
+    """Accumulate values [E, …] along each list."""
     first = (entries.level == 0).reshape(-1, *[1] * (values.ndim - 1))
 
     def both(a, b):
@@ -251,12 +245,39 @@ def _along_lists(
 
 
 def _first(one: Array, other: Array) -> Array:
-    """Of two the first that there is. Where T rises by rounding, it falls through a
-    half once more."""
+    """Return the first of two values that is not 0.
+
+    T may rise by rounding and fall through a half twice.
+    """
     return jnp.where(one != 0, one, other)
 
 
 def _before(entries: Entries, values: Array, none: float) -> Array:
-    """Of values [E, P] those of the entry before; ``none`` at the first of a list."""
+    """Return the values [E, P] of the entry before; ``none`` at the first of a list."""
     moved = jnp.concatenate([jnp.zeros_like(values[:1]), values[:-1]])
     return jnp.where((entries.level == 0)[:, None], none, moved)
+
+
+def _memory(pairs: int, task: Task, gradients: bool) -> tuple[int, int]:
+    config, channels, pixels = task.config, task.channels, task.grid.tile**2
+    entries = entry_capacity(pairs, task.grid, config.chunk_size)
+    batch = min(batch_size(config), entries)
+    in_chunk = _IN_CHUNK + channels
+    kept = entries * (config.chunk_size * in_chunk + (2 + channels) * pixels)
+    step = batch * config.chunk_size * pixels
+    if not gradients:
+        return _IN_STEP * step + kept + entries * channels * pixels, kept
+    backward = config.chunk_size * (in_chunk + _IN_CHUNK_BACKWARD)
+    more = entries * (backward + 2 * channels * pixels)
+    return 2 * _IN_STEP * step + kept + more, kept
+
+
+PARALLEL = Compositor(
+    name="parallel",
+    suits=lambda _: True,
+    forward=composite_parallel,
+    differentiable=composite_parallel,
+    reverse=None,
+    capacity=listed_pairs,
+    memory=_memory,
+)

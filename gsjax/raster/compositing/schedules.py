@@ -1,5 +1,4 @@
-"""The list of work that the lists of tiles come to on a CPU: which chunk of which
-tiles, when.
+"""The work list of chunked compositing: which chunk of which tiles, when.
 
 A step is one chunk of K Gaussians for each of G tiles. Tiles are taken in order of list
 length, so the G tiles of a block need nearly the same number of steps and no tile waits
@@ -26,12 +25,12 @@ from gsjax.raster.types import Array, RasterConfig
 
 
 class Schedule(NamedTuple):
-    """Blocks of G tiles of like length, each taking ``levels`` steps.
+    """Blocks of G tiles of similar length, each taking ``levels`` steps.
 
     Attributes:
       tiles: [blocks, G]; places past the last tile hold T, whose list is empty.
       levels: [blocks] steps of each block, falling; all 0 if there is no room.
-      steps: [] how many are wanted, saturating.
+      steps: [] number of steps needed, saturating.
     """
 
     tiles: Array
@@ -40,7 +39,7 @@ class Schedule(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Which chunk of which block each step is, [S] each."""
+    """Block and chunk of each step, [S] each."""
 
     block: Array
     level: Array
@@ -50,10 +49,10 @@ class Work(NamedTuple):
     """The steps, [S] each; those of a block follow one another, front to back.
 
     Attributes:
-      ranks: [S, G, K] what to composite; R where there is none.
-      block: which block of tiles. Past the last step: one past the last block.
-      first: whether it is the first of its block.
-      live: whether there is anything to do.
+      ranks: [S, G, K] ranks to composite; R for none.
+      block: block of tiles; one past the last block for unused steps.
+      first: True for the first step of its block.
+      live: False for unused steps.
     """
 
     ranks: Array
@@ -63,16 +62,16 @@ class Work(NamedTuple):
 
 
 def tiles_per_step(config: RasterConfig, grid: Grid) -> int:
-    """G: few stay in a CPU's caches."""
+    """Return G; few tiles stay in a CPU's caches."""
     return max(1, min(config.tiles_per_step or 16, grid.tiles))
 
 
 def make_schedule(
     lists: Lists, grid: Grid, group: int, chunk: int, room: int
 ) -> Schedule:
-    """Tiles by falling length, in blocks of ``group``, ``chunk`` Gaussians a step.
+    """Return tiles by falling length, in blocks of ``group``, ``chunk`` ranks a step.
 
-    Nothing is to be done if there are more than ``room`` steps, or the lists did not
+    The schedule is empty if it needs more than ``room`` steps, or the lists did not
     fit.
     """
     blocks = -(-grid.tiles // group)
@@ -89,16 +88,29 @@ def make_schedule(
 
 
 def step_capacity(capacity: int, grid: Grid, group: int, chunk: int) -> int:
-    """Room for steps that goes with a pair capacity: as if every chunk were full but
-    for an eighth, and half a chunk more for each block.
+    """Return the steps that a pair capacity has room for.
+
+    Chunks are assumed to be full but for an eighth, and half a chunk more per block.
     """
     blocks = -(-grid.tiles // group)
     return -(-blocks // 2) + -(-9 * capacity // (8 * group * chunk))
 
 
+def most_steps(pairs: int, ranks: int, grid: Grid, group: int, chunk: int) -> int:
+    """Return an upper limit of the steps that any lists of ``pairs`` pairs need.
+
+    Tiles come by falling length. So the longest list of a block is at most the mean of
+    the block before, and that of the first block has at most all ranks.
+    """
+    blocks = -(-grid.tiles // group)
+    return blocks + min(pairs, ranks) // chunk + pairs // (group * chunk) + 1
+
+
 def pairs_for_steps(steps: Array, grid: Grid, group: int, chunk: int) -> Array:
-    """Smallest pair capacity whose `step_capacity` holds ``steps``, to a millionth;
-    saturating int32."""
+    """Return the smallest pair capacity whose `step_capacity` holds ``steps``.
+
+    Exact to a millionth; saturating int32.
+    """
     blocks = -(-grid.tiles // group)
     extra = jnp.maximum(steps - -(-blocks // 2), 0).astype(jnp.float32)
     above = (extra - 1) * (8 * group * chunk / 9) * (1 + 1e-6)
@@ -108,8 +120,14 @@ def pairs_for_steps(steps: Array, grid: Grid, group: int, chunk: int) -> Array:
 
 
 def ranks_at(lists: Lists, tile: Array, level: Array, chunk: int, none: int) -> Array:
-    """[..., G, K] ranks of a chunk of the tiles [..., G], its ``level`` [...]; ``none``
-    where there is none.
+    """Return the ranks [..., G, K] of a chunk of tiles [..., G]; ``none`` past the end.
+
+    Args:
+      lists: of the tiles.
+      tile: [..., G].
+      level: [...] number of the chunk in each list.
+      chunk: K.
+      none: rank that stands for no Gaussian.
     """
     offset = level[..., None, None] * chunk + lax.iota(jnp.int32, chunk)
     inside = offset < take(lists.length, tile)[..., None]
@@ -118,7 +136,7 @@ def ranks_at(lists: Lists, tile: Array, level: Array, chunk: int, none: int) -> 
 
 
 def make_steps(schedule: Schedule, room: int) -> Steps:
-    """Unroll the schedule into ``room`` steps; past the last, past the last block."""
+    """Unroll the schedule into ``room`` steps; unused ones lie past the last block."""
     ends = cumulative_sum(schedule.levels)
     block = segment_ids(ends, room)
     level = lax.iota(jnp.int32, room) - take(ends - schedule.levels, block)
@@ -128,7 +146,7 @@ def make_steps(schedule: Schedule, room: int) -> Steps:
 def make_work(
     lists: Lists, schedule: Schedule, steps: Steps, chunk: int, ranks: int, room: int
 ) -> Work:
-    """What the first ``room`` of the steps composite."""
+    """Return the work of the first ``room`` steps."""
     block, level = steps.block[:room], steps.level[:room]
     tile = schedule.tiles.at[block].get(mode="fill", fill_value=lists.length.shape[0])
     return Work(

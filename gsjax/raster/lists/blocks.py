@@ -1,9 +1,7 @@
-"""Work block by block: on each slot by itself (`by_blocks`), or one block after another
-with what those before came to (`over_blocks`).
+"""Work done block by block, so that its cost goes with the slots in use.
 
-What is paid then goes with the slots in use and not with the capacity. Made for what
-no derivative is taken of: a transposed loop would copy more than it saves. Nor are the
-blocks shared by devices: on CPU the exchange of what comes out costs as much.
+`by_blocks` treats each slot by itself; `over_blocks` carries a state from one block to
+the next. No derivative is taken here: a transposed loop would copy more than it saves.
 Accelerators, where a loop waits for its launches, take everything as one block.
 """
 
@@ -22,23 +20,23 @@ from gsjax.runtime.devices import on_cpu
 
 T = TypeVar("T")
 
-BLOCK = 8192  # slots; what they hold stays in a core's cache
+BLOCK = 8192  # slots; their values fit a core's cache
 
 
 def block_size(size: int, times: int = 1) -> int:
-    """Slots of a block, ``times`` the usual many, where there are ``size`` in all."""
+    """Return the slots of a block, ``times`` the usual number, at most ``size``."""
     cpu = on_cpu()
     return max(1, min(times * BLOCK, size) if cpu else size)
 
 
 def over_blocks(add: Callable[[Array, T], T], count: Array, block: int, state: T) -> T:
-    """``add(start, state)`` for each block of ``count`` slots, one after the other.
+    """Fold ``add(start, state)`` over the blocks of ``count`` slots.
 
     Args:
-      add: from the block's first slot [] int32, and what those before came to.
-      count: [] int32, known when it runs.
+      add: (first slot of the block [] int32, state) → state.
+      count: [] int32, number of slots.
       block: slots of a block.
-      state: before the first.
+      state: before the first block.
     """
     blocks = -(-count // block)
     return lax.fori_loop(0, blocks, lambda i, s: add(i * block, s), state)
@@ -47,10 +45,10 @@ def over_blocks(add: Callable[[Array, T], T], count: Array, block: int, state: T
 def by_blocks(
     run: Callable[..., T], skip: Callable[..., T], needed: Array, inputs
 ) -> T:
-    """``run(needed, inputs)``, and ``skip`` where a block holds nothing needed.
+    """Return ``run(needed, inputs)``, or ``skip`` for blocks without needed slots.
 
     Args:
-      run, skip: from arrays [K, …] to arrays [K, …] alike, element by element.
+      run, skip: element-wise functions of arrays [K, …] with results of equal shapes.
       needed: [N] bool.
       inputs: arrays [N, …].
 
@@ -71,8 +69,8 @@ def by_blocks(
         at = jnp.minimum(which[i] * block, size - block)
         part = partial(lax.dynamic_slice_in_dim, start_index=at, slice_size=block)
         some = jax.tree.map(part, (needed, inputs))
-        # A branch of its own, else XLA's CPU backend (jax 0.10.2) would cut the block
-        # out anew for each use of it.
+        # A branch of its own: else XLA's CPU backend (jax 0.10.2) slices the block
+        # again for each use.
         update = lax.cond(any_in_batch(jnp.any(some[0])), run, skip, *some)
         put = partial(lax.dynamic_update_slice_in_dim, start_index=at, axis=0)
         return jax.tree.map(lambda all_, more: put(all_, more), out, update)

@@ -1,6 +1,4 @@
-"""Sums of counts, the lists that they stand for, and what is looked up there. No
-derivative is taken here.
-"""
+"""Sums of counts, and indices that follow from them. No derivative is taken here."""
 
 import jax.numpy as jnp
 from jax import lax
@@ -9,30 +7,30 @@ from gsjax.raster.types import Array
 from gsjax.runtime import loops
 from gsjax.runtime.devices import on_cpu
 
-# A total above this is reported as 2^31 - 1: int32 sums must not wrap.
+# A total of this or more is reported as 2^31 - 1: int32 sums must not wrap.
 COUNT_LIMIT = 2**30
 
 
 def total_count(counts: Array) -> tuple[Array, Array]:
-    """Sum of int32 counts, saturating: (total, whether it is below `COUNT_LIMIT`)."""
+    """Return the saturating sum of int32 counts, and whether it is in range."""
     safe = jnp.sum(counts.astype(jnp.float32)) < COUNT_LIMIT
     total = jnp.sum(jnp.where(safe, counts, 0), dtype=jnp.int32)
     return jnp.where(safe, total, 2**31 - 1), safe
 
 
 def cumulative_sum(counts: Array) -> Array:
-    """Inclusive sums [n] int32 of counts [n]."""
+    """Return inclusive sums [n] int32 of counts [n]."""
     if on_cpu():
         return loops.cumulative_sum(counts.astype(jnp.int32))
     return jnp.cumsum(counts, dtype=jnp.int32)
 
 
 def segment_ids(ends: Array, room: int, start: Array | int = 0) -> Array:
-    """Whose item each is of ``room`` items from item ``start`` on.
+    """Return the segment of each of ``room`` items from item ``start`` on.
 
     Args:
-      ends: [n] int32, `cumulative_sum` of how many items each has.
-      room: how many to unroll.
+      ends: [n] int32, `cumulative_sum` of the numbers of items per segment.
+      room: number of items to unroll.
       start: [] the first of them.
 
     Returns:
@@ -42,8 +40,8 @@ def segment_ids(ends: Array, room: int, start: Array | int = 0) -> Array:
     if on_cpu():
         passed = jnp.zeros(room, jnp.int32).at[place].add(1, mode="drop")
         return cumulative_sum(passed)
-    # Here whoever writes to one place waits for the others: so each owner that has
-    # items is put where they begin, one to a place. It is the last that ends there.
+    # On accelerators threads that write to one place wait for each other. So each
+    # segment that has items is written once, to the place where they begin.
     following = jnp.append(place[1:], jnp.int32(2**31 - 1))
     place = jnp.where(place < following, place, room)
     owner = lax.iota(jnp.int32, ends.shape[0]) + 1
@@ -52,15 +50,15 @@ def segment_ids(ends: Array, room: int, start: Array | int = 0) -> Array:
 
 
 def compact_indices(chosen: Array, room: int) -> tuple[Array, Array]:
-    """Indices of what is chosen, together at the front.
+    """Return the indices where ``chosen`` is set, compacted to the front.
 
     Args:
       chosen: [n] bool.
-      room: for how many; of more, the first are kept.
+      room: number of indices; of more, the first are kept.
 
     Returns:
       index: [room] int32, rising; n past the last.
-      count: [] int32 of what is chosen, not limited to ``room``.
+      count: [] int32, number of set elements, not limited to ``room``.
     """
     size = chosen.shape[0]
     if on_cpu():
@@ -76,5 +74,5 @@ def compact_indices(chosen: Array, room: int) -> tuple[Array, Array]:
 
 
 def take(values: Array, index: Array) -> Array:
-    """``values`` at ``index``, 0 past the last."""
+    """Return ``values`` at ``index``; 0 past the end."""
     return values.at[index].get(mode="fill", fill_value=0)

@@ -1,12 +1,10 @@
 """Exact sorts by a single packed key without payload.
 
-On CPU a sort of keys alone is several times faster than one that carries a payload or
-compares twice, and the stable sort (by merging) faster than the other; on GPU sorts of
-keys alone are those that XLA hands to a radix sort where there are many (on an H200,
-jax 0.11.2, 24,576 keys of 32 bits and 187,500 of 64, but not 100,000 of those), and
-where there are few, to be stable costs it a second array. Where two parts fit into 32
-bits one uint32 is sorted, else one uint64, which is built inside `jax.enable_x64` so
-that it exists whatever the user's setting; both are exact.
+On CPUs a sort of keys alone is several times faster than one with a payload or two
+keys, and the stable sort (by merging) faster than the unstable one. On GPUs XLA hands
+large sorts of keys alone to a radix sort. Two parts that fit 32 bits are packed into
+one uint32, others into one uint64, built inside `jax.enable_x64` so that it exists
+whatever the user's setting. Both are exact.
 """
 
 from collections.abc import Sequence
@@ -24,20 +22,21 @@ _REST_BITS = 31
 
 
 def _sort(keys: Array) -> Array:
-    """Equal keys are the same, so their order is a matter of speed alone."""
+    """Sort keys; equal ones are identical, so stability only decides the speed."""
     return lax.sort(keys, is_stable=on_cpu())
 
 
 def bits_for(count: int) -> int:
-    """Bits that hold the numbers 0 to count - 1."""
+    """Return the number of bits that hold 0 to count − 1."""
     return max(1, (count - 1).bit_length())
 
 
 def pair_keys(
     high: Array, low: Array, high_count: int, low_count: int
 ) -> tuple[Array, ...]:
-    """What to sort by (high, low), both int32 ≥ 0 and below their counts: one key of
-    32 bits where they fit, else both.
+    """Return the keys that sort by (high, low), both int32 ≥ 0 and below their counts.
+
+    One key if both fit 32 bits, else two.
     """
     low_bits = bits_for(low_count)
     if bits_for(high_count) + low_bits <= 32:
@@ -46,7 +45,7 @@ def pair_keys(
 
 
 def sort_pairs(keys: Sequence[Array], low_count: int) -> Array:
-    """``low`` of `pair_keys`, sorted by (high, low)."""
+    """Return ``low`` of `pair_keys`, sorted by (high, low)."""
     if len(keys) == 2:
         return _sort_wide(*keys)
     mask = jnp.uint32(2 ** bits_for(low_count) - 1)
@@ -54,11 +53,11 @@ def sort_pairs(keys: Sequence[Array], low_count: int) -> Array:
 
 
 def argsort_float(values: Array, rest: Array | None = None) -> Array:
-    """Stable ascending order [n] of floats ≥ 0 or +inf; ties by index.
+    """Return the stable ascending order [n] of floats ≥ 0 or +inf; ties by index.
 
     Args:
       values: [n].
-      rest: [n] int32 of `split_float`, what float32 ``values`` lack; or None.
+      rest: [n] int32 of `split_float`, the part that float32 cannot hold; or None.
     """
     index = lax.iota(jnp.int32, values.shape[0])
     if values.dtype != jnp.float32:
@@ -67,8 +66,8 @@ def argsort_float(values: Array, rest: Array | None = None) -> Array:
     bits = lax.bitcast_convert_type(values, jnp.uint32)
     if rest is None:
         return _sort_wide(bits, index)
-    # 31 bits of the float and as many of the rest; the index takes the place of those
-    # that count least, beyond the two that are free.
+    # 31 bits of the float and 31 of the rest; the index replaces the lowest bits,
+    # beyond the two that are free.
     low_bits = bits_for(values.shape[0])
     with jax.enable_x64(True):
         wide = lax.convert_element_type(bits, jnp.uint64) << np.uint64(_REST_BITS)
@@ -83,41 +82,40 @@ def argsort_float(values: Array, rest: Array | None = None) -> Array:
 
 
 def split_float(values: Array) -> tuple[Array, Array]:
-    """float64 ``values`` ≥ 0 or +inf as float32, and what that lacks of them.
+    """Split float64 ``values`` ≥ 0 or +inf into a float32 and a remainder.
 
-    Within ``jax.enable_x64(True)``.
+    Call within ``jax.enable_x64(True)``.
 
     Returns:
-      The nearest float32, and int32 in units of 2⁻³¹ of the distance to the next. By
-      both `argsort_float` orders as by the float64, but for as many of those 31 bits
-      as the indices take beyond two: of a million values, to 2⁻³⁷ of each.
+      The nearest float32, and the remainder as int32 in units of 2⁻³¹ of the distance
+      to the next float32. `argsort_float` orders by both as by the float64, up to the
+      bits that indices take: to a relative 2⁻³⁷ for a million values.
     """
-    # By `lax.reduce_precision`: float64 to float32 and back is no rounding to XLA where
-    # it may keep excess precision, as it may on GPU.
+    # `lax.reduce_precision`, because XLA may drop a cast to float32 and back where it
+    # may keep excess precision.
     limits = np.finfo(np.float32)
     rounded = lax.reduce_precision(values, limits.nexp, limits.nmant)
     high = lax.convert_element_type(rounded, jnp.float32)
-    # Of a float between 2^e and its double, 2^(1 - e): the exponent's bits, 1 to 254,
-    # mirrored.
+    # 2^(1 − e) for a float in [2^e, 2^(e + 1)): its exponent bits, 1 to 254, mirrored.
     bits = lax.bitcast_convert_type(high, jnp.uint32)
     mirrored = (np.uint32(255) - (bits >> np.uint32(23))) << np.uint32(23)
     per_size = lax.bitcast_convert_type(mirrored, jnp.float32)
     per_step = lax.convert_element_type(per_size, jnp.float64) * 2.0**22
     left = (values - rounded) * per_step
-    # Half a step at most; and nothing of infinities and zeros.
+    # At most half a step; 0 for infinities and zeros.
     usual = jnp.isfinite(high) & (high >= limits.tiny)
     left = jnp.where(usual, left, 0.0)
     return high, lax.convert_element_type(left * 2.0**_REST_BITS, jnp.int32)
 
 
 def argsort_descending(counts: Array) -> Array:
-    """Stable descending order [n] of int32 counts ≥ 0; ties by index."""
+    """Return the stable descending order [n] of int32 counts ≥ 0; ties by index."""
     key = (2**31 - 1 - counts).astype(jnp.uint32)
     return _sort_wide(key, lax.iota(jnp.int32, counts.shape[0]))
 
 
 def _sort_wide(high: Array, low: Array) -> Array:
-    """Sort by (high uint32, low int32 ≥ 0); returns ``low`` sorted."""
+    """Return ``low`` sorted by (high uint32, low int32 ≥ 0)."""
     with jax.enable_x64(True):
         wide = lax.convert_element_type(high, jnp.uint64) << np.uint64(32)
         key = wide | lax.convert_element_type(low, jnp.uint64)

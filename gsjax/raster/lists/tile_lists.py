@@ -1,9 +1,9 @@
-"""Two ways from spans of tiles to the same lists: by dealing them out, and by sorting.
+"""Two builders of the same tile lists: by scattering, and by sorting.
 
-On CPUs the spans are kept, front to back, and once the length of every list is known
-each Gaussian is dealt to its tiles: a counting sort, whose work goes with the pairs.
-Accelerators, where such a loop would wait for its launches, unroll the spans into keys
-and sort those. No derivative is taken here.
+On CPUs the spans are stored front to back, and once the length of every list is known
+each Gaussian is scattered to its tiles: a counting sort. On accelerators, where such a
+loop would wait for its launches, spans are unrolled into keys and sorted. No derivative
+is taken here.
 
 Axis legend: R ranks, I items (spans of tiles within a row), T tiles, P pairs.
 """
@@ -24,17 +24,17 @@ from gsjax.runtime import loops
 
 
 class ListBuilder(NamedTuple):
-    """How lists come about.
+    """A way to build tile lists.
 
     Attributes:
-      nothing: the state before the first items.
-      add: (state, rank, first, count) → state: items [I] of ranks that do not fall;
-        the tiles first … first + count - 1 of each, none where ``count`` is 0.
-      ranks: (state, start [T], pairs []) → [P] ranks by tile. Of no use if there are
+      empty: the state before the first items.
+      add: (state, rank, first, count) → state. Adds items [I] in rising order of rank;
+        item i covers the tiles first … first + count − 1.
+      ranks: (state, start [T], pairs []) → [P] ranks by tile; meaningless if there are
         more pairs than room.
     """
 
-    nothing: Any
+    empty: Any
     add: Callable[..., Any]
     ranks: Callable[..., Array]
 
@@ -42,13 +42,13 @@ class ListBuilder(NamedTuple):
 def choose_list_builder(
     platform: str, capacity: int, ranks: int, tiles: int, num_size_buckets: int
 ) -> ListBuilder:
-    """The faster one.
+    """Return the faster builder on a platform.
 
     Args:
       platform: as JAX names it.
       capacity: room for pairs.
-      ranks, tiles: how many there are.
-      num_size_buckets: 2 · num_size_buckets − 1 sizes at which to sort, at most.
+      ranks, tiles: their numbers.
+      num_size_buckets: sorting has at most 2 · num_size_buckets − 1 sizes.
     """
     if platform == "cpu":
         return scatter_builder(capacity)
@@ -56,7 +56,7 @@ def choose_list_builder(
 
 
 def scatter_builder(capacity: int) -> ListBuilder:
-    """Keep the items that have tiles; then one loop over them."""
+    """Store the items that have tiles, then scatter them in one loop."""
 
     def add(state, *item):
         return loops.append(*state, item, item[2] > 0)
@@ -64,9 +64,9 @@ def scatter_builder(capacity: int) -> ListBuilder:
     def ranks(state, start, pairs):
         (items,), kept = state
         items = jnp.where(pairs <= capacity, items, 0)
-        return loops.deal(kept, items, start, jnp.zeros(capacity, jnp.int32))
+        return loops.scatter_items(kept, items, start, jnp.zeros(capacity, jnp.int32))
 
-    # As many as there are pairs, at most; and one, see `loops.append`.
+    # At most one item per pair, and one spare row for `loops.append`.
     kept = jnp.zeros((capacity + 1, 3), jnp.int32)
     return ListBuilder((jnp.zeros(1, jnp.int32), kept), add, ranks)
 
@@ -74,9 +74,9 @@ def scatter_builder(capacity: int) -> ListBuilder:
 def sort_builder(
     capacity: int, ranks: int, tiles: int, num_size_buckets: int
 ) -> ListBuilder:
-    """Pairs as keys, sorted by (tile, rank)."""
+    """Unroll pairs into keys and sort them by (tile, rank)."""
     in_pairs = block_size(capacity, 4)
-    # The last block may reach beyond the capacity by what is not live of it.
+    # The unused part of the last block may reach beyond the capacity.
     room = jnp.full(capacity + in_pairs, tiles, jnp.int32)
     keys = pair_keys(room, jnp.full_like(room, ranks), tiles + 1, ranks + 1)
 
@@ -108,7 +108,7 @@ def sort_builder(
             low = sort_pairs([key[:size] for key in keys], ranks + 1)
             return jnp.pad(low, (0, capacity - size))
 
-        # Sizes lie close together: to sort is quick to compile, and slow to do.
+        # Sizes lie close together: sorting is quick to compile and slow to run.
         return run_at_bucket(pairs, capacity, 2 * num_size_buckets - 1, sort, step=2)
 
     return ListBuilder((jnp.int32(0), keys), add, sorted_ranks)

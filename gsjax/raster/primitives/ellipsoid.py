@@ -1,6 +1,6 @@
-"""Projection: Gaussians and a camera → `Projected`, by `gsjax.raster.primitives.ewa`.
+"""Ellipsoids by EWA splatting (Zwicker et al. 2001): the default primitive.
 
-Of the slots that `order.depth_order` found, and no others, front to back.
+Axis legend: N Gaussians (capacity), R ranks (front to back), K slots, C channels.
 """
 
 from functools import partial
@@ -11,17 +11,36 @@ import jax.numpy as jnp
 from jax import lax
 
 from gsjax.cameras.camera import LENS_RANGE, NEAREST, Camera, camera_centre
-from gsjax.gaussians import Gaussians
+from gsjax.cameras.lenses import everywhere, z_depth
 from gsjax.math import sh as sh_lib
-from gsjax.math.numerics import exp_log_scale, held, near_one, once, safe_normalize
-from gsjax.raster.primitives.ewa import dilated, half_covariance, transform_point
+from gsjax.math.numerics import (
+    exp_log_scale,
+    materialize,
+    materialize_mask,
+    near_one,
+    safe_normalize,
+)
+from gsjax.raster.lists.occlusion_culling import is_wide
+from gsjax.raster.primitives.ewa import covariance_factor, dilated, ewa_jacobian
 from gsjax.raster.size_buckets import run_at_bucket
-from gsjax.raster.types import COLOR_LIMIT, Array, Projected, RasterConfig
+from gsjax.raster.types import (
+    COLOR_LIMIT,
+    Array,
+    Bounds,
+    Box,
+    Channels,
+    Footprint,
+    Inputs,
+    Primitive,
+    Projection,
+    RasterConfig,
+    Splat,
+)
 from gsjax.raster.vmap_branching import any_in_batch
 
 
 def usable(camera: Camera) -> Array:
-    """Whether a camera can draw at all; under jit a bad one cannot be refused."""
+    """Return whether a camera can draw; under jit a bad one cannot be rejected."""
     low, high = LENS_RANGE
     focal = jnp.stack([camera.K[0, 0], camera.K[1, 1]])
     centre = jnp.abs(jnp.stack([camera.K[0, 2], camera.K[1, 2]]))
@@ -29,65 +48,139 @@ def usable(camera: Camera) -> Array:
     return good & jnp.all((focal > low) & (focal < high) & (centre < high))
 
 
-def in_depth_range(camera: Camera, z: Array) -> Array:
-    """Where camera z is drawn; a NaN is not."""
-    return (z > camera.near) & (z > NEAREST) & (z < camera.far)
+def in_depth_range(camera: Camera, depth: Array) -> Array:
+    """Return where a depth is drawn; False for NaN."""
+    return (depth > camera.near) & (depth > NEAREST) & (depth < camera.far)
 
 
-def reach_of(opacity: Array, config: RasterConfig) -> Array:
-    """Q = 2 ln(opacity / cut) at which α meets the cut; 0 if it never does."""
-    seen = opacity > config.alpha_min
-    return 2 * jnp.log(jnp.where(seen, opacity / config.alpha_min, 1))
+def reach_of(opacity: Array, alpha_min: float | Array) -> Array:
+    """Return Q = 2 ln(opacity / alpha_min), where α meets the limit; else 0."""
+    seen = opacity > alpha_min
+    return 2 * jnp.log(jnp.where(seen, opacity / alpha_min, 1))
+
+
+def _alpha_min(alpha_min: Array | None, config: RasterConfig) -> float | Array:
+    return config.alpha_min if alpha_min is None else alpha_min
+
+
+def bounds(
+    active: Array,
+    values: tuple[Array, Array, Array],
+    camera: Camera,
+    config: RasterConfig,
+    alpha_min: Array | None = None,
+) -> Bounds:
+    """Return conservative bounds of slots [K]; no derivative is taken.
+
+    Args:
+      active: [K] bool.
+      values: means [K, 3], log scales [K, 3] and logits of the opacities [K].
+      camera: a single camera.
+      config: dilation and alpha_min are used.
+      alpha_min: [] in place of that of ``config``, or None.
+    """
+    means, log_scales, logits = values[0].T, values[1].T, values[2]
+    (x, y, z), _ = camera.shutter.world_to_camera(camera.viewmat, means)
+    depth = camera.lens.depth((x, y, z))
+    if depth.dtype == jnp.float32:
+        # Rounded once, so that a Gaussian behind another one is not before it.
+        with jax.enable_x64(True):
+            depth = lax.convert_element_type(_wide_depth(means, camera), jnp.float32)
+    live = active & in_depth_range(camera, depth) & jnp.isfinite(logits)
+    live &= usable(camera)
+    for value in (*means, *log_scales):
+        live &= jnp.isfinite(value)
+    if camera.lens.valid is not everywhere:
+        live &= camera.lens.valid(camera.K, camera.coefficients, (x, y, z))
+    z = depth if camera.lens.depth is z_depth else z
+    point = (jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1))
+    centres = camera.project(point)
+    # A view matrix that scales, as one being optimised may, enlarges what it shows.
+    rotation = camera.viewmat[:3, :3]
+    gram = jnp.sum(rotation[:, None] * rotation[None], axis=-1)
+    stretch = jnp.maximum(jnp.max(jnp.sum(jnp.abs(gram), axis=1)), 1)
+    a, b, c = (jnp.where(live, s, 0) for s in log_scales)
+    low, high = jnp.minimum(a, b), jnp.maximum(a, b)
+    largest = exp_log_scale(jnp.maximum(high, c))
+    middle = exp_log_scale(jnp.maximum(low, jnp.minimum(high, c)))
+    opacity = jax.nn.sigmoid(logits)
+    reach = reach_of(opacity, _alpha_min(alpha_min, config))
+    extents, wide = [], jnp.zeros_like(live)
+    for centre, row, size in zip(centres, ewa_jacobian(camera, point), camera.visible):
+        gain = stretch * sum(j * j for j in row)
+        square = largest * largest * gain
+        extent = jnp.sqrt(reach * (square + config.dilation))
+        extent = extent * 1.001 + 0.01  # room for rounding
+        # Phrased so that neither an overflow nor a NaN gets through.
+        live &= (square < jnp.inf) & (jnp.abs(centre) < jnp.inf)
+        live &= (centre + extent >= 0.5) & (centre - extent <= size - 0.5)
+        extents.append(extent)
+        wide |= is_wide(middle * middle * gain, opacity)
+    live &= reach > 0
+    box = Box(*centres, *extents)
+    return Bounds(jnp.where(live, depth, jnp.inf), box, live & wide)
+
+
+def order_depth(means: Array, camera: Camera) -> Array:
+    """Return the float64 depth [K] of means [K, 3]; call within `jax.enable_x64`."""
+    return _wide_depth(means.T, camera)
+
+
+def _wide_depth(means, camera: Camera) -> Array:
+    """Depth [K] in float64 of components; within `jax.enable_x64(True)`."""
+
+    def wide(value: Array) -> Array:
+        return lax.convert_element_type(value, jnp.float64)
+
+    def coordinate(i: int) -> Array:
+        row = camera.viewmat[i]
+        return sum(wide(row[j]) * wide(means[j]) for j in range(3)) + wide(row[3])
+
+    if camera.lens.depth is z_depth:
+        return coordinate(2)
+    return camera.lens.depth(tuple(coordinate(i) for i in range(3)))
 
 
 def project(
-    gaussians: Gaussians,
-    camera: Camera,
-    config: RasterConfig,
-    order: Array,
-    count: Array,
-    features: Array | None = None,
-    probe: Array | None = None,
-    abs_probe: Array | None = None,
-) -> Projected:
-    """Project the slots ``order`` [R], of which the first ``count`` are there.
+    inputs: Inputs, config: RasterConfig, order: Array, count: Array
+) -> Projection:
+    """Project the slots ``order`` [R], of which the first ``count`` are used.
 
-    Every input of a dead rank is replaced before it is used, so that neither values
-    nor derivatives can leak, whatever the slot holds.
+    Every input of an unused rank is replaced before use, so that neither its values nor
+    its derivatives can leak, whatever the slot holds.
 
     Args:
-      gaussians: capacity N.
-      camera: a single camera.
-      config: dilation, antialias and alpha_min are used.
-      order, count: from `order.depth_order`.
-      features: [N, C] used in place of SH colour, or None.
-      probe: [N, 2] added to the projected means; its gradient is the densification
-        statistic. Or None.
-      abs_probe: [N, 2] zeros that collect the absolute gradient. Or None.
+      inputs: Gaussians, camera, features and probe.
+      config: dilation, antialias, alpha_min and num_size_buckets are used.
+      order, count: from `gsjax.raster.lists.depth_order`.
     """
+    gaussians, camera = inputs.gaussians, inputs.camera
+    features, probe = inputs.features, inputs.probe
     room = order.shape[0]
     order = jnp.minimum(order, gaussians.capacity - 1)
     rows = jax.tree.map(lambda a: a[order], gaussians.params)
-    colour_rows = rows.sh if features is None else features[order]
+    color_rows = rows.sh if features is None else features[order]
+    shift = None if probe is None or config.absgrad else _columns(probe[order])
     components = _Components(
         means=_columns(rows.means),
         quats=_columns(rows.quats),
         log_scales=_columns(rows.log_scales),
         logit_opacities=rows.logit_opacities,
-        colors=_blocks(colour_rows.reshape(room, -1), colour_rows.shape[-1]),
-        shift=None if probe is None else _columns(probe[order]),
+        colors=_blocks(color_rows.reshape(room, -1), color_rows.shape[-1]),
+        shift=shift,
+        alpha_min=inputs.alpha_min,
     )
 
-    def some(size: int, components: _Components, camera, count) -> Projected:
+    def some(size: int, components: _Components, camera, count) -> _Projected:
         live = lax.iota(jnp.int32, size) < count
-        front = jax.tree.map(lambda a: a[..., :size], components)
+        front = jax.tree.map(lambda a: a[..., :size] if a.ndim else a, components)
         out = _project_components(front, camera, config, live, features is None)
         if size == room:
             return out
 
-        # As an update at a place that XLA (jax 0.10.2) does not know to be 0: else it
-        # makes a pad of it, fuses that with all that leads to ``a``, and evaluates
-        # this element by element over the whole room.
+        # An update at a place that XLA (jax 0.10.2) does not know to be 0: else it
+        # makes a pad of it, fuses that with everything that leads to ``a``, and
+        # evaluates it element by element over the whole room.
         zero = jnp.minimum(count, 0)
 
         def among(unseen: Array, a: Array) -> Array:
@@ -95,33 +188,40 @@ def project(
 
         return jax.tree.map(among, _unseen(out, room), out)
 
-    def none(*operands) -> Projected:
+    def none(*operands) -> _Projected:
         return _unseen(jax.eval_shape(partial(some, room), *operands), room)
 
-    def run(size: int) -> Projected:
+    def run(size: int) -> _Projected:
         project_some = jax.checkpoint(partial(some, size))
         some_live = any_in_batch(count > 0)
         return lax.cond(some_live, project_some, none, components, camera, count)
 
-    # Two sizes: every one more costs seconds of compiling.
+    # Two sizes at most: each further one costs seconds of compiling.
     out = run_at_bucket(count, room, min(config.num_size_buckets, 2), run, step=16)
-    return out if abs_probe is None else out._replace(probe=abs_probe[order].T)
+    absolute = config.absgrad and probe is not None
+    return Projection(
+        footprint=Footprint(
+            out.u, out.v, out.inv_sx, out.slope, out.var_y, out.det, out.reach
+        ),
+        splat=out.splat,
+        channels=Channels(
+            colors=out.colors,
+            depth=out.depth,
+            probe=probe[order].T if absolute else None,
+            alpha_min=inputs.alpha_min,
+        ),
+    )
 
 
-def ellipses(
-    gaussians: Gaussians,
-    camera: Camera,
-    config: RasterConfig,
-    slots: Array,
-    count: Array,
-    features: Array | None,
-) -> tuple[Array, ...]:
-    """u, v, inv_sx, slope, inv_sy, opacity [R] of slots, of which the first ``count``
-    are there; see `Projected`.
+def occluders(
+    inputs: Inputs, config: RasterConfig, slots: Array, count: Array
+) -> Splat:
+    """Return the splats [K] of ``slots``, of which the first ``count`` are used.
 
-    Of colours only whether they can be drawn, and quick to compile: for a few. No
-    derivative is taken here.
+    Quick to compile, for a few slots. Colours are only checked for being drawable. No
+    derivative is taken.
     """
+    gaussians, camera, features = inputs.gaussians, inputs.camera, inputs.features
     params = gaussians.params
     rows = jax.tree.map(
         lambda a: a.at[slots].get(mode="clip").T,
@@ -140,31 +240,31 @@ def ellipses(
     colors = params.sh if features is None else features
     rows = colors.at[slots].get(mode="clip").reshape(slots.shape[0], -1)
     live &= jnp.all(jnp.abs(rows) < COLOR_LIMIT, axis=1)
-    p = _project_components(components, camera, config, live, harmonic=False)
-    return p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity
+    return _project_components(components, camera, config, live, harmonic=False).splat
 
 
 def _columns(rows: Array) -> tuple[Array, ...]:
-    """The columns of [R, M], [R] each."""
+    """Return the columns of [R, M], [R] each."""
     return tuple(block[0] for block in _blocks(rows, 1))
 
 
 def _blocks(rows: Array, width: int) -> tuple[Array, ...]:
-    """The columns of [R, M], ``width`` at a time: [width, R] each.
+    """Return the columns of [R, M], ``width`` at a time: [width, R] each.
 
-    By `lax.split`, whose transpose puts M derivatives side by side. That of M slices is
-    the sum of M arrays of zeros with one column each, which XLA's CPU backend (jax
-    0.10.2) forms number by number: M² operations a row.
+    `lax.split` has a transpose that puts M derivatives side by side. The transpose of M
+    slices is a sum of M padded arrays, which XLA's CPU backend (jax 0.10.2) forms with
+    M² operations a row.
     """
     return tuple(lax.split(rows.T, (width,) * (rows.shape[1] // width), axis=0))
 
 
 class _Components(NamedTuple):
-    """Parameters of the ranks, [R] each: see `GaussianParams`.
+    """Parameters of the ranks, [R] each; see `GaussianParams`.
 
     Attributes:
-      colors: K coefficients [3, R] each, or features, [C, R].
-      shift: of the projected mean, px, or None.
+      colors: K coefficients [3, R] each, or features, one [C, R].
+      shift: added to the projected mean, px; or None.
+      alpha_min: [] in place of that of the config, or None.
     """
 
     means: tuple[Array, ...]
@@ -173,10 +273,32 @@ class _Components(NamedTuple):
     logit_opacities: Array
     colors: tuple[Array, ...]
     shift: tuple[Array, ...] | None
+    alpha_min: Array | None = None
 
 
-def _unseen(like: Projected, count: int) -> Projected:
-    """Ranks of which nothing shows, of the types and channels of others."""
+class _Projected(NamedTuple):
+    """Results of the arithmetic, [R], colors [C, R]; see `Footprint` and `Splat`."""
+
+    u: Array
+    v: Array
+    depth: Array
+    inv_sx: Array
+    slope: Array
+    inv_sy: Array
+    var_y: Array
+    det: Array
+    opacity: Array
+    reach: Array
+    colors: Array
+
+    @property
+    def splat(self) -> Splat:
+        shape = (self.inv_sx, self.slope, self.inv_sy, self.opacity)
+        return Splat(self.u, self.v, shape)
+
+
+def _unseen(like: _Projected, count: int) -> _Projected:
+    """Return ranks that show nothing, of the types and channels of ``like``."""
     empty = jax.tree.map(lambda a: jnp.zeros((*a.shape[:-1], count), a.dtype), like)
     ones = jnp.ones_like(empty.u)
     return empty._replace(inv_sx=ones, inv_sy=ones, det=ones)
@@ -188,15 +310,14 @@ def _project_components(
     config: RasterConfig,
     live: Array,
     harmonic: bool,
-) -> Projected:
-    """The arithmetic of `project`, on components.
+) -> _Projected:
+    """Do the arithmetic of `project`, on components.
 
     `project` runs it in a branch of its own, for two reasons. How it is fused, and so
-    rounded, then does not depend on what uses it: images are the same bits whatever
-    the capacity and the devices. And XLA's CPU backend evaluates a shared value anew
-    for each use that indexes it differently (jax 0.10.2): were the derivatives by x, y
-    and z put into one array in the same loop, they would cost as much as all the rest
-    of a render. It is recomputed in the backward pass rather than kept.
+    rounded, then does not depend on its users: images are the same bits whatever the
+    capacity and the devices. And XLA's CPU backend evaluates a shared value again for
+    each use that indexes it differently (jax 0.10.2). It is recomputed in the backward
+    pass instead of stored.
     """
     for values in rows.colors:
         for value in values:
@@ -204,44 +325,46 @@ def _project_components(
     quat, good = near_one(
         tuple(jnp.where(live, q, 1) for q in rows.quats), (1.0, 0.0, 0.0, 0.0)
     )
-    live = held(live & good)
+    live = materialize_mask(live & good)
     means = tuple(jnp.where(live, m, 0) for m in rows.means)
     scales = tuple(exp_log_scale(jnp.where(live, s, 0)) for s in rows.log_scales)
-    x, y, z = transform_point(camera.viewmat, means)
-    # Where the world is far away it is off by as much as that: not at the lens.
-    live &= z > 0.5 * camera.near
-    # A dead rank's mean is the origin, which may lie anywhere: park it at z = 1.
+    (x, y, z), viewmat = camera.shutter.world_to_camera(camera.viewmat, means)
+    # Far from the world's origin, float32 may put a Gaussian elsewhere: not at the
+    # lens.
+    live &= camera.lens.depth((x, y, z)) > 0.5 * camera.near
+    # The mean of a dead rank is the origin, which may lie anywhere: move it to z = 1.
     x, y, z = jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1)
-    x, y, z = once((x, y, z), live)
-    u, v = camera.model.project(camera.K, (x, y, z))
+    x, y, z = materialize((x, y, z), live)
+    u, v = camera.project((x, y, z))
     if rows.shift is not None:
         u, v = (a + b.astype(a.dtype) for a, b in zip((u, v), rows.shift))
-    live = held(live & (jnp.abs(u) < jnp.inf) & (jnp.abs(v) < jnp.inf))
+    live = materialize_mask(live & (jnp.abs(u) < jnp.inf) & (jnp.abs(v) < jnp.inf))
 
-    m1, m2 = half_covariance(camera, (x, y, z), quat, scales)
-    m1, m2 = once(m1, live), once(m2, live)
+    m1, m2 = covariance_factor(camera, viewmat, (x, y, z), quat, scales)
+    m1, m2 = materialize(m1, live), materialize(m2, live)
     a, b, c, det, det_sharp = dilated(m1, m2, config.dilation)
-    live = held(live & (det > 0) & (det < jnp.inf) & (a < jnp.inf) & (c < jnp.inf))
+    live = materialize_mask(
+        live & (det > 0) & (det < jnp.inf) & (a < jnp.inf) & (c < jnp.inf)
+    )
     a, b, c = jnp.where(live, a, 1), jnp.where(live, b, 0), jnp.where(live, c, 1)
     det = jnp.where(live, det, 1)
-    # sqrt(max(0.005², ratio)): the floor of Mip-Splatting and gsplat.
-    ratio = jnp.where(live, det_sharp, 1) / det
-    floor = 0.005**2
-    compensation = jnp.sqrt(jnp.where(ratio > floor, ratio, floor))
-
     opacity = jax.nn.sigmoid(jnp.where(live, rows.logit_opacities, 0))
     if config.antialias:
-        opacity = opacity * compensation
-    reach = jnp.where(live, reach_of(lax.stop_gradient(opacity), config), 0)
+        # sqrt(max(0.005², ratio)): the floor of Mip-Splatting and gsplat.
+        ratio = jnp.where(live, det_sharp, 1) / det
+        floor = 0.005**2
+        opacity = opacity * jnp.sqrt(jnp.where(ratio > floor, ratio, floor))
+    alpha_min = _alpha_min(rows.alpha_min, config)
+    reach = jnp.where(live, reach_of(lax.stop_gradient(opacity), alpha_min), 0)
     if harmonic:
         colors = _sh_colors(camera, means, rows.colors, live)
     else:
         (features,) = rows.colors
         colors = jnp.where(live, features, 0)
-    return Projected(
+    return _Projected(
         u=u,
         v=v,
-        depth=z,
+        depth=camera.lens.depth((x, y, z)),
         inv_sx=1 / jnp.sqrt(a),
         slope=b / a,
         inv_sy=jnp.sqrt(a / det),
@@ -250,17 +373,15 @@ def _project_components(
         opacity=jnp.where(live, opacity, 0),
         reach=reach,
         colors=colors,
-        compensation=compensation,
-        probe=None,
     )
 
 
 def _sh_colors(camera: Camera, means, coefficients, live: Array) -> Array:
-    """Colour [3, R] of K coefficients [3, R] seen from the camera; + 0.5, ≥ 0.
+    """Return the colour [3, R] of K coefficients [3, R]: 0.5 + Σ, at least 0.
 
-    The channels together: a third as many derivatives, each a kernel to compile. Over
-    K summed in plain sight: as a reduction of [K, 1, R] · [K, 3, R], XLA's CPU backend
-    (jax 0.10.2, YNNPACK) gets it wrong from some 10⁴ Gaussians on.
+    The channels are handled together: a third as many derivatives, each a kernel to
+    compile. The sum over K is written out: as a reduction of [K, 1, R] · [K, 3, R],
+    XLA's CPU backend (jax 0.10.2) gets it wrong from some 10⁴ Gaussians on.
     """
     degree = sh_lib.degree_of(len(coefficients))
     if degree == 0:
@@ -275,9 +396,4 @@ def _sh_colors(camera: Camera, means, coefficients, live: Array) -> Array:
     return jnp.where(raw > 0, raw, 0)
 
 
-def conics_of(projected: Projected) -> Array:
-    """Inverse 2D covariances [R, 3] as (xx, xy, yy), for comparison with others."""
-    var_x = 1 / (projected.inv_sx * projected.inv_sx)
-    cov_xy = projected.slope * var_x
-    entries = (projected.var_y, -cov_xy, var_x)
-    return jnp.stack([entry / projected.det for entry in entries], -1)
+ELLIPSOID = Primitive("ellipsoid", bounds, order_depth, project, occluders)
