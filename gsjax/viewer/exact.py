@@ -60,6 +60,7 @@ class ExactRenderer:
         Raises:
           CapacityError: if the view needs more memory than can be addressed.
         """
+        camera = jax.device_put(camera, gaussians.active.sharding)  # perhaps only one
         behind = jnp.asarray(self.background, jnp.result_type(float))
         with self._lock:
             view = render_exact(gaussians, camera, self.config, behind)

@@ -210,7 +210,8 @@ def _preview(view: Render, photo: np.ndarray | None, name: str) -> np.ndarray:
         row = SheetRow("photograph", photo, rgb, depth, rendered=f"{name},")
         return comparison([row], width=width)
     found = previews.depth_cell(depth)
-    return previews.cell_sheet([Cell(display_pixels(rgb), name), found], None, _MAX_WIDTH)
+    cells = [Cell(display_pixels(rgb), name), found]
+    return previews.cell_sheet(cells, None, _MAX_WIDTH)
 
 
 def _display(value, **options):

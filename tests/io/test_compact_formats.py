@@ -375,19 +375,19 @@ def test_splat_files_follow_the_layout(tmp_path):
 def test_export_selects_the_format_by_suffix(tmp_path, capsys):
     gsjax.save(tmp_path / "a.ply", given())
     out = tmp_path / "new" / "b.spz"
-    assert main.main(["export", str(tmp_path / "a.ply"), str(out)]) == 0
+    assert main(["export", str(tmp_path / "a.ply"), str(out)]) == 0
     assert capsys.readouterr().out.startswith(f"{out}  3 Gaussians")
     assert_alike(gsjax.load(out), given(), 1 / 32)
-    assert main.main(["info", str(out)]) == 0
+    assert main(["info", str(out)]) == 0
     assert "Gaussians         3" in capsys.readouterr().out
     args = ["export", str(out), str(tmp_path / "c.splat")]
-    assert main.main(args) == 0
+    assert main(args) == 0
     assert "degree 1 to 3 are left out" in capsys.readouterr().err
-    assert main.main([*args, "--overwrite", "--sh-degree", "0"]) == 0
+    assert main([*args, "--overwrite", "--sh-degree", "0"]) == 0
     assert capsys.readouterr().err == ""
     quats = np.asarray([[1, 0, 0, 0], [0, 0, 0, 0], [0, 1, 0, 0]])
     gsjax.save(tmp_path / "e.ply", given(quats=quats))
-    assert main.main(["export", str(tmp_path / "e.ply"), str(tmp_path / "e.spz")]) == 0
+    assert main(["export", str(tmp_path / "e.ply"), str(tmp_path / "e.spz")]) == 0
     assert "2 of 3 Gaussians" in capsys.readouterr().out
-    assert main.main(["export", str(out), str(tmp_path / "d.xyz")]) == 3
+    assert main(["export", str(out), str(tmp_path / "d.xyz")]) == 3
     assert "a suffix of .ply, .splat, .spz, got" in capsys.readouterr().err

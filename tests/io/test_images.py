@@ -25,9 +25,9 @@ def test_camera_files_round_trip(tmp_path):
             K=[[50, 0, 7], [0, 60, 9], [0, 0, 1]],
             width=20 + index,
             height=10,
-            model=model,
+            lens=lens,
         )
-        for index, model in enumerate(("pinhole", "orthographic"))
+        for index, lens in enumerate(("pinhole", "orthographic"))
     ]
     path = tmp_path / "cameras.json"
     entries = [CameraEntry(f"c{i}", camera) for i, camera in enumerate(cameras)]
@@ -38,5 +38,5 @@ def test_camera_files_round_trip(tmp_path):
         assert (entry.camera.width, entry.camera.lens) == (camera.width, camera.lens)
         np.testing.assert_array_equal(entry.camera.K, camera.K)
         np.testing.assert_allclose(entry.camera.viewmat, camera.viewmat, atol=1e-6)
-    with pytest.raises(gsjax.InputError, match="is a batch"):
+    with pytest.raises(gsjax.InputError, match="expected a single camera"):
         transforms_json([CameraEntry("b", gsjax.stack_cameras([cameras[0]] * 2))])

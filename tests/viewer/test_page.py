@@ -1,0 +1,162 @@
+"""HTML pages of `gsjax view --html`, and the arguments of the command."""
+
+import base64
+import re
+import struct
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import training
+from viewing import COUNT, PHOTO_COLORS, run_at, scene
+
+import gsjax
+from gsjax.cli.main import main
+from gsjax.math.rotations import quaternion_to_matrix
+from gsjax.runs.folder import run_files, save_scene
+from gsjax.train.config import TrainConfig
+from gsjax.viewer.cameras import UPS
+
+pytest.importorskip("viser", reason="needs gsjax[viewer]")
+
+FAR = np.asarray([4e5, -3e6, 20.0])
+
+
+@pytest.fixture(scope="module")
+def ply(tmp_path_factory):
+    """A scene of which three Gaussians are too faint to be drawn."""
+    path = tmp_path_factory.mktemp("ply") / "a.ply"
+    logits = scene().params.logit_opacities.at[:3].set(-9.0)
+    params = scene().params.replace(logit_opacities=logits)
+    gsjax.save(path, scene().replace(params=params))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A finished run far from the origin that found the true scene."""
+    run = run_at(tmp_path_factory.mktemp("run"), TrainConfig(), origin=FAR)
+    far = replace(training.dataset(), origin=FAR)
+    save_scene(run_files(run).splat, training.true_gaussians(), far)
+    return run
+
+
+def decode(text: str) -> tuple[list[dict], np.ndarray]:
+    """Messages of a page, and its packed splats [M, 8]: its only buffer."""
+    import msgspec
+    import zstandard
+
+    data = base64.b64decode(re.search(r'EMBED_DATA__="([^"]*)"', text)[1])
+    inner = zstandard.ZstdDecompressor().decompressobj().decompress(data[8:])
+    length = 8 + struct.unpack("<Q", inner[:8])[0]
+    content = msgspec.msgpack.decode(inner[8:length])
+    messages = [message for _, message in content["messages"]]
+    kinds = [message["type"] for message in messages]
+    assert kinds.count("GaussianSplatsMessage") == 1
+    assert "BackgroundImageMessage" in kinds
+    (size,) = content["binaryBufferLengths"]
+    packed = np.frombuffer(inner[len(inner) - size :], np.uint32).reshape(-1, 8)
+    return messages, packed
+
+
+def about(messages: list[dict], kind: str, name: str) -> dict:
+    """The only message of a kind about a node of the scene."""
+    (found,) = (m for m in messages if m["type"] == kind and m["name"] == name)
+    return found
+
+
+def turned(wxyz) -> np.ndarray:
+    return np.asarray(quaternion_to_matrix(np.asarray(wxyz)))
+
+
+def test_without_viser_the_error_names_the_package(ply, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    for args in (["view", str(ply)], ["train", "x", "-o", str(tmp_path), "--viewer"]):
+        assert main(args) == 6
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert "install it: pip install viser" in err
+
+
+@pytest.mark.parametrize(
+    "args", [["--min-opacity", "1"], ["--max-gaussians", "0"], ["--port", "0"],
+             ["--up", "z"]],
+)  # fmt: skip
+def test_arguments_out_of_range_are_usage_errors(ply, args, capsys):
+    assert main(["view", str(ply), *args]) == 2
+    assert args[0] in capsys.readouterr().err
+
+
+def test_a_page_holds_the_scene_and_loads_nothing(ply, tmp_path, capsys):
+    out = tmp_path / "new" / "a.html"
+    assert main(["view", str(ply), "--html", str(out)]) == 0
+    said = capsys.readouterr()
+    size = out.stat().st_size / 2**20
+    drawn = COUNT - 3
+    assert said.out == f"{out}  {drawn} of {COUNT} Gaussians, {size:.2f} MiB\n"
+    assert f"3 of {COUNT} Gaussians left out: opacity below 0.01" in said.err
+    text = out.read_text()
+    assert not re.findall(r"(?:src|href)=.?https?://[^\"' ]+", text)
+    assert "SH degree 0" in text
+    _, packed = decode(text)
+    rgb = packed[:, 7:].copy().view(np.uint8)[:, :3] / 255
+    np.testing.assert_allclose(rgb, [[0.9, 0.5, 0.1]] * drawn, atol=1 / 255)
+    assert main(["view", str(ply), "--html", str(out)]) == 3
+    assert "exists" in capsys.readouterr().err
+    args = ["--overwrite", "--max-gaussians", "20", "--min-opacity", "0.5"]
+    assert main(["view", str(ply), "--html", str(out), *args]) == 0
+    said = capsys.readouterr()
+    assert f"20 of {COUNT} Gaussians" in said.out
+    assert "left out" not in said.err, "the limit was requested"
+    args = ["--overwrite", "--min-opacity", "0.999"]
+    assert main(["view", str(ply), "--html", str(out), *args]) == 3
+    assert "lower --min-opacity" in capsys.readouterr().err
+
+
+def test_a_page_of_a_run_holds_its_cameras_and_photographs(run, tmp_path, capsys):
+    """At their poses; with --no-photos only the cameras."""
+    texts = []
+    for more in ([], ["--no-photos"]):
+        out = tmp_path / f"{len(texts)}.html"
+        assert main(["view", str(run), "--html", str(out), *more]) == 0
+        said = capsys.readouterr()
+        assert f"{training.POINTS} Gaussians, {training.VIEWS} cameras" in said.out
+        assert "warning" not in said.err
+        texts.append(out.read_text())
+        messages, packed = decode(texts[-1])
+        splats = about(messages, "GaussianSplatsMessage", "/splats")["props"]
+        means = packed[:, :3].copy().view(np.float32) * splats["scale"]
+        # The origin of the page is arbitrary.
+        away = np.median(means - training.true_gaussians().params.means, axis=0)
+        for index, view in enumerate(training.dataset().views):
+            name = f"/cameras/{index:04d}"
+            place = about(messages, "SetPositionMessage", name)["position"]
+            np.testing.assert_allclose(place - away, view.centre, atol=1e-4)
+            turn = turned(about(messages, "SetOrientationMessage", name)["wxyz"])
+            np.testing.assert_allclose(turn, view.viewmat[:3, :3].T, atol=1e-6)
+            drawn = about(messages, "CameraFrustumMessage", name)["props"]
+            half = np.tan(drawn["fov"] / 2)
+            np.testing.assert_allclose(half, view.height / 2 / view.K[1, 1])
+            np.testing.assert_allclose(drawn["aspect"], view.width / view.height)
+            if more:
+                assert drawn["_image_data"] is None
+                continue
+            photo = cv2.imdecode(np.frombuffer(drawn["_image_data"], np.uint8), 1)
+            assert photo.shape == (120, 160, 3)
+            assert np.abs(photo[..., ::-1] - PHOTO_COLORS[index].astype(int)).max() < 8
+    assert len(texts[1]) < len(texts[0])
+
+
+@pytest.mark.parametrize("up", [None, "+x", "-y"])
+def test_the_up_direction_of_a_page(run, tmp_path, capsys, up):
+    """By default that of the cameras; up is +y in the browser."""
+    out = tmp_path / "a.html"
+    more = [] if up is None else ["--up", up]
+    assert main(["view", str(run), "--html", str(out), "--no-photos", *more]) == 0
+    capsys.readouterr()
+    messages, _ = decode(out.read_text())
+    world = turned(about(messages, "SetOrientationMessage", "")["wxyz"])
+    np.testing.assert_allclose(world @ UPS[up or "+z"], (0, 1, 0), atol=1e-6)

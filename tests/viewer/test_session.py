@@ -1,0 +1,307 @@
+"""Sessions of browsers, the server, and the live view of a training."""
+
+import contextlib
+import logging
+import socket
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+import training
+from viewing import COUNT, Browser, scene, wait_for
+
+import gsjax
+from gsjax.data.types import Photo
+from gsjax.errors import InputError
+from gsjax.math.rotations import quaternion_to_matrix
+from gsjax.train.config import TrainConfig
+from gsjax.train.initialisation import initial_state
+from gsjax.train.loop import Progress
+from gsjax.train.state import Metrics
+from gsjax.viewer.cameras import frusta_of, photo_distances
+from gsjax.viewer.exact import ExactRenderer
+from gsjax.viewer.live import LiveViewer
+from gsjax.viewer.opening import make_content
+from gsjax.viewer.server import ViewerServer
+from gsjax.viewer.splats import MIN_DRAWN_OPACITY, longest_axes, opacities_of
+from gsjax.viewer.viser_server import open_server, stop_server
+
+pytest.importorskip("viser", reason="needs gsjax[viewer]")
+
+
+class FakeRenderer:
+    """Grey images, and a record of the calls."""
+
+    background = (0, 0, 0)
+
+    def __init__(self):
+        self.calls = []
+
+    def __call__(self, gaussians, camera):
+        self.calls.append((gaussians, camera))
+        image = np.full((camera.height, camera.width, 3), 0.5)
+        return gsjax.Render(**dict.fromkeys(gsjax.Render._fields))._replace(rgb=image)
+
+
+@pytest.fixture(scope="module")
+def running():
+    """One server for the module."""
+    views = training.dataset().views
+    renderer = ExactRenderer(gsjax.RasterConfig(), (0, 0, 0))
+    server = ViewerServer(make_content(scene(), renderer, frusta_of(views)), port=8190)
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def server(running):
+    """The server with its first content, and no browser."""
+    content = running.content
+    content.gaussians, content.renderer = scene(), FakeRenderer()
+    content.frusta, content.status = frusta_of(training.dataset().views), ""
+    content.min_opacity = 0.0
+    yield running
+    wait_for(lambda: not running.has_browsers)
+
+
+def session_of(server):
+    """The session of its only browser, once Gaussians are sent."""
+    wait_for(lambda: server.sessions and next(iter(server.sessions.values())).splats)
+    return next(iter(server.sessions.values()))
+
+
+@pytest.fixture
+def joined(server):
+    """A browser that is connected to the server, and its session."""
+    browser = Browser(server.url)
+    yield browser, session_of(server)
+    browser.close()
+
+
+def sent_means(session) -> np.ndarray:
+    return session.splats.buffer[:, :3].view(np.float32) * session.splats.scale
+
+
+def test_a_session_cuts_renders_and_moves(server, joined):
+    _, session = joined
+    calls = server.content.renderer.calls
+    assert session.splats.buffer.shape == (COUNT, 8)
+    assert f"**{COUNT}** of {COUNT} Gaussians" in session.counts.content
+    assert len(session.cameras) == 1 + training.VIEWS
+    session.opacity.value = 0.5
+    kept = int((opacities_of(scene()) >= 0.5).sum())
+    wait_for(lambda: session.splats.buffer.shape == (kept, 8))
+    assert not calls  # an image is rendered on request only
+    session.height.value = "270"
+    # The first message of the browser about its camera may arrive after a render, and
+    # uncovers the view as any movement does.
+    wait_for(lambda: session.render() or session.covered)
+    gaussians, camera = calls[-1]
+    assert (camera.height, camera.width) == (270, 360)
+    assert int(gaussians.active.sum()) == kept
+    assert not session.splats.visible
+    session.place.value = "in the panel"
+    wait_for(lambda: session.pictures.visible)
+    assert session.splats.visible
+    assert not session.covered
+    server.show(scene(2.0), "step 7 of 9")
+    wait_for(lambda: "step 7 of 9" in session.counts.content)
+
+
+def test_a_click_on_a_camera_moves_there_and_shows_its_photograph(server, joined):
+    browser, session = joined
+    views = training.dataset().views
+
+    def is_at(view) -> bool:
+        camera = session.client.camera
+        turn = np.asarray(quaternion_to_matrix(camera.wxyz))
+        half = view.height / 2 / view.K[1, 1]
+        return (
+            np.allclose(camera.position, view.centre, atol=1e-6)
+            and np.allclose(turn, view.viewmat[:3, :3].T, atol=1e-6)
+            and np.isclose(np.tan(camera.fov / 2), half)
+        )
+
+    browser.click(session, "/cameras/0003")
+    wait_for(lambda: is_at(views[3]))
+    assert session.photo is None
+    flat = [np.full((24, 32, 3), 60 * index, np.uint8) for index in range(len(views))]
+    photos = [Photo(pixels, None, None, views[0].K) for pixels in flat]
+    server.show_cameras(frusta_of(views, photos))
+    wait_for(lambda: not server.busy)
+    browser.click(session, "/cameras/0002")
+    wait_for(lambda: session.photo and session.photo.label == views[2].name)
+    assert is_at(views[2])
+    first = session.photo
+    np.testing.assert_array_equal(first.image, flat[2])
+    session.go_to.value = views[1].name
+    wait_for(lambda: session.photo.label == views[1].name)
+    assert is_at(views[1])
+    assert session.photo is first
+    np.testing.assert_array_equal(first.image, flat[1])
+
+
+def test_a_camera_that_the_view_is_in_is_hidden(server, joined):
+    """Until the view has left it; over an exact image all are hidden."""
+    browser, session = joined
+    views = training.dataset().views
+
+    def drawn() -> list[bool]:
+        return [handle.visible for handle in session.cameras]
+
+    wait_for(lambda: drawn() == [True] * (1 + len(views)))
+    browser.click(session, "/cameras/0003")
+    wait_for(lambda: session.go_to.value == views[3].name)
+    assert drawn() == [True, *(view is not views[3] for view in views)]
+    # As far as the photograph is from the camera that took it.
+    (reach,) = photo_distances(server.content.frusta, session.cameras[1].scale)[3:4]
+    back = -views[3].viewmat[2, :3]
+    near = views[3].centre + 0.9 * reach * back
+    browser.look_from(near)
+    wait_for(lambda: np.allclose(session.client.camera.position, near, atol=1e-6))
+    session.update_cameras()
+    assert not session.cameras[4].visible
+    browser.look_from(views[3].centre + 1.1 * reach * back)
+    wait_for(lambda: drawn() == [True] * (1 + len(views)))
+    wait_for(lambda: session.go_to.value not in [view.name for view in views])
+    session.go_to.value = views[3].name  # it can be chosen again
+    wait_for(lambda: not session.cameras[4].visible)
+    session.height.value = "270"
+    wait_for(lambda: session.render() or session.covered)
+    assert not session.cameras[0].visible, "the parent of all"
+    browser.look_from((0, 0, 0))
+    wait_for(lambda: drawn() == [True] * (1 + len(views)))
+
+
+def test_the_counts_exclude_gaussians_that_are_too_faint_to_be_drawn(server, joined):
+    _, session = joined
+    logits = scene().params.logit_opacities.at[:3].set(-9.0)
+    server.show(scene().replace(params=scene().params.replace(logit_opacities=logits)))
+    message = (
+        f"**{COUNT - 3}** of {COUNT} Gaussians<br/>"
+        f"3 of opacity below {MIN_DRAWN_OPACITY}"
+    )
+    wait_for(lambda: message in session.counts.content)
+    assert session.splats.buffer.shape == (COUNT - 3, 8)
+    session.render()
+    gaussians, _ = server.content.renderer.calls[-1]
+    assert int(gaussians.active.sum()) == COUNT, "the exact image has all"
+
+
+def test_sliders_select_by_scale_and_opacity(server, joined):
+    _, session = joined
+    opacities, longest = opacities_of(scene()), longest_axes(scene())
+    limit = np.percentile(longest, 40)
+
+    def sends(kept) -> bool:
+        if f"**{kept.sum()}** of {COUNT} Gaussians" not in session.counts.content:
+            return False
+        means, expected = sent_means(session), np.asarray(scene().params.means)[kept]
+        return means.shape == expected.shape and np.allclose(means, expected, 1e-5)
+
+    session.scale.value = 40
+    wait_for(lambda: sends(longest <= limit))
+    session.opacity.value = 0.5
+    kept = (longest <= limit) & (opacities >= 0.5)
+    wait_for(lambda: sends(kept))
+    session.render()
+    np.testing.assert_array_equal(server.content.renderer.calls[-1][0].active, kept)
+    session.scale.value = 100
+    wait_for(lambda: sends(opacities >= 0.5))
+
+
+def test_the_initial_opacity_may_exceed_the_range_of_the_slider(server):
+    """As with `gsjax view PLY --min-opacity 0.995`."""
+    server.content.min_opacity = 0.995
+    logits = jax.numpy.linspace(0, 9, COUNT)
+    params = scene().params.replace(logit_opacities=logits)
+    server.content.gaussians = scene().replace(params=params)
+    browser = Browser(server.url)
+    session = session_of(server)
+    kept = (opacities_of(server.content.gaussians) >= 0.995).sum()
+    wait_for(lambda: f"**{kept}** of {COUNT} Gaussians" in session.counts.content)
+    assert session.splats.buffer.shape == (kept, 8)
+    browser.close()
+
+
+@pytest.mark.timeout(60)  # viser would wait forever
+def test_addresses_that_cannot_be_served():
+    for host in ("192.0.2.1", "no-such-host.invalid", "a..b"):
+        with pytest.raises(InputError, match=f"{host}:8390: cannot listen there"):
+            open_server(host, 8390)
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # used by another process
+            stack.enter_context(socket.create_server(("127.0.0.1", 65535)))
+        stack.enter_context(pytest.raises(InputError, match="no port from 65535 on"))
+        open_server("127.0.0.1", 65535)
+
+
+def test_the_next_free_port_is_used_and_silent_clients_are_not_logged(
+    monkeypatch, caplog
+):
+    """Chromium connects in advance, and may leave without a request."""
+    logger = logging.getLogger("websockets.server")
+    monkeypatch.setattr(logger, "filters", [])  # those of earlier servers
+    records: list[logging.LogRecord] = []
+    logger.addFilter(lambda record: records.append(record) is None)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        server = open_server("127.0.0.1", port)
+    assert server.get_port() > port
+    socket.create_connection(("127.0.0.1", server.get_port())).close()
+    wait_for(lambda: records)
+    stop_server(server)
+    assert caplog.records == []
+
+
+def test_without_viser_the_error_names_the_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(gsjax.GsjaxError, match="install it: pip install viser"):
+        LiveViewer()
+
+
+def test_a_training_is_shown_by_copies():
+    config = TrainConfig(steps=9, sh_degree=0, raster=training.RASTER)
+    dataset, viewer = training.dataset(), LiveViewer(port=8290)
+    blank = np.zeros((training.HEIGHT, training.WIDTH, 3), np.uint8)
+    photos = [Photo(blank, None, None, view.K) for view in dataset.views]
+    hook = viewer.begin(dataset, photos, config)
+    state = initial_state(dataset, config)
+
+    def after(step):
+        """Call the hook, and then delete its state as the next step does."""
+        gaussians = jax.tree.map(jax.numpy.copy, state.gaussians)
+        means = gaussians.params.means + step
+        gaussians = gaussians.replace(params=gaussians.params.replace(means=means))
+        kept = np.array(means)
+        metrics = Metrics(*[0] * len(Metrics._fields))._replace(step=step)
+        hook(state.replace(gaussians=gaussians), Progress(metrics, 0, 0, 0, 1, 64))
+        np.testing.assert_array_equal(means, kept)
+        jax.tree.map(lambda a: a.delete(), gaussians)
+        return kept
+
+    def shown():
+        return np.asarray(viewer.server.content.gaussians.params.means)
+
+    first = after(1)
+    after(2)  # too early for a copy
+    np.testing.assert_array_equal(shown(), first)
+    viewer.due = 0.0
+    second = after(2)
+    np.testing.assert_array_equal(shown(), second)
+    browser = Browser(viewer.server.url)
+    wait_for(lambda: viewer.server.has_browsers)
+    viewer.due = time.monotonic() + 60
+    after(3)
+    np.testing.assert_array_equal(shown(), second)
+    last = after(9)  # the last step is always shown
+    np.testing.assert_array_equal(shown(), last)
+    assert viewer.due > time.monotonic()
+    session = session_of(viewer.server)
+    wait_for(lambda: "step 9 of 9" in session.counts.content)
+    browser.close()
+    wait_for(lambda: not viewer.server.has_browsers)
+    viewer.wait_for_browsers()  # returns, as none is connected
+    viewer.close()
