@@ -136,7 +136,7 @@ def write(
         # The names of the lines stand beside the title.
         size = (720 if len(series) < 4 else 1200, 420)
         picture = curves(
-            series, title=title, x_label=x_label, size=size, log_x=log_x, least=LEAST
+            series, title=title, x_label=x_label, size=size, log_x=log_x, min_y_span=LEAST
         )
         files.write_file(path, images.encode_png(picture))
 

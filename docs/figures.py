@@ -1,4 +1,4 @@
-"""The pictures of these pages, made anew: ``python docs/figures.py``."""
+"""Draw the pictures of these pages: ``python docs/figures.py``."""
 
 from pathlib import Path
 
@@ -8,7 +8,8 @@ import numpy as np
 
 import gsjax
 from gsjax.math.sh import rgb_to_dc
-from gsjax.plots.contact_sheets import depth_colors, put_text, text_width, wrapped
+from gsjax.plots import figures
+from gsjax.plots.contact_sheets import depth_colors
 from gsjax.raster.lists import binning
 from gsjax.raster.lists.depth_order import depth_order
 from gsjax.raster.primitives.ellipsoid import project
@@ -18,7 +19,7 @@ ASSETS = Path(__file__).parent / "assets"
 
 
 def write(name: str, rgb: np.ndarray) -> None:
-    """RGB [H, W, 3] in [0, 1] as a .webp."""
+    """Write RGB [H, W, 3] in [0, 1] as a .webp."""
     pixels = np.rint(255 * np.clip(rgb, 0, 1)).astype(np.uint8)[..., ::-1]
     quality = [cv2.IMWRITE_WEBP_QUALITY, 82]
     _, encoded = cv2.imencode(".webp", pixels, quality)
@@ -26,7 +27,7 @@ def write(name: str, rgb: np.ndarray) -> None:
 
 
 def knot() -> None:
-    """The torus knot beside its depth."""
+    """Draw the torus knot beside its depth."""
     scene = torus_knot_scene(count=20_000, frames=48, width=560, height=420)
     behind = np.asarray(scene.background)
     view = gsjax.render_exact(scene.gaussians, scene.cameras[4], background=behind)
@@ -37,7 +38,7 @@ def knot() -> None:
 
 
 def order() -> None:
-    """Two splats beside each other, one in front, then the other."""
+    """Draw two splats beside each other, one in front, then the other."""
     K = [[240, 0, 140], [0, 240, 100], [0, 0, 1]]
     camera = gsjax.make_camera(viewmat=np.eye(4), K=K, width=280, height=200)
     pictures = []
@@ -54,14 +55,11 @@ def order() -> None:
     write("order.webp", np.concatenate(pictures, axis=1))
 
 
-_PAPER, _INK, _BACK = (255, 255, 255), (60, 64, 72), (190, 70, 40)
-_GAP, _TILE = 46, 16
-# Shown half as wide on the pages.
-_HEAD, _TEXT, _LINE = 1.15, 0.9, 32
+_TILE = 16
 
 
 def pipeline() -> None:
-    """The way from Gaussians to a picture, and back: four panels and arrows."""
+    """Draw the way from Gaussians to a picture and back: four panels and arrows."""
     scene = torus_knot_scene(count=6000, frames=48, width=320, height=240)
     gaussians, camera = scene.gaussians, scene.cameras[4]
     white = np.ones(3)
@@ -77,43 +75,35 @@ def pipeline() -> None:
     seen = project(gaussians, camera, config, slots, count)
     panels = [dots, _ellipses(seen, dots.shape), _lengths(seen, picture), picture]
     captions = [
-        ("Gaussians", "position, rotation, scale, opacity, colour"),
-        ("project", "each to an ellipse, with its colour from here"),
-        ("sort", "by tile and depth: red tiles have long lists"),
-        ("blend", "tile by tile, front to back"),
+        ("Gaussians", "position, rotation,\nscale, opacity, colour"),
+        ("project", "each to an ellipse,\nwith its colour from here"),
+        ("sort", "by tile and depth:\nred tiles have long lists"),
+        ("blend", "tile by tile,\nfront to back"),
     ]
-    height, width = dots.shape[:2]
-    texts = [wrapped(text, width, _TEXT) for _, text in captions]
-    below = height + 80 + _LINE * max(map(len, texts))
-    page = np.full((below + 50, 4 * width + 3 * _GAP + 20, 3), 255, np.uint8)
-    for index, (panel, (title, _), text) in enumerate(zip(panels, captions, texts)):
-        left = 10 + index * (width + _GAP)
-        pixels = np.rint(255 * np.clip(panel, 0, 1)).astype(np.uint8)
-        page[10 : 10 + height, left : left + width] = pixels
-        cv2.rectangle(page, (left, 10), (left + width, 10 + height), _INK, 1)
-        put_text(page, title, (left, height + 48), _INK, _HEAD)
-        for number, line in enumerate(text):
-            put_text(page, line, (left, height + 86 + _LINE * number), _INK, _TEXT)
+    figure = figures.new_figure((1480, 440))
+    across, back = {"arrowstyle": "->", "lw": 2}, "#be4628"
+    for index, (panel, (title, text)) in enumerate(zip(panels, captions)):
+        left = 0.01 + 0.25 * index
+        axes = figure.add_axes((left, 0.42, 0.216, 0.545))
+        axes.imshow(np.clip(panel, 0, 1), interpolation="nearest")
+        axes.set(xticks=[], yticks=[])
+        figure.text(left, 0.35, title, fontsize=19, color=figures.INK)
+        figure.text(left, 0.31, text, fontsize=14, color=figures.INK, va="top")
         if index:
-            middle = 10 + height // 2
-            _arrow(page, (left - _GAP + 8, middle), (left - 8, middle), _INK)
-    row, right = below + 20, page.shape[1] - 12
-    _arrow(page, (right, row), (12, row), _BACK)
+            place = {"xycoords": "axes fraction", "arrowprops": across}
+            axes.annotate("", (-0.02, 0.5), (-0.14, 0.5), **place)
     told = "jax.grad, jax.jvp: by Gaussians, camera and background"
-    wide = text_width(told, _TEXT)
-    left = (page.shape[1] - wide) // 2
-    page[row - 14 : row + 15, left - 16 : left + wide + 16] = _PAPER
-    put_text(page, told, (left, row + 9), _BACK, _TEXT)
-    write("pipeline.webp", page / 255)
-
-
-def _arrow(page: np.ndarray, start: tuple[int, int], end: tuple[int, int], color):
-    tip = 12 / max(abs(end[0] - start[0]), 1)
-    cv2.arrowedLine(page, start, end, color, 3, cv2.LINE_AA, tipLength=tip)
+    ends = {"xycoords": "figure fraction", "arrowprops": {**across, "color": back}}
+    axes.annotate("", (0.01, 0.07), (0.98, 0.07), **ends)
+    figure.text(
+        0.5, 0.07, told, fontsize=15, color=back, ha="center", va="center",
+        bbox={"color": "white"},
+    )  # fmt: skip
+    write("pipeline.webp", figures.figure_pixels(figure) / 255)
 
 
 def _ellipses(seen, shape: tuple[int, ...]) -> np.ndarray:
-    """One in six of them, where their densities are e^(-1/2), far to near."""
+    """Draw the one-sigma ellipse of one splat in six, far to near."""
     page = np.full(shape, 255, np.uint8)
     u, v, var_y, slope, inv_sx = (
         np.asarray(a, np.float64)
@@ -135,7 +125,7 @@ def _ellipses(seen, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _lengths(seen, picture: np.ndarray) -> np.ndarray:
-    """How many Gaussians each tile's list has, in colours over the picture."""
+    """Return the picture under the lengths of the tile lists, as colours."""
     height, width = picture.shape[:2]
     grid = binning.make_grid(width, height, _TILE, 1)
     device = jnp.int32(0)

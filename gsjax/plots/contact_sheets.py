@@ -1,10 +1,9 @@
-"""Sheets of results: photograph, render, error and depth side by side.
+"""Contact sheets: photograph, render, error and depth side by side.
 
-Axis legend: H W a picture; the sheet is one row of four cells for each view.
-
-Colours are RGB. OpenCV draws the captions; its font is ASCII.
+Axis legend: H W a picture. Colours are RGB.
 """
 
+import textwrap
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,25 +11,26 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.io import images
+from gsjax.plots import figures
 
-MAGNIFIED = 4  # the error is shown so many times as large
+MAGNIFIED = 4  # factor on the error
 
-_PAPER, _TEXT, _FAINT = (24, 26, 31), (232, 234, 238), (150, 156, 166)
-_MISSING = (255, 0, 255)  # what is not finite
-_NOTHING = (44, 47, 54)  # where there is no depth
-# In px: between cells, the height of a caption, and of each line that it has more.
-_GAP, _BAR, _LINE = 6, 20, 15
+_PAPER, _TEXT, _ALARM = (24, 26, 31), "#c8ccd4", "#ff785a"
+_MISSING = (255, 0, 255)  # pixels that are not finite
+_NOTHING = (44, 47, 54)  # pixels without depth
+_GAP, _LINE, _CHARACTER = 6, 15, 6.1  # px: margin, height of a line, width of a letter
+_FONT = {"family": "DejaVu Sans Mono", "fontsize": 7.2, "parse_math": False}
 
 
 class SheetRow(NamedTuple):
-    """One view.
+    """One view of a contact sheet.
 
     Attributes:
-      name: what the caption calls it, below the photograph.
+      name: caption of the photograph.
       truth: [H, W, 3] the photograph, uint8, or floats in [0, 1].
       render: [H, W, 3] alike.
-      depth: [H, W] of the render, 0 where nothing is; or None.
-      rendered: what is said below the render, before its PSNR.
+      depth: [H, W] of the render, 0 where there is none; or None.
+      rendered: caption of the render, before its PSNR.
     """
 
     name: str
@@ -40,31 +40,87 @@ class SheetRow(NamedTuple):
     rendered: str = "render"
 
 
+class Cell(NamedTuple):
+    """A picture [H, W, 3] uint8 with its caption; ``alarm`` sets it in red."""
+
+    pixels: np.ndarray
+    caption: str = ""
+    alarm: bool = False
+
+
 def comparison(rows: Sequence[SheetRow], *, width: int = 320) -> np.ndarray:
-    """A sheet [·, ·, 3] uint8 of photograph, render, error × 4 and depth.
+    """Return a sheet [·, ·, 3] uint8 of photograph, render, error × 4 and depth.
 
     Pixels that are not finite are magenta. Near is red and far is blue, between the
     2nd and the 98th percentile of each view. PSNR is that of the pixels as given.
 
     Args:
       rows: the views, of any sizes.
-      width: of a cell in px; pictures are scaled to it, and captions broken into lines.
+      width: of a cell in px; pictures are scaled to it.
 
     Raises:
-      InputError: if there is no row, or the pictures of one are not of one size.
+      InputError: if there is no row, or the pictures of one differ in size.
     """
     if not rows:
-        raise InputError("no views to compare; a sheet has at least one row")
-    with_depth = any(row.depth is not None for row in rows)
-    return np.concatenate([_row(row, width, with_depth) for row in rows])
+        raise InputError("comparison: expected at least one row, got none")
+    return cell_grid([_row(row, width) for row in rows])
+
+
+def cell_grid(rows: Sequence[Sequence[Cell]]) -> np.ndarray:
+    """Return cells in rows [H, W, 3] uint8, pixel by pixel, over their captions.
+
+    Columns are as wide as the widest cell; captions are broken into lines.
+    """
+    width = max(cell.pixels.shape[1] for row in rows for cell in row)
+    captions = [[_wrapped(cell.caption, width) for cell in row] for row in rows]
+    heights = [
+        max(cell.pixels.shape[0] + _GAP for cell in row)
+        + (_LINE * max(map(len, texts)) + _GAP if any(texts) else 0)
+        for row, texts in zip(rows, captions)
+    ]
+    size = max(map(len, rows)) * (width + _GAP), sum(heights)
+    page, places, top = np.full((*size[::-1], 3), _PAPER, np.uint8), [], _GAP // 2
+    for row, height in zip(rows, heights):
+        places.append([(_GAP // 2 + i * (width + _GAP), top) for i in range(len(row))])
+        top += height
+    if any(text for texts in captions for text in texts):
+        page = _page_of_text(size, rows, captions, places)
+    for row, where in zip(rows, places):
+        for cell, (x, y) in zip(row, where):
+            page[y : y + cell.pixels.shape[0], x : x + cell.pixels.shape[1]] = (
+                cell.pixels
+            )
+    return page
+
+
+def _page_of_text(size: tuple[int, int], rows, captions, places) -> np.ndarray:
+    """Draw the captions of `cell_grid`."""
+    width, height = size
+    figure = figures.new_figure(size, color=_PAPER)
+    for row, texts, where in zip(rows, captions, places):
+        for cell, lines, (x, y) in zip(row, texts, where):
+            top = y + cell.pixels.shape[0] + 3
+            for number, line in enumerate(lines):
+                figure.text(
+                    (x + 2) / width, 1 - (top + _LINE * number) / height, line,
+                    va="top", color=_ALARM if cell.alarm else _TEXT, **_FONT,
+                )  # fmt: skip
+    return figures.figure_pixels(figure)
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """Break a caption into lines that fit into ``width`` px."""
+    letters = max(1, int((width - 4) / _CHARACTER))
+    lines = [figures.printable(line) for line in text.splitlines()]
+    return [piece for line in lines for piece in textwrap.wrap(line, letters)]
 
 
 def depth_colors(
     depth: np.ndarray, limits: tuple[float, float] | None = None
 ) -> tuple[np.ndarray, float, float]:
-    """([H, W, 3] uint8, near, far): Turbo from near (red) to far (blue).
+    """Return ([H, W, 3] uint8, near, far): Turbo from near (red) to far (blue).
 
-    Near and far are ``limits``, or else the 2nd and the 98th percentile, both 0 if
+    Near and far are ``limits``, or else the 2nd and the 98th percentile; both 0 if
     there is no depth.
     """
     cv2 = images.opencv()
@@ -73,75 +129,62 @@ def depth_colors(
     if not found.any():
         return pixels, 0.0, 0.0
     near, far = limits or np.percentile(depth[found], (2, 98)).tolist()
-    # The ends of the map are nearly black.
     closeness = (far - np.where(found, depth, far)) / max(far - near, 1e-12)
+    # The ends of the map are nearly black.
     level = images.to_8_bit(0.06 + 0.88 * np.clip(closeness, 0, 1))
     colors = cv2.applyColorMap(level, cv2.COLORMAP_TURBO)[..., ::-1]
     return np.where(found[..., None], colors, pixels), near, far
 
 
-def put_text(
-    picture: np.ndarray, text: str, place: tuple[int, int], color=_TEXT, size=0.42
-) -> None:
-    """Write into ``picture`` [H, W, 3]; ``place`` (x, y) is where the line begins."""
-    cv2 = images.opencv()
-    text = _ascii(text)
-    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, color, 1, 16)
+def display_pixels(picture) -> np.ndarray:
+    """Return [H, W, 3] uint8 of a picture [H, W] or [H, W, 3].
 
+    Floats are clipped to [0, 1]; pixels that are not finite become magenta.
 
-def text_width(text: str, size: float = 0.42) -> int:
-    """Width in px of what `put_text` writes."""
-    cv2 = images.opencv()
-    return cv2.getTextSize(_ascii(text), cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0]
-
-
-def _ascii(text: str) -> str:
-    return text.encode("ascii", "replace").decode()
-
-
-def wrapped(text: str, width: int, size: float = 0.42) -> list[str]:
-    """Lines that `put_text` writes into ``width`` px: words, broken where one is wider.
-
-    Every character but for the blanks between lines is in them, at least one in each.
+    Raises:
+      InputError: on another shape, or an empty picture.
     """
-    lines = [""]
-    for word in text.split():
-        longer = f"{lines[-1]} {word}".lstrip()
-        if text_width(longer, size) <= width:
-            lines[-1] = longer
-            continue
-        if lines[-1]:
-            lines.append("")
-        for letter in word:
-            if lines[-1] and text_width(lines[-1] + letter, size) > width:
-                lines.append("")
-            lines[-1] += letter
-    return lines
+    picture = np.asarray(picture)
+    if picture.ndim == 2:
+        picture = np.repeat(picture[..., None], 3, axis=2)
+    if picture.ndim != 3 or picture.shape[2] != 3 or 0 in picture.shape:
+        raise InputError(
+            f"picture: expected shape [H, W] or [H, W, 3], got {picture.shape}"
+        )
+    if picture.dtype == np.uint8:
+        return picture
+    picture = picture.astype(np.float64)
+    finite = np.isfinite(picture).all(axis=-1, keepdims=True)
+    pixels = images.to_8_bit(np.where(finite, picture, 0))
+    return np.where(finite, pixels, np.asarray(_MISSING, np.uint8))
 
 
-def _row(row: SheetRow, width: int, with_depth: bool) -> np.ndarray:
-    truth, render = _floats(row.truth), _floats(row.render)
-    if truth.shape != render.shape:
+def _row(row: SheetRow, width: int) -> list[Cell]:
+    for what, picture in (("photograph", row.truth), ("render", row.render)):
+        if picture.ndim != 3 or picture.shape != (*row.truth.shape[:2], 3):
+            raise InputError(
+                f"{row.name}: expected the photograph and the render to have one "
+                f"shape [H, W, 3], got {what} {picture.shape}"
+            )
+    if row.depth is not None and row.depth.shape != row.truth.shape[:2]:
         raise InputError(
-            f"{row.name}: the photograph is {truth.shape}, the render {render.shape}"
+            f"{row.name}: expected a depth of shape {row.truth.shape[:2]}, got "
+            f"{row.depth.shape}"
         )
-    if row.depth is not None and row.depth.shape != truth.shape[:2]:
-        raise InputError(
-            f"{row.name}: the depth is {row.depth.shape}, the photograph {truth.shape}"
-        )
+    truth, render = (
+        picture / 255.0 if picture.dtype == np.uint8 else np.asarray(picture, float)
+        for picture in (row.truth, row.render)
+    )
     error = np.abs(truth - render)
-    pictures = [visible(truth), visible(render), visible(MAGNIFIED * error)]
-    captions = [row.name, f"{row.rendered} {_psnr(error)}", f"error x {MAGNIFIED}"]
+    cells = [
+        Cell(display_pixels(truth), row.name),
+        Cell(display_pixels(render), f"{row.rendered} {_psnr(error)}"),
+        Cell(display_pixels(MAGNIFIED * error), f"error × {MAGNIFIED}"),
+    ]
     if row.depth is not None:
         pixels, near, far = depth_colors(row.depth)
-        pictures.append(pixels)
-        captions.append(f"depth, 2 to 98 %: {near:.3g} to {far:.3g}")
-    texts = [wrapped(caption, width - 2) for caption in captions]
-    bar = _BAR + _LINE * (max(map(len, texts)) - 1)
-    cells = [_cell(*one, width, bar) for one in zip(pictures, texts)]
-    if with_depth and row.depth is None:
-        cells.append(np.full_like(cells[0], _PAPER))
-    return np.concatenate(cells, axis=1)
+        cells.append(Cell(pixels, f"depth, 2 to 98 %: {near:.3g} to {far:.3g}"))
+    return [cell._replace(pixels=scale_to_width(cell.pixels, width)) for cell in cells]
 
 
 def _psnr(error: np.ndarray) -> str:
@@ -151,31 +194,9 @@ def _psnr(error: np.ndarray) -> str:
     return f"{-10 * np.log10(square):.2f} dB" if square > 0 else "identical"
 
 
-def _floats(picture: np.ndarray) -> np.ndarray:
-    if picture.ndim != 3 or picture.shape[2] != 3:
-        raise InputError(f"a picture is {picture.shape}; [H, W, 3] is wanted")
-    return picture / 255.0 if picture.dtype == np.uint8 else np.asarray(picture, float)
-
-
-def visible(picture: np.ndarray) -> np.ndarray:
-    """[H, W, 3] uint8 of floats in [0, 1] (clipped); magenta where not finite."""
-    finite = np.isfinite(picture).all(axis=-1, keepdims=True)
-    pixels = images.to_8_bit(np.where(finite, picture, 0))
-    return np.where(finite, pixels, np.asarray(_MISSING, np.uint8))
-
-
-def _cell(pixels: np.ndarray, lines: list[str], width: int, bar: int) -> np.ndarray:
-    """A picture scaled to ``width`` over its caption of ``bar`` px, with a margin."""
+def scale_to_width(pixels: np.ndarray, width: int) -> np.ndarray:
+    """Scale [H, W, 3] uint8 to ``width`` px: by area, or by repeating pixels."""
     cv2 = images.opencv()
     height = max(1, round(width * pixels.shape[0] / pixels.shape[1]))
-    shrinks = width < pixels.shape[1]
-    how = cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST
-    cell = np.full((height + bar + _GAP, width + _GAP, 3), _PAPER, np.uint8)
-    left = _GAP // 2
-    top = left
-    cell[top : top + height, left : left + width] = cv2.resize(
-        np.ascontiguousarray(pixels), (width, height), interpolation=how
-    )
-    for index, line in enumerate(lines):
-        put_text(cell, line, (left + 2, top + height + 14 + _LINE * index), _FAINT)
-    return cell
+    how = cv2.INTER_AREA if width < pixels.shape[1] else cv2.INTER_NEAREST
+    return cv2.resize(np.ascontiguousarray(pixels), (width, height), interpolation=how)

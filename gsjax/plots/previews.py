@@ -1,8 +1,8 @@
-"""Contact sheets, and sketches of scenes: what a notebook shows of a value.
+"""Cells that a notebook shows of a render, a depth map or a scene.
 
 Axis legend: B batch, H W picture, N Gaussians.
 
-Nothing here renders: a sketch is discs, drawn by OpenCV from the arrays as they are.
+Nothing is rendered here: the sketch of a scene is discs, drawn by OpenCV.
 """
 
 from collections.abc import Sequence
@@ -12,59 +12,37 @@ import jax
 import numpy as np
 
 from gsjax.cameras.camera import look_at
-from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.io import images
 from gsjax.math.sh import dc_to_rgb
-from gsjax.plots import contact_sheets
-from gsjax.plots.contact_sheets import depth_colors, put_text, text_width, wrapped
+from gsjax.plots.contact_sheets import (
+    Cell,
+    cell_grid,
+    depth_colors,
+    display_pixels,
+    scale_to_width,
+)
 from gsjax.raster.types import Render
 from gsjax.viewer.splats import Cut, most_important, within
 
-_PAPER, _TEXT, _ALARM = (24, 26, 31), (200, 204, 212), (255, 120, 90)
-_GAP, _BAR, _LINE, _SMALL = 4, 18, 17, 0.38
-_SHEET = 960  # px, how wide a sheet becomes by itself
-_NARROW = 96  # px, as wide as captions may make a cell
+_PAPER = (24, 26, 31)
+_SHEET = 960  # px, default width of a sheet
+_NARROW = 96  # px, least width of a cell with a caption
 _MOST_CELLS = 24
 _DISCS = 20_000
 _SIZE = (320, 240)
 
 
-class Cell(NamedTuple):
-    """A picture [H, W, 3] uint8 of a sheet, and what is said below it."""
-
-    pixels: np.ndarray
-    caption: str = ""
-
-
-def visible(picture) -> np.ndarray:
-    """[H, W, 3] uint8 of a picture [H, W] or [H, W, 3]; magenta where not finite.
-
-    Raises:
-      InputError: on another shape, or an empty one.
-    """
-    picture = np.asarray(picture)
-    if picture.ndim == 2:
-        picture = np.repeat(picture[..., None], 3, axis=2)
-    if picture.ndim != 3 or picture.shape[2] != 3 or 0 in picture.shape:
-        raise InputError(
-            f"a picture is {picture.shape}; [H, W] or [H, W, 3] is wanted, or a batch"
-        )
-    if picture.dtype == np.uint8:
-        return picture
-    return contact_sheets.visible(picture.astype(np.float64))
-
-
-def of_depth(depth: np.ndarray) -> Cell:
-    """Depth [H, W] in Turbo colours, near red and far blue, with its range."""
+def depth_cell(depth: np.ndarray) -> Cell:
+    """Return depth [H, W] in Turbo colours, near red and far blue, with its range."""
     pixels, near, far = depth_colors(depth)
     return Cell(pixels, f"depth {near:.3g} to {far:.3g}")
 
 
-def of_render(render: Render) -> list[Cell]:
-    """A cell for each image; of a batch camera by camera, at most 24 in all.
+def render_cells(render: Render) -> list[Cell]:
+    """Return a cell for each image; of a batch camera by camera, at most 24 in all.
 
-    The single picture of a render without any other has no caption.
+    A single image has no caption.
     """
     names = ("rgb", "alpha", "depth", "median_depth")
     there = [name for name in names if getattr(render, name) is not None]
@@ -80,38 +58,35 @@ def of_render(render: Render) -> list[Cell]:
         for name in there:
             image = found[name][index]
             if "depth" in name:
-                cell = of_depth(image)
+                cell = depth_cell(image)
                 prefix = "median " if name == "median_depth" else ""
                 cell = cell._replace(caption=prefix + cell.caption)
             else:
-                cell = Cell(visible(_three(image) if name == "rgb" else image), name)
+                image = _three(image) if name == "rgb" else image
+                cell = Cell(display_pixels(image), name)
             if count > 1:
                 cell = cell._replace(caption=f"{index}: {cell.caption}")
             cells.append(cell)
     if len(cells) == 1:
         cells = [cells[0]._replace(caption="")]
     if bool(np.any(np.asarray(render.overflowed))):
-        cells = [c._replace(caption="INCOMPLETE: overflowed") for c in cells]
+        told = "INCOMPLETE: overflowed"
+        cells = [cell._replace(caption=told, alarm=True) for cell in cells]
     return cells
 
 
 def _three(image: np.ndarray) -> np.ndarray:
-    """Features [H, W, C] as colours: the first three, or grey if it is one."""
+    """Return features [H, W, C] as colours: the first three, or grey if C is 1."""
     channels = image.shape[-1]
     if channels == 1:
         return np.repeat(image, 3, axis=2)
     return np.pad(image[..., :3], ((0, 0), (0, 0), (0, max(0, 3 - channels))))
 
 
-def of_gaussians(gaussians: Gaussians) -> list[Cell]:
-    """A sketch beside a few numbers; of a batch, a sketch of each, at most 24."""
+def gaussian_cells(gaussians: Gaussians) -> list[Cell]:
+    """Return a sketch over a summary; of a batch, a sketch of each, at most 24."""
     if gaussians.active.ndim == 1:
-        picture, lines = drawn(gaussians), facts(gaussians)
-        width = max(text_width(line) for line in lines) + 24
-        page = np.full((picture.shape[0], width, 3), _PAPER, np.uint8)
-        for index, line in enumerate(lines):
-            put_text(page, line, (12, 30 + _LINE * index), _TEXT)
-        return [Cell(np.concatenate([picture, page], axis=1))]
+        return [Cell(sketch(gaussians), summary(gaussians))]
     size = gaussians.active.shape[-1]
     lead = gaussians.active.ndim - 1
     flat = jax.tree.map(
@@ -120,62 +95,57 @@ def of_gaussians(gaussians: Gaussians) -> list[Cell]:
     cells, view = [], None
     for index in range(min(len(flat.active), _MOST_CELLS)):
         one = jax.tree.map(lambda a, i=index: a[i], flat)
-        view = view or viewpoint(one)  # of the first: all from one place
+        view = view or choose_viewpoint(one)  # the same for all
         text = f"{index}: {one.active.sum():,} Gaussians"
-        cells.append(Cell(drawn(one, view), text))
+        cells.append(Cell(sketch(one, view), text))
     return cells
 
 
-def facts(gaussians: Gaussians) -> list[str]:
-    """What `Gaussians` are, in a few lines of ASCII."""
+def summary(gaussians: Gaussians) -> str:
+    """Return counts and ranges of a scene, in a few lines."""
     active = np.asarray(gaussians.active)
     slots = f" in {len(active):,} slots" if not active.all() else ""
-    lines = [f"{active.sum():,} Gaussians{slots}", f"SH degree {gaussians.sh_degree}"]
+    lines = [f"{active.sum():,} Gaussians{slots}, SH degree {gaussians.sh_degree}"]
     if not active.any():
-        return lines
+        return lines[0]
     params = gaussians.params
     with np.errstate(all="ignore"):
         logits = np.asarray(params.logit_opacities, np.float64)[active]
-        values = {
-            "opacity": 1 / (1 + np.exp(-logits)),
-            "longest axis": np.exp(
-                np.asarray(params.log_scales, np.float64)[active].max(axis=1)
-            ),
-        }
+        longest = np.asarray(params.log_scales, np.float64)[active].max(axis=1)
+        values = {"opacity": 1 / (1 + np.exp(-logits)), "longest axis": np.exp(longest)}
         means = np.asarray(params.means, np.float64)[active]
         low, high = np.nanpercentile(means, (1, 99), axis=0)
     for name, value in values.items():
-        low_, middle, high_ = np.nanpercentile(value, (10, 50, 90))
-        lines += ["", name, f"  {low_:.3g} to {high_:.3g}, median {middle:.3g}"]
-    lines += ["", "within"]
-    lines += [f"  {n} {a:.3g} to {b:.3g}" for n, a, b in zip("xyz", low, high)]
-    return lines
+        least, middle, most = np.nanpercentile(value, (10, 50, 90))
+        lines.append(f"{name} {least:.3g} to {most:.3g}, median {middle:.3g}")
+    box = (f"{n} {a:.3g} to {b:.3g}" for n, a, b in zip("xyz", low, high))
+    return "\n".join([*lines, *box])
 
 
 class Viewpoint(NamedTuple):
-    """World → camera [4, 4], and how far what is looked at is."""
+    """World → camera [4, 4], and the distance to the centre of the scene."""
 
     viewmat: np.ndarray
     distance: float
 
 
-def drawn(gaussians: Gaussians, view: Viewpoint | None = None) -> np.ndarray:
-    """A sketch [240, 320, 3]: the 20 000 of most weight as discs, the far ones first.
+def sketch(gaussians: Gaussians, view: Viewpoint | None = None) -> np.ndarray:
+    """Draw the 20 000 Gaussians of most weight as discs [240, 320, 3], far to near.
 
     Colours are those of degree 0, radii the middle scale.
 
     Args:
       gaussians: N slots, concrete.
-      view: from where; default `viewpoint`.
+      view: default `choose_viewpoint`.
     """
     cv2 = images.opencv()
     width, height = _SIZE
     page = np.full((height, width, 3), _PAPER, np.uint8)
-    shown = _worth_drawing(gaussians)
+    shown = _important(gaussians)
     means = np.asarray(gaussians.params.means, np.float64)[shown]
     if not len(means):
         return page
-    viewmat, distance = view or viewpoint(gaussians)
+    viewmat, distance = view or choose_viewpoint(gaussians)
     local = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     focal = height  # a field of view of 53°
     middle = np.median(np.asarray(gaussians.params.log_scales, np.float64)[shown], 1)
@@ -193,18 +163,18 @@ def drawn(gaussians: Gaussians, view: Viewpoint | None = None) -> np.ndarray:
     return page
 
 
-def _worth_drawing(gaussians: Gaussians) -> np.ndarray:
-    """[N] bool."""
+def _important(gaussians: Gaussians) -> np.ndarray:
+    """Return which Gaussians [N] a sketch draws."""
     shown = within(gaussians, Cut(min_opacity=0.05))
     return most_important(gaussians, shown, _DISCS)
 
 
-def viewpoint(gaussians: Gaussians) -> Viewpoint:
-    """From obliquely above, with most of the scene in view.
+def choose_viewpoint(gaussians: Gaussians) -> Viewpoint:
+    """Return a view from obliquely above with most of the scene in it.
 
-    Up is the way of the least spread that is up by habit (−y, or z): a heuristic.
+    Up is the direction of least spread, signed by convention (−y, or z): a heuristic.
     """
-    points = np.asarray(gaussians.params.means, np.float64)[_worth_drawing(gaussians)]
+    points = np.asarray(gaussians.params.means, np.float64)[_important(gaussians)]
     if not len(points):
         points = np.zeros((1, 3))
     target = np.median(points, axis=0)
@@ -219,45 +189,32 @@ def viewpoint(gaussians: Gaussians) -> Viewpoint:
     return Viewpoint(look_at(target + distance * direction, target, up), distance)
 
 
-def sheet(cells: Sequence[Cell], columns: int | None, most: int) -> np.ndarray:
-    """Cells in rows [H, W, 3] uint8, at most ``most`` px wide; captions where any."""
-    longest = max(text_width(cell.caption, _SMALL) for cell in cells) + 2
-    widest = max(min(longest, _NARROW), *(c.pixels.shape[1] for c in cells)) + _GAP
+def cell_sheet(cells: Sequence[Cell], columns: int | None, most: int) -> np.ndarray:
+    """Return cells in rows [H, W, 3] uint8, at most ``most`` px wide.
+
+    Pictures are shown pixel by pixel; only a sheet wider than ``most`` is scaled.
+    """
+    if any(cell.caption for cell in cells):
+        cells = [cell._replace(pixels=_widened(cell.pixels, _NARROW)) for cell in cells]
+    widest = max(cell.pixels.shape[1] for cell in cells)
     columns = columns or max(1, min(len(cells), _SHEET // widest))
-    captioned = any(cell.caption for cell in cells)
-    rows = []
-    for first in range(0, len(cells), columns):
-        some = cells[first : first + columns]
-        captions = [wrapped(c.caption, widest - _GAP - 2, _SMALL) for c in some]
-        bar = _BAR + _LINE * (max(map(len, captions)) - 1) if captioned else 0
-        height = max(cell.pixels.shape[0] for cell in some) + bar + _GAP
-        row = np.full((height, columns * widest, 3), _PAPER, np.uint8)
-        for index, ((pixels, caption), lines) in enumerate(zip(some, captions)):
-            left, top = index * widest + _GAP // 2, _GAP // 2
-            row[top : top + pixels.shape[0], left : left + pixels.shape[1]] = pixels
-            color = _ALARM if caption.startswith("INCOMPLETE") else _TEXT
-            for number, line in enumerate(lines):
-                below = top + pixels.shape[0] + 13 + _LINE * number
-                put_text(row, line, (left + 2, below), color, _SMALL)
-        rows.append(row)
-    whole = np.concatenate(rows)
-    if whole.shape[1] <= most:
-        return whole
-    size = most, max(1, round(whole.shape[0] * most / whole.shape[1]))
-    return images.opencv().resize(whole, size, interpolation=3)  # by area
+    page = cell_grid([cells[i : i + columns] for i in range(0, len(cells), columns)])
+    return scale_to_width(page, most) if page.shape[1] > most else page
 
 
-def enlarged(pixels: np.ndarray, zoom: int) -> np.ndarray:
-    """[H, W, 3] with each pixel ``zoom`` by ``zoom``."""
+def enlarge(pixels: np.ndarray, zoom: int) -> np.ndarray:
+    """Return [H, W, 3] with each pixel ``zoom`` by ``zoom``."""
     return pixels.repeat(zoom, axis=0).repeat(zoom, axis=1)
 
 
-def stacked(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Pictures [H, W, 3] one above the other, the narrower ones padded."""
+def stack_pictures(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """Return pictures [H, W, 3] one below the other, padded to one width."""
     width = max(picture.shape[1] for picture in pictures)
-    out = []
-    for picture in pictures:
-        page = np.full((picture.shape[0], width, 3), _PAPER, np.uint8)
-        page[:, : picture.shape[1]] = picture
-        out.append(page)
-    return np.concatenate(out)
+    return np.concatenate([_widened(picture, width) for picture in pictures])
+
+
+def _widened(pixels: np.ndarray, width: int) -> np.ndarray:
+    """Pad pixels on the right to a width of at least ``width``."""
+    page = np.full((pixels.shape[0], max(width, pixels.shape[1]), 3), _PAPER, np.uint8)
+    page[:, : pixels.shape[1]] = pixels
+    return page
