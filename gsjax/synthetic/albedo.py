@@ -1,7 +1,9 @@
-"""Albedo of the demonstration's solids: patterns without detail finer than 0.05.
+"""Albedo of the demo's solids: patterns without detail finer than 0.05 units.
 
-Axis legend: R points. Every edge is a smooth step some hundredths of a unit wide, so
-that photographs of a few hundred pixels hold all there is, and splats can match it.
+Every edge is a smooth step a few hundredths of a unit wide, which photographs of a few
+hundred pixels resolve.
+
+Axis legend: R points.
 """
 
 from itertools import pairwise
@@ -10,7 +12,7 @@ import numpy as np
 
 _INK = (0.13, 0.16, 0.24)
 _CREAM = (0.93, 0.89, 0.80)
-# Strokes of letters in a unit square, as polylines.
+# Strokes of letters in the unit square, as polylines.
 _LETTERS = {
     "G": (
         [(1, 0.85), (0.7, 1), (0.3, 1), (0, 0.7), (0, 0.3), (0.3, 0), (0.7, 0)],
@@ -27,79 +29,81 @@ _LETTERS = {
 
 
 def ground(radius: float):
-    """Paint of a disc: a checkerboard of two tones that drift, and a dark rim."""
+    """Return the albedo of a disc: a checkerboard of varying tones with a dark rim."""
 
-    def paint(points):
+    def albedo(points):
         x, y, _ = points
-        odd_x, odd_y = (_step(np.sin(np.pi * a / 0.52), 0.2) for a in (x, y))
+        odd_x, odd_y = (smooth_step(np.sin(np.pi * a / 0.52), 0.2) for a in (x, y))
         check = odd_x + odd_y - 2 * odd_x * odd_y
         drift = _waves(x, y)
         light = _mix((0.90, 0.84, 0.72), (0.86, 0.70, 0.56), drift)
         dark = _mix((0.24, 0.42, 0.47), (0.30, 0.33, 0.50), drift)
         tiles = dark + (light - dark) * check
         distance = np.hypot(x, y)
-        rim = _step(distance - 0.89 * radius, 0.03)
-        turns = _step(np.sin(24 * np.arctan2(y, x)), 0.25)
+        rim = smooth_step(distance - 0.89 * radius, 0.03)
+        turns = smooth_step(np.sin(24 * np.arctan2(y, x)), 0.25)
         edge = _mix((0.16, 0.19, 0.28), (0.86, 0.52, 0.26), turns)
         return tiles + (edge - tiles) * rim
 
-    return paint
+    return albedo
 
 
 def bands(points: np.ndarray) -> np.ndarray:
-    """Paint of a sphere: bands of a palette that wind about it and swing."""
+    """Return the albedo of a sphere: wavy bands of a palette."""
     x, y, z = points / np.sqrt((points**2).sum(axis=0))
     turn = np.arctan2(y, x)
     level = 0.5 * z + 0.09 * np.sin(3 * turn) * (1 - z * z) + 0.5
-    thin = _step(np.cos(2 * np.pi * 5 * level) - 0.8, 0.16)
+    thin = smooth_step(np.cos(2 * np.pi * 5 * level) - 0.8, 0.16)
     return _onto(_palette(0.9 * level + 0.55), _CREAM, 0.85 * thin)
 
 
 def rings(points: np.ndarray) -> np.ndarray:
-    """Paint of a small sphere: golden, with darker circles about its x axis."""
+    """Return the albedo of a small sphere: golden, with dark rings about its x axis."""
     x = points[0] / np.sqrt((points**2).sum(axis=0))
-    return _mix((0.93, 0.68, 0.22), (0.60, 0.24, 0.20), _step(np.sin(8.5 * x), 0.3))
+    return _mix(
+        (0.93, 0.68, 0.22), (0.60, 0.24, 0.20), smooth_step(np.sin(8.5 * x), 0.3)
+    )
 
 
 def helix(major: float):
-    """Paint of a torus about z: stripes that wind, over a slow palette."""
+    """Return the albedo of a torus about z: helical stripes over a palette."""
 
-    def paint(points):
+    def albedo(points):
         x, y, z = points
         turn = np.arctan2(y, x)
         around = np.arctan2(z, np.hypot(x, y) - major)
-        stripe = _step(np.sin(8 * turn + 2 * around) - 0.15, 0.25)
+        stripe = smooth_step(np.sin(8 * turn + 2 * around) - 0.15, 0.25)
         return _onto(_palette(turn / (2 * np.pi)), _CREAM, 0.8 * stripe)
 
-    return paint
+    return albedo
 
 
 def crate(half: float):
-    """Paint of a cube: letters on its sides, stripes on its lid, all of it framed."""
+    """Return the albedo of a cube: letters on the sides, a striped lid, a frame."""
     sides = ((0.80, 0.32, 0.27), (0.18, 0.50, 0.53), (0.90, 0.66, 0.28))
 
-    def paint(points):
+    def albedo(points):
         x, y, z = points / half
         face = np.abs(points).argmax(axis=0)
-        # Seen from outside with z up, u runs to the right.
+        # Seen from outside with z up, u points to the right.
         u = np.choose(face, (np.sign(x) * y, -np.sign(y) * x, x))
         v = np.choose(face, (z, z, y))
         color = np.asarray(sides, x.dtype).T[:, face]
-        lid = _step(np.sin(2.6 * np.pi * (u + v)), 0.35) * (face == 2)
+        lid = smooth_step(np.sin(2.6 * np.pi * (u + v)), 0.35) * (face == 2)
         color = _onto(color, (0.42, 0.27, 0.50), lid)
         for index, word in enumerate(("GS", "JAX")):
             found = face == index
             stroke = np.zeros_like(u)
             stroke[found] = _word(word, u[found], v[found])
             color = _onto(color, _CREAM, stroke)
-        frame = _step(np.maximum(np.abs(u), np.abs(v)) - 0.88, 0.05)
+        frame = smooth_step(np.maximum(np.abs(u), np.abs(v)) - 0.88, 0.05)
         return _onto(color, _INK, frame)
 
-    return paint
+    return albedo
 
 
 def _word(word: str, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """[R] how much the strokes of ``word`` cover (u, v) of a face, [-1, 1]²."""
+    """Return [R] in [0, 1]: coverage of (u, v) in [-1, 1]² by the strokes of a word."""
     gap, height = 0.2, 0.9
     width = (1.44 - gap * (len(word) - 1)) / len(word)
     nearest = np.full_like(u, np.inf)
@@ -110,10 +114,11 @@ def _word(word: str, u: np.ndarray, v: np.ndarray) -> np.ndarray:
             corners = corners.astype(u.dtype)
             for start, end in pairwise(corners):
                 nearest = np.minimum(nearest, _to_segment(u, v, start, end))
-    return _step(0.085 - nearest, 0.045)
+    return smooth_step(0.085 - nearest, 0.045)
 
 
 def _to_segment(u, v, start, end) -> np.ndarray:
+    """Return [R] distances of (u, v) to a line segment."""
     along = end - start
     share = ((u - start[0]) * along[0] + (v - start[1]) * along[1]) / (along @ along)
     share = np.clip(share, 0, 1)
@@ -121,32 +126,32 @@ def _to_segment(u, v, start, end) -> np.ndarray:
 
 
 def _waves(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Smooth noise in [0, 1]: a few plane waves of different lengths."""
+    """Return smooth noise in [0, 1]: a sum of plane waves."""
     total = np.sin(1.7 * x + 0.6 * y + 0.4) + np.sin(-0.9 * x + 2.1 * y + 2.2)
     total += 0.6 * np.sin(3.9 * x - 2.3 * y + 1.1)
     total += 0.6 * np.sin(2.2 * x + 4.3 * y + 4.0)
     return np.clip(0.5 + total / 5, 0, 1)
 
 
-def _step(x: np.ndarray, width: float) -> np.ndarray:
-    """0 … 1 step of x through 0, ``width`` wide on either side."""
+def smooth_step(x: np.ndarray, width: float) -> np.ndarray:
+    """Return a smooth step from 0 to 1 over [-width, width]."""
     x = np.minimum(np.maximum((x / width + 1) / 2, 0), 1)
     return x * x * (3 - 2 * x)
 
 
 def _mix(low, high, share: np.ndarray) -> np.ndarray:
-    """[3, R] from one colour to another."""
+    """Interpolate between two colours, [3, R]."""
     low, high = (np.asarray(c, share.dtype)[:, None] for c in (low, high))
     return low + (high - low) * share
 
 
 def _onto(color: np.ndarray, over, share: np.ndarray) -> np.ndarray:
-    """``color`` [3, R] covered by one colour where ``share`` is 1."""
+    """Blend one colour over ``color`` [3, R] with opacity ``share`` [R]."""
     return color + (np.asarray(over, color.dtype)[:, None] - color) * share
 
 
 def _palette(turn: np.ndarray) -> np.ndarray:
-    """Colours [3, R] of a closed, smooth path: coral, amber, teal, blue."""
+    """Return colours [3, R] of a smooth cyclic palette: coral, amber, teal, blue."""
     stops = np.asarray(
         [
             (0.89, 0.36, 0.34),
@@ -158,6 +163,6 @@ def _palette(turn: np.ndarray) -> np.ndarray:
     )
     place = (turn % 1) * len(stops)
     low = place.astype(int) % len(stops)
-    share = _step((place % 1) - 0.5, 0.5)
+    share = smooth_step((place % 1) - 0.5, 0.5)
     first, second = stops.T[:, low], stops.T[:, (low + 1) % len(stops)]
     return first + (second - first) * share

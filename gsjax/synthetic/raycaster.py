@@ -1,8 +1,7 @@
-"""Photographs of a small still life, by casting rays: data to train on, from nothing.
+"""Photographs of a still life by ray casting: a dataset that needs no download.
 
-Nothing here knows of Gaussians: hits are in closed form (a torus is marched), light is
-a sun with a soft shadow and a sky, and no surface looks different from elsewhere, so
-the photographs are a fair task for a trainer. Right-handed, z up, floor at z = 0.
+Intersections are in closed form (a torus is sphere traced). Light is a sun with a soft
+shadow and a sky; all surfaces are diffuse. Right-handed, z up, floor at z = 0.
 
 Axis legend: R rays or points ([3, R] arrays), H W image, M points, F cameras.
 """
@@ -23,19 +22,27 @@ from gsjax.runtime.files import make_folder, refuse_existing, write_file
 from gsjax.synthetic import albedo
 from gsjax.synthetic.shapes import Solid, box, disc, dot, sphere, torus
 
-# What trainers assume where nothing is.
 BACKGROUND = (0.0, 0.0, 0.0)
 TARGET = np.asarray([0.0, 0.0, 0.10])
 GROUND_RADIUS = 2.1
 
 _SUN = np.asarray([0.52, -0.40, 0.76]) / np.linalg.norm([0.52, -0.40, 0.76])
-_PENUMBRA = 0.12  # tangent of the sun's apparent diameter, as wide as looks soft
+_PENUMBRA = 0.12  # tangent of the apparent diameter of the sun
 _SHADOW_STEPS, _LEAST_STEP, _MOST_STEP = 24, 0.025, 0.5
-_CHUNK = 1 << 16  # rays at a time: arrays then stay in the cache
+_CHUNK = 1 << 16  # rays at a time, to stay in the CPU cache
 
 
 class DemoDatasetSettings(NamedTuple):
-    """How many photographs, how large, and what comes with them."""
+    """Settings of `write_demo_dataset`.
+
+    Attributes:
+      photos: number of photographs.
+      width, height: image size, px.
+      samples: a pixel is the mean of samples × samples rays.
+      points: number of points in the point cloud.
+      seed: seed of the points.
+      background: RGB in [0, 1] of pixels without a surface.
+    """
 
     photos: int = 40
     width: int = 320
@@ -49,39 +56,38 @@ class DemoDatasetSettings(NamedTuple):
 def cast(
     viewmat, K, width: int, height: int, samples: int = 3, *, background=BACKGROUND
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A photograph of the still life, and its depth.
+    """Return a photograph of the still life and its depth.
 
     Args:
-      viewmat: [4, 4] world → camera; the camera stands above the floor and outside
-        the solids.
-      K: [3, 3] intrinsics in px, pixel centres at + 0.5.
-      width, height: size in px.
+      viewmat: [4, 4] world → camera; above the floor and outside the solids.
+      K: [3, 3] intrinsics in px, with pixel centres at + 0.5.
+      width, height: image size, px.
       samples: a pixel is the mean of samples × samples rays on a regular grid.
-      background: RGB where there is nothing.
+      background: RGB in [0, 1] of pixels without a surface.
 
     Returns:
       rgb [H, W, 3] float32 in [0, 1], and depth [H, W] float64: camera z at the
-      centre of each pixel, 0 where nothing is.
+      centre of each pixel, 0 for background.
 
     Raises:
       InputError: if ``samples`` is below 1.
     """
-    rgb = _picture(viewmat, K, (width, height), samples, background)
+    rgb = _image(viewmat, K, (width, height), samples, background)
     u, v = (a.ravel() + 0.5 for a in np.meshgrid(np.arange(width), np.arange(height)))
     depth, _ = _first_hits(*_rays(viewmat, K, u, v))
     return rgb, np.where(np.isfinite(depth), depth, 0).reshape(height, width)
 
 
 def surface_points(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Points as structure from motion would give: seen from the orbit, a little off.
+    """Return noisy surface points that the cameras see, as from structure from motion.
 
     Args:
-      count: how many.
-      seed: of the pixels that are looked through and of the noise.
+      count: number of points.
+      seed: seed of the sampled pixels and of the noise.
 
     Returns:
-      points [M, 3] float64 with noise of 0.004 in each coordinate, and their shaded
-      colours [M, 3] uint8.
+      points [M, 3] float64 with noise of σ = 0.004 in each coordinate, and their
+      shaded colours [M, 3] uint8.
     """
     rng = np.random.default_rng(seed)
     viewmats, K = demo_cameras(24, 1, 1)
@@ -104,14 +110,14 @@ def surface_points(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 def demo_cameras(
     count: int, width: int, height: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Cameras on two rings about the still life, the lower one first.
+    """Return cameras on two rings about the still life, the lower ring first.
 
     Args:
-      count: how many; the lower ring has half of them, or one more.
-      width, height: image size in px.
+      count: number of cameras; the lower ring has half of them, rounded up.
+      width, height: image size, px.
 
     Returns:
-      viewmats [4, 4] (world → camera), and the K [3, 3] that they share.
+      viewmats [4, 4] (world → camera), and their common K [3, 3].
     """
     focal = 0.5 * min(width, height) / np.tan(np.radians(41) / 2)
     K = np.asarray([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
@@ -137,8 +143,8 @@ def write_demo_dataset(
 
     Args:
       folder: created if missing.
-      settings: how much of it.
-      overwrite: whether files that exist may be replaced.
+      settings: default `DemoDatasetSettings()`.
+      overwrite: whether to replace existing files.
 
     Raises:
       InputError: if a file exists and ``overwrite`` is not set, or cannot be written.
@@ -155,7 +161,7 @@ def write_demo_dataset(
     make_folder(folder / "images")
     entries = []
     for name, photo, viewmat in zip(names, photos, viewmats):
-        rgb = _picture(viewmat, K, size, settings.samples, settings.background)
+        rgb = _image(viewmat, K, size, settings.samples, settings.background)
         write_file(photo, images.encode_png(images.to_8_bit(rgb)))
         camera = make_camera(viewmat=viewmat, K=K, width=size[0], height=size[1])
         entries.append(CameraEntry(name, camera))
@@ -167,7 +173,7 @@ def write_demo_dataset(
 
 @cache
 def solids() -> tuple[Solid, ...]:
-    """The still life; the floor comes first."""
+    """Return the still life, the floor first."""
     flat = np.eye(3)
 
     def turned(degrees: float) -> np.ndarray:
@@ -177,8 +183,8 @@ def solids() -> tuple[Solid, ...]:
     upright = turned(35) @ np.asarray([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     tilted = np.asarray([[0.8, 0, 0.6], [0, 1.0, 0], [-0.6, 0, 0.8]])
 
-    def put(shape, place, axes, paint):
-        return Solid(shape, np.asarray(place, float), axes, paint)
+    def put(shape, place, axes, color):
+        return Solid(shape, np.asarray(place, float), axes, color)
 
     half, major, minor = 0.46, 0.46, 0.17
     return (
@@ -195,30 +201,30 @@ def solids() -> tuple[Solid, ...]:
     )
 
 
-def _picture(viewmat, K, size: tuple[int, int], samples: int, background):
-    """[H, W, 3] float32: means over samples² rays a pixel."""
+def _image(viewmat, K, size: tuple[int, int], samples: int, background):
+    """Return an image [H, W, 3] float32, the mean over samples² rays a pixel."""
     if samples < 1:
-        raise InputError(f"samples is {samples}; at least 1 ray a pixel is wanted")
+        raise InputError(f"samples: expected at least 1 ray a pixel, got {samples}")
     width, height = size
     u = (np.arange(width * samples) + 0.5) / samples
     rows = max(1, _CHUNK // (width * samples * samples))
-    picture = np.empty((height, width, 3), np.float32)
+    image = np.empty((height, width, 3), np.float32)
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         v = (np.arange(top * samples, bottom * samples) + 0.5) / samples
         grid = (a.ravel() for a in np.meshgrid(u, v))
-        # float32 is half the time, and exact to 1e-6 of the scene.
+        # float32 takes half the time and is exact to 1e-6 of the scene.
         origin, directions = (a.astype(np.float32) for a in _rays(viewmat, K, *grid))
         rgb = _radiance(origin, directions, background)
         rgb = rgb.reshape(3, bottom - top, samples, width, samples).mean(axis=(2, 4))
-        picture[top:bottom] = np.moveaxis(rgb, 0, -1)
-    return picture
+        image[top:bottom] = np.moveaxis(rgb, 0, -1)
+    return image
 
 
 def _rays(viewmat, K, u: np.ndarray, v: np.ndarray):
-    """Origin [3] and directions [3, R] through pixels (u, v), with camera z 1.
+    """Return origin [3] and directions [3, R] through pixels (u, v), with camera z 1.
 
-    So the parameter of a hit is its depth.
+    The ray parameter of a hit is its depth.
     """
     viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
     x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
@@ -228,7 +234,7 @@ def _rays(viewmat, K, u: np.ndarray, v: np.ndarray):
 
 
 def _first_hits(origin: np.ndarray, directions: np.ndarray):
-    """(t [R], index [R]) of the first solid that each ray meets; inf where none."""
+    """Return (t [R], index [R]) of the first solid on each ray; t is inf if none."""
     first = np.full(directions.shape[1], np.inf, directions.dtype)
     which = np.zeros(directions.shape[1], int)
     square = dot(directions, directions)
@@ -255,38 +261,38 @@ def _radiance(origin: np.ndarray, directions: np.ndarray, background) -> np.ndar
 
 
 def _shade(points: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Colours [3, R] in [0, 1] of points on the solids ``which`` [R]."""
-    albedo, normals = np.empty_like(points), np.empty_like(points)
+    """Return colours [3, R] in [0, 1] of points on the solids ``which`` [R]."""
+    base, normals = np.empty_like(points), np.empty_like(points)
     for index, solid in enumerate(solids()):
         mine = np.flatnonzero(which == index)
         local = solid.local(points.take(mine, axis=1))
-        albedo[:, mine] = solid.paint(local)
+        base[:, mine] = solid.albedo(local)
         normals[:, mine] = solid.axes.astype(local.dtype) @ solid.shape.normal(local)
     facing = np.maximum(_SUN.astype(normals.dtype) @ normals, 0)
     sun, sky = facing, 0.66 + 0.34 * normals[2]
     for index, solid in enumerate(solids()[1:], start=1):
         other = which != index
         asked = (facing > 0) & (other if solid.shape.convex else True)
-        sun = sun * _sunlit(solid, points, normals, asked)
-        sky = sky * _open_sky(solid, points, normals, other)
+        sun = sun * _sun_visibility(solid, points, normals, asked)
+        sky = sky * _sky_visibility(solid, points, normals, other)
     # The floor hides the sky from what stands on it.
     sky *= np.where(which > 0, 0.55 + 0.45 * np.minimum(2 * points[2], 1), 1)
     warm, cool = np.asarray([(0.82, 0.79, 0.72), (0.50, 0.54, 0.59)], sun.dtype)
     light = np.outer(warm, sun) + np.outer(cool, sky)
-    return np.minimum(albedo * light, 1)
+    return np.minimum(base * light, 1)
 
 
-def _sunlit(solid: Solid, points, normals, asked: np.ndarray) -> np.ndarray:
-    """[R] in [0, 1]: how much of the sun passes by ``solid``; 1 where not ``asked``.
+def _sun_visibility(solid: Solid, points, normals, asked: np.ndarray) -> np.ndarray:
+    """Return [R] in [0, 1]: share of the sun that ``solid`` leaves visible.
 
-    The least angle by which a ray to the sun clears it, from marching along the ray,
-    with the closest approach between two steps estimated (S. Aaltonen, GDC 2018).
+    It follows from the smallest angle by which a ray to the sun clears the solid: the
+    ray is marched, and the closest approach between two steps estimated (S. Aaltonen,
+    GDC 2018). Points outside of ``asked`` [R] get 1.
     """
     lit = np.ones_like(points[0])
     offset = points - solid.centre.astype(points.dtype)[:, None]
-    ahead = -(
-        _SUN.astype(points.dtype) @ offset
-    )  # along the ray to where it is nearest the centre
+    # Distance along the ray to the point nearest the centre.
+    ahead = -(_SUN.astype(points.dtype) @ offset)
     reach = solid.shape.reach
     wide = reach + _PENUMBRA * np.maximum(ahead + reach, 0)
     aside = dot(offset, offset) - ahead * ahead
@@ -298,8 +304,8 @@ def _sunlit(solid: Solid, points, normals, asked: np.ndarray) -> np.ndarray:
     least, step = np.ones_like(t), np.zeros_like(t)
     for _ in range(_SHADOW_STEPS):
         gap = solid.shape.distance(start + t * sun)
-        # Had the last step the length of the gap there, then two balls are known to
-        # be free, and nearest to the ray is where they meet, ``back`` from here.
+        # If the last step was as long as the gap there, two balls are free, and the
+        # nearest point of the ray is where they meet, ``back`` from here.
         back = np.minimum(gap * gap / (2 * np.maximum(step, 1e-9)), gap)
         back = back * ((back < step) & (step > _LEAST_STEP) & (step < _MOST_STEP))
         closest = np.sqrt(gap * gap - back * back) * (gap > 0)
@@ -308,16 +314,16 @@ def _sunlit(solid: Solid, points, normals, asked: np.ndarray) -> np.ndarray:
         step = np.minimum(np.maximum(gap, _LEAST_STEP), _MOST_STEP)
         t = t + step
         going = np.flatnonzero((least > 1e-3) & (t < end))
-        if len(going) < 0.7 * len(rays):  # copying fewer costs more than it saves
+        if len(going) < 0.7 * len(rays):  # otherwise copying costs more than it saves
             rays, start, end = rays[going], start.take(going, axis=1), end[going]
             step, t, least = step[going], t[going], least[going]
     return lit
 
 
-def _open_sky(solid: Solid, points, normals, other: np.ndarray) -> np.ndarray:
-    """[R] in [0, 1]: how little ``solid`` hides of the sky (a heuristic).
+def _sky_visibility(solid: Solid, points, normals, other: np.ndarray) -> np.ndarray:
+    """Return [R] in [0, 1]: share of the sky that ``solid`` leaves visible.
 
-    By how much nearer than free space it is to a point above the surface.
+    A heuristic, from its distance to a point above the surface.
     """
     height = 0.45
     above = points + height * normals
@@ -331,7 +337,7 @@ def _open_sky(solid: Solid, points, normals, other: np.ndarray) -> np.ndarray:
 
 
 def _points_ply(points: np.ndarray, colors: np.ndarray) -> bytes:
-    """The PLY of a point cloud, as nerfstudio writes it: xyz, red green blue."""
+    """Return a PLY point cloud as nerfstudio writes it: xyz, red, green, blue."""
     kinds = [(name, "<f4") for name in "xyz"]
     kinds += [(name, "u1") for name in ("red", "green", "blue")]
     rows = np.empty(len(points), kinds)

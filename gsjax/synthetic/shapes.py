@@ -1,9 +1,9 @@
-"""Solids of the demonstration's ray caster: where rays hit, and how far they are.
+"""Solids of the ray caster: ray intersections, signed distances and normals.
 
-Axis legend: R rays or points. Arrays are [3, R], float32 or float64 (results are of
-the same type), in coordinates of the shape: its centre is the origin. A shape is a
-NamedTuple of functions, made by `sphere`, `box`, `torus` or `disc`; a `Solid` puts
-one into the world, with its paint.
+Arrays are [3, R], float32 or float64 (results have the same type), in coordinates of
+the shape, whose centre is the origin.
+
+Axis legend: R rays or points.
 """
 
 from collections.abc import Callable
@@ -11,19 +11,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-# A ray is marched this often (2 of 1000 that hit would want more), then has missed.
+# After this many steps a ray counts as a miss: 2 in 1000 hits need more.
 _TORUS_STEPS = 40
-_TORUS_NEAR = 2e-6  # ten times the rounding of float32
+_TORUS_NEAR = 2e-6  # ten times the rounding error of float32
 
 
 class Shape(NamedTuple):
     """The geometry of a solid.
 
     Attributes:
-      reach: radius of a ball about the origin that holds all of it.
-      convex: whether it cannot throw a shadow on itself.
+      reach: radius of a ball about the origin that contains the shape.
+      convex: whether it casts no shadow on itself.
       hit: (origin [3], directions [3, R]) → [R], the smallest t > 0 at which
-        origin + t · direction is on the surface; inf where there is none.
+        origin + t · direction is on the surface; inf if there is none.
       distance: points [3, R] → [R] signed distance, negative inside.
       normal: points [3, R] on the surface → [3, R], unit, outward.
     """
@@ -36,39 +36,39 @@ class Shape(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """A shape in the world.
+    """A shape with a pose and an albedo.
 
     Attributes:
       shape: the geometry.
       centre: [3] in the world.
-      axes: [3, 3], the columns are the axes of the shape in the world.
-      paint: points [3, R] of the shape → albedo [3, R] in [0, 1].
+      axes: [3, 3], whose columns are the axes of the shape in the world.
+      albedo: points [3, R] of the shape → [3, R] in [0, 1].
     """
 
     shape: Shape
     centre: np.ndarray
     axes: np.ndarray
-    paint: Callable[[np.ndarray], np.ndarray]
+    albedo: Callable[[np.ndarray], np.ndarray]
 
     def local(self, points: np.ndarray) -> np.ndarray:
-        """Points [3, R] of the world in coordinates of the shape."""
+        """Transform points [3, R] from the world to the shape."""
         centre, axes = (a.astype(points.dtype) for a in (self.centre, self.axes))
         return axes.T @ (points - centre[:, None])
 
 
 def sphere(radius: float) -> Shape:
-    """A ball about the origin."""
+    """Return a ball about the origin."""
     return Shape(
         reach=radius,
         convex=True,
-        hit=lambda origin, directions: ball_span(origin, directions, radius)[0],
+        hit=lambda origin, directions: ball_interval(origin, directions, radius)[0],
         distance=lambda points: np.sqrt(dot(points, points)) - radius,
         normal=lambda points: points / np.sqrt(dot(points, points)),
     )
 
 
 def box(half: tuple[float, float, float]) -> Shape:
-    """A box from −half to half (the method of slabs)."""
+    """Return a box from −half to half, intersected by the slab method."""
 
     def hit(origin, directions):
         sizes = np.asarray(half, directions.dtype)[:, None]
@@ -93,7 +93,7 @@ def box(half: tuple[float, float, float]) -> Shape:
 
 
 def torus(major: float, minor: float) -> Shape:
-    """A ring about the z axis; rays are marched by the distance to it."""
+    """Return a torus about the z axis, intersected by sphere tracing."""
 
     def distance(points):
         x, y, z = points
@@ -101,18 +101,18 @@ def torus(major: float, minor: float) -> Shape:
 
     def hit(origin, directions):
         found = np.full(directions.shape[1], np.inf, directions.dtype)
-        enter, leave = ball_span(origin, directions, major + minor)
+        enter, leave = ball_interval(origin, directions, major + minor)
         rays = np.flatnonzero(np.isfinite(leave))
         along, leave = directions[:, rays], leave[rays]
         speed = np.sqrt(dot(along, along))
-        # From inside the ball, start at the origin of the ray.
+        # Inside the ball, start at the origin of the ray.
         t = np.where(enter[rays] < leave, enter[rays], 0.0)
         for _ in range(_TORUS_STEPS):
             x, y, z = origin[:, None] + t * along
             ring = np.hypot(x, y)
             gap = np.hypot(ring - major, z) - minor
-            # Near by, Newton: along a ray the distance to a bulge is convex, so that
-            # it stays before the root; to a hollow it may pass it, and comes back.
+            # Newton steps near the surface: they do not pass the root at a convex part,
+            # where distance is convex along a ray; at a concave part they return.
             inward = 1 - major / np.maximum(ring, 1e-6)
             fall = -(inward * (x * along[0] + y * along[1]) + z * along[2])
             fall = fall / (speed * (gap + minor))
@@ -136,7 +136,7 @@ def torus(major: float, minor: float) -> Shape:
 
 
 def disc(radius: float) -> Shape:
-    """A disc in the plane z = 0 that faces +z; it has no thickness."""
+    """Return a disc without thickness in the plane z = 0, facing +z."""
 
     def hit(origin, directions):
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -157,14 +157,14 @@ def disc(radius: float) -> Shape:
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[R] of [3, R] twice; three products are faster than a sum over axis 0."""
+    """Return dot products [R] of [3, R]; faster than a sum over axis 0."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def ball_span(origin, directions, radius: float):
-    """(first t > 0, last t) of rays through a ball about 0; inf, inf where missed.
+def ball_interval(origin, directions, radius: float):
+    """Return (first t > 0, last t) at which rays meet a ball about 0; inf if missed.
 
-    From inside, both are where the ray leaves.
+    For an origin inside the ball, both are where the ray leaves it.
     """
     square = dot(directions, directions)
     middle = -(origin @ directions) / square

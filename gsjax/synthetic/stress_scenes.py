@@ -1,6 +1,6 @@
-"""Small scenes that are hard on a renderer, each in its own way, with one camera.
+"""Small scenes that stress a renderer, each with one camera.
 
-Everything is drawn from a fixed seed; the camera is at the origin and looks along z.
+Random numbers have fixed seeds; the camera is at the origin and looks along z.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from gsjax.synthetic.torus_knot import torus_knot_scene
 
 
 class StressScene(NamedTuple):
-    """A scene and a view of it."""
+    """Gaussians with a camera and a background."""
 
     name: str
     gaussians: Gaussians
@@ -24,40 +24,39 @@ class StressScene(NamedTuple):
 
 
 def knot(width: int = 240, height: int = 180) -> StressScene:
-    """A torus knot over a floor: opaque surfaces, SH degree 1."""
+    """Return a torus knot over a floor: opaque surfaces, SH degree 1."""
     scene = torus_knot_scene(3000, frames=1, width=width, height=height)
     return StressScene("knot", scene.gaussians, scene.cameras[0], scene.background)
 
 
 def fog(width: int = 240, height: int = 180, count: int = 6000) -> StressScene:
-    """Thousands of wide splats with opacities of about 1/255: what a cut leaves out
-    adds up."""
+    """Return thousands of wide splats with opacities near the cut-off of 1/255."""
     rng = np.random.default_rng(1)
     depth = rng.uniform(1, 9, count)
     scales = depth[:, None] * rng.uniform(0.01, 0.06, (count, 3))
     opacity = np.exp(rng.uniform(np.log(0.001), np.log(0.03), count))
-    return _trial("fog", depth, scales, opacity, rng, (width, height))
+    return _random_scene("fog", depth, scales, opacity, rng, (width, height))
 
 
 def needles(width: int = 240, height: int = 180, count: int = 1500) -> StressScene:
-    """Splats 30 to 300 px long and a hundredth of one wide, half opaque."""
+    """Return splats 30 to 300 px long, 0.01 px wide and half opaque."""
     rng = np.random.default_rng(2)
     depth = rng.uniform(2, 8, count)
     along = depth * np.exp(rng.uniform(np.log(0.03), np.log(0.3), count))
     thin = 1e-5 * depth
     scales = np.stack([thin, along, thin], axis=1)
     opacity = rng.uniform(0.2, 0.9, count)
-    return _trial("needles", depth, scales, opacity, rng, (width, height))
+    return _random_scene("needles", depth, scales, opacity, rng, (width, height))
 
 
 def huge(width: int = 240, height: int = 180, count: int = 4000) -> StressScene:
-    """One huge splat over many small ones."""
+    """Return one huge splat over many small ones."""
     rng = np.random.default_rng(3)
     depth = rng.uniform(2, 8, count)
     scales = depth[:, None] * rng.uniform(0.002, 0.012, (count, 3))
     opacity = rng.beta(2, 1, count).clip(0.01, 0.99)
     depth[0], scales[0], opacity[0] = 1.0, 2.0, 0.5
-    return _trial("huge", depth, scales, opacity, rng, (width, height))
+    return _random_scene("huge", depth, scales, opacity, rng, (width, height))
 
 
 STRESS_SCENES: dict[str, Callable[[], StressScene]] = {
@@ -68,10 +67,10 @@ STRESS_SCENES: dict[str, Callable[[], StressScene]] = {
 }
 
 
-def _trial(
+def _random_scene(
     name: str, depth, scales, opacity, rng, size: tuple[int, int]
 ) -> StressScene:
-    """Spread over the view and a little beyond, colours and rotations at random."""
+    """Return Gaussians at random over the view and a little beyond it."""
     width, height = size
     count, focal = len(depth), float(max(size))
     spread = 0.55 * np.asarray(size) / focal

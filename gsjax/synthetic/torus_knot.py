@@ -1,10 +1,9 @@
-"""Scenes made of nothing: a torus knot over a checkerboard, and cameras around it.
+"""A generated scene: Gaussians of a torus knot over a checkerboard, and an orbit.
+
+Light is baked on the host: a sun with a shadow map, a sky with ambient occlusion, and a
+highlight in SH degree 1. The result is deterministic; z is up, the floor is z = 0.
 
 Axis legend: N Gaussians, M Gaussians of the knot, F frames.
-
-Light is baked on the host, in the way of a small shader: a sun with a shadow map, a
-sky that near surfaces hide, and a highlight that SH degree 1 lets move with the
-view. Everything is deterministic; z is up and the floor is z = 0.
 """
 
 from typing import NamedTuple
@@ -13,6 +12,7 @@ import numpy as np
 
 from gsjax.cameras.camera import Camera, look_at, make_camera
 from gsjax.gaussians import Gaussians, make_gaussians
+from gsjax.synthetic.albedo import smooth_step
 
 _GOLDEN = (1 + 5**0.5) / 2
 _SUN = np.asarray([0.36, -0.3, 0.88]) / np.linalg.norm([0.36, -0.3, 0.88])
@@ -20,12 +20,12 @@ _C0, _C1 = 0.28209479177387814, 0.4886025119029199
 _CENTRE = np.asarray([0.0, 0.0, 1.42])
 _TUBE = 0.3
 _FLOOR_RADIUS = 4.4
-# What the floor fades into.
+# The floor fades into it.
 BACKGROUND = (0.93, 0.945, 0.955)
 
 
 class SyntheticScene(NamedTuple):
-    """Gaussians, an orbit of cameras [F], and the background that they go with."""
+    """Gaussians, an orbit of F cameras, and the matching background."""
 
     gaussians: Gaussians
     cameras: list[Camera]
@@ -46,12 +46,12 @@ class _Surfels(NamedTuple):
 def torus_knot_scene(
     count: int = 20_000, frames: int = 48, width: int = 640, height: int = 480
 ) -> SyntheticScene:
-    """A striped torus knot over a checkerboard floor, SH degree 1.
+    """Return a striped torus knot over a checkerboard floor, SH degree 1.
 
     Args:
-      count: Gaussians of the knot; those of the floor come on top, about half.
-      frames: cameras of the orbit.
-      width, height: image size of the cameras.
+      count: number of Gaussians of the knot; the floor adds about half as many.
+      frames: number of cameras of the orbit.
+      width, height: image size, px.
     """
     knot = _knot(count)
     floor = _floor(count)
@@ -72,15 +72,15 @@ def orbit(
     elevation: float = 24.0,
     field_of_view: float = 38.0,
 ) -> list[Camera]:
-    """Cameras on a horizontal circle that look at its axis; angles in degrees.
+    """Return cameras on a horizontal circle that look at a target.
 
     Args:
-      frames: how many, evenly spaced.
-      width, height: image size.
-      target: the point in the middle of the images.
-      radius: distance from it.
-      elevation: angle above the horizontal.
-      field_of_view: of the shorter side of the image.
+      frames: number of cameras, evenly spaced.
+      width, height: image size, px.
+      target: point in the middle of the images.
+      radius: distance from the target.
+      elevation: angle above the horizontal, degrees.
+      field_of_view: of the shorter side of the image, degrees.
     """
     focal = 0.5 * min(width, height) / np.tan(np.radians(field_of_view) / 2)
     K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
@@ -95,7 +95,7 @@ def orbit(
 
 
 def _knot(count: int) -> _Surfels:
-    """The (2, 3) torus knot as a tube, sampled by the golden ratio."""
+    """Return the (2, 3) torus knot as a tube, sampled by the golden ratio."""
     index = np.arange(count) + 0.5
     t = 2 * np.pi * index / count
     around = 2 * np.pi * ((index * _GOLDEN) % 1)
@@ -105,9 +105,9 @@ def _knot(count: int) -> _Surfels:
     means = (path + _TUBE * normals) @ tilt.T + _CENTRE
     length = np.linalg.norm(tangent, axis=1).mean() * 2 * np.pi
     spacing = np.sqrt(length * 2 * np.pi * _TUBE / count)
-    # Two families of helical stripes; 3 turns of the palette close on themselves.
-    stripe = _soft_square(np.cos(3 * around + 24 * t), 0.2)
-    thin = _soft_square(np.cos(24 * t) - 0.9, 0.08)
+    # Two families of helical stripes.
+    stripe = smooth_step(np.cos(3 * around + 24 * t), 0.2)
+    thin = smooth_step(np.cos(24 * t) - 0.9, 0.08)
     albedo = _palette(t / (2 * np.pi))
     albedo = albedo * (1 - 0.3 * stripe[:, None])
     albedo += (np.asarray([0.98, 0.95, 0.88]) - albedo) * thin[:, None]
@@ -117,7 +117,7 @@ def _knot(count: int) -> _Surfels:
 
 
 def _knot_frame(t: np.ndarray):
-    """Path [M, 3], its derivative, and two unit normals of it."""
+    """Return the path [M, 3], its derivative, and two unit normals."""
     ring = np.stack([np.cos(2 * t), np.sin(2 * t), 0 * t], -1)
     along = np.stack([-np.sin(2 * t), np.cos(2 * t), 0 * t], -1)
     up = np.asarray([0.0, 0.0, 1.0])
@@ -132,7 +132,7 @@ def _knot_frame(t: np.ndarray):
 
 
 def _floor(count: int) -> _Surfels:
-    """A disc of checkerboard at z = 0 that fades out, about count / 2 Gaussians."""
+    """Return a checkerboard disc at z = 0 that fades out, about count / 2 Gaussians."""
     square = 0.55
     per_square = max(2, round(square / np.sqrt(2 * np.pi * _FLOOR_RADIUS**2 / count)))
     spacing = square / per_square
@@ -155,14 +155,14 @@ def _floor(count: int) -> _Surfels:
 
 
 def _shaded(surfels: _Surfels, caster: _Surfels) -> dict[str, np.ndarray]:
-    """Fields of `make_gaussians`, with the light that reaches past ``caster``."""
+    """Return fields of `make_gaussians`, lit past the shadow of ``caster``."""
     means, normals = surfels.means, surfels.normals
     facing = normals @ _SUN
     sun = np.clip(facing, 0, 1) * _sunlit(means, caster.means)
     sky = (0.62 + 0.38 * normals[:, 2]) * _open_sky(means, normals, caster.means)
     light = 0.72 * sun[:, None] * (1.0, 0.96, 0.88)
     light = light + 0.6 * sky[:, None] * (0.9, 0.97, 1.06)
-    # A highlight towards the mirrored sun: SH directions point away from the camera.
+    # Highlight towards the mirrored sun; SH directions point away from the camera.
     mirrored = 2 * facing[:, None] * normals - _SUN
     highlight = (surfels.gloss * (sun > 0) * np.sqrt(sun))[:, None]
     sh = np.zeros((len(means), 4, 3))
@@ -180,7 +180,7 @@ def _shaded(surfels: _Surfels, caster: _Surfels) -> dict[str, np.ndarray]:
 
 
 def _sunlit(points: np.ndarray, casters: np.ndarray) -> np.ndarray:
-    """[N] in [0, 1]: share of a small patch of the sun's map that is not nearer."""
+    """Return [N] in [0, 1]: share of a patch of the shadow map that is not nearer."""
     size, cells = 5.0, 72
     right = np.cross(_SUN, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -203,7 +203,7 @@ def _sunlit(points: np.ndarray, casters: np.ndarray) -> np.ndarray:
 
 
 def _open_sky(points: np.ndarray, normals: np.ndarray, casters: np.ndarray):
-    """[N] in [0, 1]: how little of the hemisphere near casters hide (a heuristic)."""
+    """Return [N] in [0, 1]: visible share of the sky (a heuristic)."""
     some = casters[:: max(1, len(casters) // 400)]
     height = normals @ some.T - (normals * points).sum(1)[:, None]
     square = (points**2).sum(1)[:, None] + (some**2).sum(1) - 2 * points @ some.T
@@ -212,7 +212,7 @@ def _open_sky(points: np.ndarray, normals: np.ndarray, casters: np.ndarray):
 
 
 def _quats_of_normals(normals: np.ndarray) -> np.ndarray:
-    """Shortest rotations [N, 4] (wxyz) that take z to each normal."""
+    """Return the shortest rotations [N, 4] (wxyz) from z to each normal."""
     x, y, z = normals.T
     quats = np.stack([1 + z, -y, x, 0 * z], -1)
     quats[z < -1 + 1e-6] = (0.0, 1.0, 0.0, 0.0)
@@ -224,14 +224,8 @@ def _rotation_x(angle: float) -> np.ndarray:
     return np.asarray([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
 
 
-def _soft_square(wave: np.ndarray, width: float) -> np.ndarray:
-    """0 … 1 step of ``wave`` through 0, ``width`` wide on either side."""
-    x = np.clip((wave / width + 1) / 2, 0, 1)
-    return x * x * (3 - 2 * x)
-
-
 def _palette(turn: np.ndarray) -> np.ndarray:
-    """Colours [M, 3] of a closed path: teal, blue, violet, coral, amber."""
+    """Return colours [M, 3] of a cyclic palette: teal, blue, violet, coral, amber."""
     stops = np.asarray(
         [
             (0.07, 0.60, 0.62),

@@ -1,11 +1,11 @@
-"""Where a run starts: at the points of a scene, or anywhere in view of it."""
+"""Initial Gaussians at the points of a dataset or at random, and their extents."""
 
 from dataclasses import replace
 
 import jax
 import numpy as np
 import pytest
-from captures import scene_of_views
+from captures import dataset_of_views
 
 import gsjax
 from gsjax import look_at
@@ -16,8 +16,6 @@ from gsjax.errors import InputError
 from gsjax.init.gaussians import init_gaussians, neighbour_distance, points_in_ball
 from gsjax.math.sh import dc_to_rgb
 
-FAR = 1e3  # an extent that clips nothing
-
 
 def brute_force(points):
     distance = np.linalg.norm(points[:, None] - points, axis=-1)
@@ -26,13 +24,13 @@ def brute_force(points):
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 5, 200])
-def test_distance_to_the_three_nearest(count):
+def test_neighbour_distance_matches_brute_force(count):
     points = np.random.default_rng(0).normal(size=(count, 3))
-    found = neighbour_distance(points, FAR)
+    found = neighbour_distance(points, 1e3)  # an extent that clips nothing
     np.testing.assert_allclose(found, brute_force(points), rtol=1e-12)
 
 
-def test_distance_where_there_are_no_neighbours():
+def test_neighbour_distance_without_neighbours():
     assert neighbour_distance(np.zeros((1, 3)), 5.0).tolist() == [0.05]
     assert neighbour_distance(np.zeros((0, 3)), 5.0).shape == (0,)
     same = neighbour_distance(np.ones((7, 3)), 5.0)
@@ -42,8 +40,8 @@ def test_distance_where_there_are_no_neighbours():
 
 
 @pytest.mark.parametrize(("extent", "most"), [(5.0, 0.5), (1.0, None)])
-def test_distance_of_points_far_from_all_others(extent, most):
-    """A tenth of the extent, or three times the median of all."""
+def test_neighbour_distance_of_outliers_is_clipped(extent, most):
+    """To a tenth of the extent, or three times the median."""
     points = np.concatenate([np.random.default_rng(0).normal(size=(99, 3)), [[99] * 3]])
     points *= 0.1
     found, wanted = neighbour_distance(points, extent), brute_force(points)
@@ -53,7 +51,7 @@ def test_distance_of_points_far_from_all_others(extent, most):
     assert np.sum(found == found[-1]) < 10
 
 
-def test_extent():
+def test_scene_extent():
     centres = np.asarray([[0.0, 0, 0], [4, 0, 0], [2, 6, 0]]) + 100
     wanted = 1.1 * np.linalg.norm([0, 4, 0])  # the mean is (2, 2, 0)
     assert scene_extent(centres) == pytest.approx(wanted)
@@ -62,9 +60,11 @@ def test_extent():
 
 
 @pytest.mark.parametrize("at", [(0, 0, 0), (1.3, 2.1, 0.7), (1000, 2000, 5)])
-def test_cameras_on_a_tripod_are_in_one_place(at):
-    """But for the rounding of −Rᵀt."""
-    views = [replace(v, viewmat=turned) for v, turned in zip(*on_a_tripod(at))]
+def test_cameras_on_a_tripod_coincide(at):
+    """Up to the rounding of −Rᵀt."""
+    rng = np.random.default_rng(1)
+    turned = [look_at(at, np.add(at, rng.normal(size=3))) for _ in range(5)]
+    views = [replace(v, viewmat=m) for v, m in zip(dataset_of_views(5).views, turned)]
     centres = np.stack([view.centre for view in views])
     assert np.ptp(centres, axis=0).max() < 1e-11
     assert scene_extent(centres) == 1.0
@@ -72,53 +72,42 @@ def test_cameras_on_a_tripod_are_in_one_place(at):
     assert scene_extent(centres + 1e-6 * np.eye(5, 3)) < 1e-5
 
 
-def on_a_tripod(at):
-    views, rng = scene_of_views(5).views, np.random.default_rng(1)
-    return views, [look_at(at, np.add(at, rng.normal(size=3))) for _ in views]
-
-
-def test_the_extent_of_training_is_not_less_than_its_points_want():
-    """In any unit; that of the cameras where they stand apart."""
-    scene = scene_of_views(points=500)
-    centres = np.stack([view.centre for view in scene.views])
-    assert extent_of(scene) == scene_extent(centres)
+def test_extent_has_a_lower_bound_from_the_points_in_any_unit():
+    dataset = dataset_of_views(points=500)
+    centres = np.stack([view.centre for view in dataset.views])
+    assert extent_of(dataset) == scene_extent(centres)
     for at in ((0, 0, -4), (1000, 2000, 5)):
-        views, turns = scene_of_views(5).views, []
-        for index in range(5):
-            turns.append(look_at(np.add(at, 1e-9 * index), np.add(at, [0, 0, 1])))
-        views = tuple(replace(v, viewmat=m) for v, m in zip(views, turns))
-        points = scene.points * 0.3 + at + np.asarray([0, 0, 4])
+        points = dataset.points * 0.3 + at + np.asarray([0, 0, 4])
         for unit in (1e-3, 1.0, 1e3):
-            resized = [v.viewmat.copy() for v in views]
-            for viewmat in resized:
+            views = []
+            for index, view in enumerate(dataset_of_views(5).views):
+                viewmat = look_at(np.add(at, 1e-9 * index), np.add(at, [0, 0, 1]))
                 viewmat[:3, 3] *= unit
-            some = tuple(replace(v, viewmat=m) for v, m in zip(views, resized))
-            narrow = replace(scene, views=some, points=points * unit)
+                views.append(replace(view, viewmat=viewmat))
+            narrow = replace(dataset, views=tuple(views), points=points * unit)
             assert extent_of(narrow) == pytest.approx(0.4 * unit, rel=0.05)
             centres = np.stack([view.centre for view in narrow.views])
             near = near_plane(centres, least_extent(narrow))
             assert near == pytest.approx(min(NEAR, 8e-4 * unit), rel=0.05)
-    assert extent_of(replace(scene_of_views(1), points=np.zeros((0, 3)))) == 1.0
+    assert extent_of(replace(dataset_of_views(1), points=np.zeros((0, 3)))) == 1.0
 
 
 def test_points_become_gaussians():
-    scene = scene_of_views(points=40)
-    gaussians = init_gaussians(scene, sh_degree=2, opacity=0.3, scale=0.5)
+    dataset = dataset_of_views(points=40)
+    gaussians = init_gaussians(dataset, sh_degree=2, opacity=0.3, scale=0.5)
     params = gaussians.params
     assert gaussians.active.all()
     assert gaussians.capacity == 40
     assert params.sh.shape == (40, 9, 3)
-    np.testing.assert_array_equal(params.means, scene.points)
+    np.testing.assert_array_equal(params.means, dataset.points)
     np.testing.assert_allclose(jax.nn.sigmoid(params.logit_opacities), 0.3, rtol=1e-12)
-    rms = brute_force(scene.points)
-    wanted = 0.5 * np.minimum(rms, max(0.1 * extent_of(scene), 3 * np.median(rms)))
-    np.testing.assert_allclose(
-        np.exp(params.log_scales), np.repeat(wanted[:, None], 3, 1), rtol=1e-12
-    )
+    rms = brute_force(dataset.points)
+    wanted = 0.5 * np.minimum(rms, max(0.1 * extent_of(dataset), 3 * np.median(rms)))
+    scales = np.exp(params.log_scales)
+    np.testing.assert_allclose(scales, np.repeat(wanted[:, None], 3, 1), rtol=1e-12)
     np.testing.assert_array_equal(params.quats, np.tile([1.0, 0, 0, 0], (40, 1)))
-    np.testing.assert_allclose(
-        dc_to_rgb(params.sh[:, 0]) * 255, scene.colors, atol=1e-9
-    )
+    colors = dc_to_rgb(params.sh[:, 0]) * 255
+    np.testing.assert_allclose(colors, dataset.colors, atol=1e-9)
     assert (params.sh[:, 1:] == 0).all()
 
 
@@ -127,91 +116,79 @@ def test_points_become_gaussians():
     [[[1.0, 2, 3]], [[0.0, 0, 0], [1, 0, 0]], [[1.0, 1, 1]] * 6, np.eye(3)],
     ids=["one", "two", "identical", "three"],
 )
-def test_few_points_are_finite_and_visible(points):
+def test_few_points_give_finite_gaussians(points):
     points = np.asarray(points, float)
     colors = np.full((len(points), 3), 200, np.uint8)
-    scene = replace(scene_of_views(), points=points, colors=colors)
-    gaussians = init_gaussians(scene, capacity=8)
+    dataset = replace(dataset_of_views(), points=points, colors=colors)
+    gaussians = init_gaussians(dataset, capacity=8)
     assert gaussians.capacity == 8
     assert gsjax.num_active(gaussians) == len(points)
     for leaf in jax.tree.leaves(gaussians.params):
         assert np.isfinite(leaf).all()
 
 
-def test_points_that_are_no_numbers_are_left_out():
-    scene = scene_of_views(points=9)
-    points = scene.points.copy()
+def test_nonfinite_points_are_ignored():
+    dataset = dataset_of_views(points=9)
+    points = dataset.points.copy()
     points[3, 1], points[7, 0] = np.nan, np.inf
     left = np.delete(np.arange(9), [3, 7])
-    found = init_gaussians(replace(scene, points=points))
-    wanted = init_gaussians(
-        replace(scene, points=points[left], colors=scene.colors[left])
+    fewer = replace(dataset, points=points[left], colors=dataset.colors[left])
+    found, wanted = (
+        init_gaussians(d) for d in (replace(dataset, points=points), fewer)
     )
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted)):
         np.testing.assert_array_equal(a, b)
 
 
-def test_of_too_many_some_are_drawn():
-    scene = scene_of_views(points=50)
-    few = init_gaussians(scene, max_count=20, seed=1)
+def test_a_subset_is_drawn_from_too_many_points():
+    dataset = dataset_of_views(points=50)
+    few, again, other = (
+        init_gaussians(dataset, max_count=20, seed=s) for s in (1, 1, 2)
+    )
     means = np.asarray(few.params.means)
-    places = [np.flatnonzero((scene.points == m).all(1)) for m in means]
+    places = [np.flatnonzero((dataset.points == m).all(1)) for m in means]
     assert all(len(p) == 1 for p in places)
     assert (np.diff(np.concatenate(places)) > 0).all()  # each once, in order
-    again, other = (init_gaussians(scene, max_count=20, seed=s) for s in (1, 2))
     np.testing.assert_array_equal(again.params.means, means)
     assert not np.array_equal(other.params.means, means)
-    # As wide as those are apart that are left.
-    np.testing.assert_allclose(
-        few.params.log_scales[:, 0],
-        np.log(neighbour_distance(means, extent_of(scene))),
-    )
+    spacing = np.log(neighbour_distance(means, extent_of(dataset)))  # of the subset
+    np.testing.assert_allclose(few.params.log_scales[:, 0], spacing)
 
 
-def test_random_ones_are_in_view():
-    scene = scene_of_views(points=0)
-    gaussians = init_gaussians(scene, random_count=3000, seed=3)
+def test_random_points_are_uniform_in_a_visible_ball():
+    dataset = dataset_of_views(points=0)
+    gaussians = init_gaussians(dataset, random_count=3000, seed=3)
     means = np.asarray(gaussians.params.means)
-    extent = scene_extent(np.stack([view.centre for view in scene.views]))
-    away = (
-        np.linalg.norm(means - focus_point([v.viewmat for v in scene.views]), axis=1)
-        / extent
-    )
+    extent = scene_extent(np.stack([view.centre for view in dataset.views]))
+    middle = focus_point([view.viewmat for view in dataset.views])
+    away = np.linalg.norm(means - middle, axis=1) / extent
     assert away.max() <= 1
-    # Even in the ball: the cube of the distance is uniform.
+    # In a uniform ball the cube of the distance is uniform.
     shares = np.histogram(away**3, 10, (0, 1))[0]
     assert np.sum((shares - 300) ** 2 / 300) < 34  # χ², 9 degrees, 0.9999
-    # Cameras side by side see more of what is before them than they are apart.
+    # Parallel cameras see a larger region than their distance.
     turned = [look_at((x, 0, 0), (0, 0, 10.0)) for x in (-0.6, 0.6)]
-    views = tuple(replace(v, viewmat=m) for v, m in zip(scene.views, turned))
-    away = points_in_ball(replace(scene, views=views), 3000, np.random.default_rng(0))
+    views = tuple(replace(v, viewmat=m) for v, m in zip(dataset.views, turned))
+    away = points_in_ball(replace(dataset, views=views), 3000, np.random.default_rng(0))
     away = np.linalg.norm(away - [0, 0, 10], axis=1)
     assert away.max() == pytest.approx(5, rel=0.01)
     colors = dc_to_rgb(np.asarray(gaussians.params.sh[:, 0]))
     assert colors.min() >= 0
     assert colors.max() <= 1
-    assert init_gaussians(scene, random_count=30, max_count=10).capacity == 10
+    assert init_gaussians(dataset, random_count=30, max_count=10).capacity == 10
 
 
 @pytest.mark.parametrize(
-    ("kwargs", "named"),
+    ("changes", "kwargs", "message"),
     [
-        *(({"opacity": value}, "opacity") for value in (0.0, 1.0, np.nan)),
-        *(({"scale": value}, "scale") for value in (0.0, -1.0, np.inf, np.nan)),
+        *(({}, {"opacity": value}, "opacity") for value in (0.0, 1.0, np.nan)),
+        *(({}, {"scale": value}, "scale") for value in (0.0, -1.0, np.inf, np.nan)),
+        ({"colors": np.zeros((8, 3), np.uint8)}, {}, "9 points and 8 colours"),
+        ({"points": np.zeros((0, 3))}, {}, "no points"),
     ],
     ids=str,
 )
-def test_out_of_range(kwargs, named):
-    with pytest.raises(InputError, match=named):
-        init_gaussians(scene_of_views(points=9), **kwargs)
-
-
-def test_a_colour_for_each_point():
-    scene = scene_of_views(points=9)
-    with pytest.raises(InputError, match="9 points and 8 colours"):
-        init_gaussians(replace(scene, colors=scene.colors[:8]))
-
-
-def test_no_points():
-    with pytest.raises(InputError, match="no points to start from"):
-        init_gaussians(scene_of_views(points=0))
+def test_rejected(changes, kwargs, message):
+    dataset = replace(dataset_of_views(points=9), **changes)
+    with pytest.raises(InputError, match=message):
+        init_gaussians(dataset, **kwargs)
