@@ -1,4 +1,4 @@
-"""A capture small enough to train on in a test: 4 views of 32 × 24 px, 60 points."""
+"""A small dataset to train on in tests: 4 views of 32 × 24 px, 60 points."""
 
 from dataclasses import replace
 from functools import cache
@@ -17,15 +17,16 @@ from gsjax.init.gaussians import init_gaussians
 from gsjax.io.images import to_8_bit
 
 VIEWS, POINTS, WIDTH, HEIGHT = 4, 60, 32, 24
-# Small programs: they take longest in these tests.
 RASTER = RasterConfig(**{**LIGHT, "pair_capacity": 4096})
-# No threshold within reach, so that finite differences are those of the gradient.
-SMOOTH = RASTER.replace(alpha_min=1e-14, alpha_max=1 - 1e-9, stop=0, stop_rule="after")
+# Without thresholds, for finite differences.
+SMOOTH = RASTER.replace(
+    alpha_min=1e-14, alpha_max=1 - 1e-9, transmittance_min=0, stop_rule="after"
+)
 
 
 @cache
-def scene() -> Dataset:
-    """Cameras around coloured points; no files."""
+def dataset() -> Dataset:
+    """Return cameras around coloured points; no files."""
     rng = np.random.default_rng(0)
     views = []
     for index in range(VIEWS):
@@ -40,19 +41,19 @@ def scene() -> Dataset:
     return Dataset(Path("made"), "made", tuple(views), points, colors)
 
 
-EXTENT = extent_of(scene())
+EXTENT = extent_of(dataset())
 
 
 def true_gaussians() -> gsjax.Gaussians:
-    """What the scene consists of."""
-    return init_gaussians(scene(), sh_degree=0, opacity=0.8, scale=0.6)
+    """Return the Gaussians that the photographs show."""
+    return init_gaussians(dataset(), sh_degree=0, opacity=0.8, scale=0.6)
 
 
 @cache
 def photos() -> list[Photo]:
-    """Its photographs."""
+    """Return the photographs of the dataset."""
     with jax.enable_x64(False):
-        return [photo_of(true_gaussians(), view) for view in scene().views]
+        return [photo_of(true_gaussians(), view) for view in dataset().views]
 
 
 _render = jax.jit(
@@ -61,7 +62,7 @@ _render = jax.jit(
 
 
 def photo_of(gaussians: gsjax.Gaussians, view: View, background=(0.0, 0.0, 0.0)):
-    """What the view would see."""
+    """Return the photograph of a view."""
     camera = gsjax.make_camera(
         viewmat=view.viewmat, K=view.K, width=WIDTH, height=HEIGHT
     )
@@ -70,8 +71,8 @@ def photo_of(gaussians: gsjax.Gaussians, view: View, background=(0.0, 0.0, 0.0))
 
 
 def rough_start(sh_degree: int, capacity: int, seed: int = 1) -> gsjax.Gaussians:
-    """Gaussians to learn from, near the true ones: too wide, and of wrong colours."""
-    start = scene()
+    """Return initial Gaussians near the true ones: too wide, with wrong colours."""
+    start = dataset()
     rng = np.random.default_rng(seed)
     points = start.points + 0.05 * rng.normal(size=start.points.shape)
     colors = rng.integers(0, 256, start.colors.shape).astype(np.uint8)
@@ -81,7 +82,7 @@ def rough_start(sh_degree: int, capacity: int, seed: int = 1) -> gsjax.Gaussians
         opacity=0.5,
         capacity=capacity,
     )
-    # Of spheres the gradient by the rotation is rounding alone, and Adam follows it.
+    # Not spheres: their gradient by the rotation is rounding, which Adam amplifies.
     params = made.params
     stretch = jnp.asarray(rng.normal(0, 0.4, params.log_scales.shape))
     quats = jnp.asarray(rng.normal(size=params.quats.shape), params.quats.dtype)
@@ -90,12 +91,12 @@ def rough_start(sh_degree: int, capacity: int, seed: int = 1) -> gsjax.Gaussians
 
 
 def copy(tree):
-    """Arrays of its own, to be donated."""
+    """Return a copy that may be donated."""
     return jax.tree.map(jnp.copy, tree)
 
 
 def bits(tree) -> list[tuple]:
-    """All that the leaves are, random keys included."""
+    """Return name, dtype, shape and bytes of each leaf, random keys included."""
     out = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
@@ -106,5 +107,5 @@ def bits(tree) -> list[tuple]:
 
 
 def changed(first, second) -> list[str]:
-    """Names of the leaves that differ in a bit."""
+    """Return the names of the leaves that are not bit-equal."""
     return [a[0] for a, b in zip(bits(first), bits(second), strict=True) if a != b]

@@ -63,7 +63,7 @@ def copy_into(tree: Tree, source: Array, new: Tree) -> Tree:
     copied = source < source.shape[0]
 
     def leaf(old, new):
-        row = new.at[source].get(mode="clip")
+        row = jnp.asarray(new).at[source].get(mode="clip")
         return jnp.where(slot_mask(copied, old), row, old)
 
     return jax.tree.map(leaf, tree, new)

@@ -60,11 +60,8 @@ def test_one_picture_keeps_its_pixels(tmp_path):
     np.testing.assert_array_equal(pixels_of(path.read_bytes()), eight)
     picture(image, zoom=2).save(str(path))
     np.testing.assert_array_equal(pixels_of(path.read_bytes())[::2, ::2], eight)
-
-
-def test_a_small_picture_is_displayed_enlarged_and_stored_as_it_is():
-    png, size = picture(random_picture(12, 16))._repr_png_()
-    assert size == {"width": 240, "height": 180}
+    png, size = picture(image)._repr_png_()
+    assert size == {"width": 240, "height": 180}, "displayed enlarged"
     assert pixels_of(png).shape == (12, 16, 3)
 
 
@@ -167,18 +164,6 @@ def test_nothing_is_drawn_without_values():
     jax.tree.map(lambda a: a.delete(), donated)
     seen.append(donated._repr_png_())
     assert not any(seen)
-
-
-def test_jupyter_finds_the_display_methods():
-    formatters = pytest.importorskip("IPython.core.formatters")
-    scene, camera = scene_of("random")
-    ask = formatters.DisplayFormatter().format
-    data, size = ask(picture(random_picture()))
-    assert pixels_of(data["image/png"]).shape == (12, 16, 3)
-    assert size["image/png"]["width"] == 240
-    assert "image/png" in ask(scene)[0]
-    assert "text/html" in ask(camera)[0]
-    assert "text/html" in ask(movie([random_picture()]))[0]
 
 
 @pytest.mark.parametrize("kind", ["webp", "gif", "webm"])
