@@ -40,9 +40,9 @@ class BenchCommand(HeavyCommand):
     def run(self) -> int:
         check_suffix("--plot", self.plot, ".png")
         start_jax()
-        from gsjax.bench.pareto import front, pareto, points, stages
+        from gsjax.bench.pareto import front, make_points, measure_points, time_stages
         from gsjax.bench.report import front_picture, table
-        from gsjax.bench.scenes import open_stress_scene
+        from gsjax.bench.scenes import open_bench_scene
         from gsjax.io import images
         from gsjax.planning.plan import plan
         from gsjax.runtime import files
@@ -50,7 +50,7 @@ class BenchCommand(HeavyCommand):
 
         outputs = [path for path in (self.json, self.plot) if path is not None]
         files.refuse_existing(outputs, self.overwrite)
-        scene = open_stress_scene(self.scene, cameras=self.cameras, size=self.size)
+        scene = open_bench_scene(self.scene, cameras=self.cameras, size=self.size)
         planned = None
         if self.budget is not None:
             planned = plan(
@@ -61,8 +61,8 @@ class BenchCommand(HeavyCommand):
             )
             for line in planned.lines():
                 note(line)
-        rows = pareto(scene, points(scene.gaussians, planned), self.repeats)
-        parts = stages(scene, self.repeats)
+        rows = measure_points(scene, make_points(scene.gaussians, planned), self.repeats)
+        parts = time_stages(scene, self.repeats)
         where = machine()
         facts = ", ".join(f"{name} {value}" for name, value in where.items())
         say(f"{scene.name}, {scene.camera.width} × {scene.camera.height}; {facts}")

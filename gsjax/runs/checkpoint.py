@@ -16,14 +16,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.io.npy import read_npy
 from gsjax.runtime.files import make_folder, opened, write_file
-from gsjax.train.state import TrainState
+from gsjax.train.state import TrainState, state_arrays, state_from_arrays
 
 _KEEP = 2
 _FORMAT = 1
@@ -52,10 +50,6 @@ class Checkpoint(NamedTuple):
     meta: dict[str, Any]
 
 
-def _is_key(leaf) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
 def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Path:
     """Write the state, then remove all but the latest two checkpoints.
 
@@ -72,14 +66,7 @@ def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Pa
       InputError: if writing fails; earlier checkpoints are kept.
     """
     make_folder(folder)
-    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
-    arrays = {
-        jax.tree_util.keystr(path): np.asarray(
-            jax.random.key_data(leaf) if _is_key(leaf) else leaf
-        )
-        for path, leaf in leaves
-    }
-    step = int(state.step)
+    arrays, step = state_arrays(state), int(state.step)
     header = {**meta, "format": _FORMAT, "step": step}
     header["capacity"], header["arrays"] = state.gaussians.capacity, sorted(arrays)
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -274,21 +261,4 @@ def restore(checkpoint: Checkpoint, template: TrainState) -> TrainState:
       InputError: if the checkpoint was written under other settings.
     """
     where = f"{checkpoint.path}: the checkpoint of step {checkpoint.step}"
-    remedy = "it has other settings; pass those of the run, or train again"
-    leaves, structure = jax.tree_util.tree_flatten_with_path(template)
-    names = [jax.tree_util.keystr(path) for path, _ in leaves]
-    if set(names) != set(checkpoint.arrays):
-        differing = sorted(set(names) ^ set(checkpoint.arrays))[:3]
-        raise InputError(f"{where} differs in {differing}: {remedy}")
-    out = []
-    for name, (_, leaf) in zip(names, leaves):
-        array = checkpoint.arrays[name]
-        like = jax.random.key_data(leaf) if _is_key(leaf) else leaf
-        if array.shape != like.shape or array.dtype != like.dtype:
-            raise InputError(
-                f"{where}: expected {name} of {like.dtype} {like.shape}, got "
-                f"{array.dtype} {array.shape}: {remedy}"
-            )
-        value = jnp.asarray(array)
-        out.append(jax.random.wrap_key_data(value) if _is_key(leaf) else value)
-    return jax.tree_util.tree_unflatten(structure, out)
+    return state_from_arrays(where, checkpoint.arrays, template)

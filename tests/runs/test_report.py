@@ -1,11 +1,13 @@
-"""What a run says of itself as it goes."""
+"""Progress that a run reports."""
 
 import math
+import time
 
 import jax.numpy as jnp
 import pytest
 
-from gsjax.runs.report import Reporter, _smoothed
+from gsjax.runs import report
+from gsjax.runs.report import Reporter
 from gsjax.train.config import Level, TrainConfig
 from gsjax.train.loop import Progress
 from gsjax.train.state import Metrics
@@ -13,69 +15,60 @@ from gsjax.train.state import Metrics
 CONFIG = TrainConfig(steps=100, levels=(Level(0.0, 4), Level(0.5, 2), Level(0.8, 1)))
 
 
-def progress(step: int, seconds: float, compiling: float) -> Progress:
+def progress(step: int, compile_seconds: float = 0.0, psnr: float = 0.0) -> Progress:
     metrics = Metrics(*map(jnp.asarray, [0] * len(Metrics._fields)))
-    metrics = metrics._replace(step=jnp.asarray(step))
-    return Progress(metrics, seconds, compiling, 1, CONFIG.divisor(step), 64)
+    metrics = metrics._replace(step=jnp.asarray(step), psnr=jnp.asarray(psnr))
+    return Progress(metrics, 200.0, compile_seconds, 1, CONFIG.divisor(step), 64)
 
 
-def test_the_time_left_knows_of_larger_pictures_and_of_compiling(monkeypatch, capsys):
-    monkeypatch.setattr("gsjax.runs.report._LINE_SECONDS", 0.0)
+def test_time_left_weighs_image_sizes_and_excludes_compilation(monkeypatch, capsys):
+    monkeypatch.setattr(report, "_LINE_SECONDS", 0.0)
+    clock = [time.time()]
     reporter = Reporter(CONFIG)
-    reporter.step(progress(10, 30.0, 20.0))  # a step a second, twenty for a program
-    assert reporter.left(10) == pytest.approx(40 + 2 * 30 + 4 * 20 + 2 * 20)
-    reporter.step(progress(60, 120.0, 20.0 + 30.0))
-    assert reporter.rate == pytest.approx(50 / 60)
-    assert reporter.left(60) == pytest.approx(60 / 50 * (20 + 2 * 20) + 25)
-    reporter.step(progress(100, 200.0, 50.0))
-    assert reporter.left(100) == 0
+    monkeypatch.setattr(reporter.bar, "_time", lambda: clock[0])
+    reporter.bar.start_t = reporter.bar.last_print_t = clock[0]
+    clock[0] += 20.0
+    reporter.step(progress(1, compile_seconds=20.0))
+    for step in range(2, 51):
+        clock[0] += 1.0  # a step at a quarter of the size
+        reporter.step(progress(step, compile_seconds=20.0))
+    left = (reporter.bar.total - reporter.bar.n) / reporter.bar.format_dict["rate"]
+    assert left == pytest.approx(30 * 2 + 20 * 4, rel=0.02)
+    reporter.step(progress(100, compile_seconds=20.0))
     reporter.close()
-    *_, before, last = capsys.readouterr().err.splitlines()
-    assert "step 60/100: loss 0.0000, 0.00 dB, 0 Gaussians, 0.8 steps/s" in before
-    assert last.endswith("3:20 gone, 0:00 left")
+    *_, last = capsys.readouterr().err.splitlines()
+    assert last.startswith("gsjax: step 100/100, loss 0.0000, 0.00 dB, 0 Gaussians")
+    assert last.endswith("03:20 elapsed, 00:00 left")
 
 
-def test_what_is_no_number_is_not_in_the_mean():
-    """The PSNR of a photograph that is masked altogether."""
-    mean = float("nan")
-    for value, wanted in ((float("inf"), None), (20.0, 20.0), (float("inf"), 20.0)):
-        mean = _smoothed(mean, value)
-        assert mean == wanted if wanted else math.isnan(mean)
-    assert 20 < _smoothed(mean, 30.0) < 30
-    assert _smoothed(mean, float("nan")) == mean
-
-
-def test_of_the_first_steps_nothing_is_foretold(monkeypatch, capsys):
-    """They are slow; and where all are, they are waited for no longer than usual."""
-    monkeypatch.setattr("gsjax.runs.report._LINE_SECONDS", 0.5)
+def test_the_mean_ignores_values_that_are_not_finite():
+    """The PSNR of a fully masked photograph is infinite."""
     reporter = Reporter(CONFIG)
-    reporter.last = 0.0  # long ago, as after compiling
-    for step in range(1, 20):
-        reporter.step(progress(step, 20.02 * step, 20.0 * step))
-    assert capsys.readouterr().err == ""
-    reporter.step(progress(20, 420.4, 420.0))
-    assert "step 20/100" in capsys.readouterr().err
-    reporter.last = 0.0
-    reporter.step(progress(21, 421.4, 420.0))
-    assert "1.0 steps/s" in capsys.readouterr().err
+    reporter.step(progress(1, psnr=math.inf))
+    assert math.isnan(reporter.psnr)
+    for step, psnr in enumerate((20.0, math.inf, math.nan), 2):
+        reporter.step(progress(step, psnr=psnr))
+        assert reporter.psnr == 20.0
+    reporter.step(progress(5, psnr=30.0))
+    assert 20 < reporter.psnr < 30
+    reporter.close()
 
 
-def test_a_bar_on_a_terminal(monkeypatch, capsys):
+def test_a_terminal_shows_a_bar(monkeypatch, capsys):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    monkeypatch.setattr("gsjax.runs.report._BAR_SECONDS", 0.0)
     reporter = Reporter(CONFIG, 99)
-    reporter.step(progress(100, 2.0, 1.0))
-    reporter.bar.refresh()
-    told = capsys.readouterr().err
+    reporter.step(progress(100))
     reporter.close()
-    assert "100/100" in told
-    assert "0:00 left, loss" in told
+    shown = capsys.readouterr().err
+    assert "100%|" in shown
+    assert "step 100/100, loss" in shown
 
 
-def test_that_there_may_be_no_more_is_said_once(capsys):
+def test_reaching_the_maximum_is_reported_once(capsys):
     reporter = Reporter(CONFIG)
     for wanted in (CONFIG.max_gaussians, *[CONFIG.max_gaussians + 1] * 2):
-        reporter.tell_if_full(wanted)
-    (told,) = capsys.readouterr().err.splitlines()
-    assert f"{CONFIG.max_gaussians + 1:,} Gaussians are wanted" in told
-    assert "(train --max-gaussians)" in told, "the demonstration has no such option"
+        reporter.report_if_full(wanted)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"asks for {CONFIG.max_gaussians + 1:,} Gaussians" in line
+    assert "(train --max-gaussians)" in line
+    reporter.close()
