@@ -4,6 +4,7 @@ Public names are loaded on first use, so importing gsjax does not import JAX. Th
 prepares the process for rendering on CPUs; see `gsjax.runtime.setup.prepare_process`.
 """
 
+import sys
 import typing
 from importlib import import_module
 from importlib.util import find_spec
@@ -91,6 +92,8 @@ __all__ = list(_MODULES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 def __getattr__(name: str):
     if name in _MODULES:
+        if "ipykernel" in sys.modules:  # a notebook: attach the display methods
+            import_module("gsjax.viewer.notebook")
         module = import_module(f"gsjax.{_MODULES[name]}")
         if not hasattr(module, name):  # a submodule
             import_module(f"{module.__name__}.{name}")

@@ -40,7 +40,7 @@ def opencv():
 
 
 def shrink(pixels: np.ndarray, max_size: int) -> np.ndarray:
-    """Scale an image down until its longer side is at most ``max_size`` px; 0: never."""
+    """Scale an image down to ``max_size`` px of its longer side; 0 changes nothing."""
     height, width = pixels.shape[:2]
     scale = max_size / max(height, width) if max_size else 1.0
     if scale >= 1:

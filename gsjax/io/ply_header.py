@@ -152,35 +152,29 @@ def check_properties(header: Header, required: Collection[str]) -> int:
     """
     path, found = header.path, header.vertex.types
     lists = [name for name, kind in found.items() if kind is None]
-    if lists:
-        raise InputError(
-            f"{path}: expected scalar properties of element vertex, got the list "
-            f"properties {lists[:8]}; export the scene as a 3DGS PLY"
-        )
     rest = sum(re.fullmatch("f_rest_[0-9]+", name) is not None for name in found)
     missing = [name for name in required if name not in found]
-    if "f_dc_0" in missing and {"red", "green", "blue"} <= found.keys():
-        raise InputError(
-            f"{path}: this is a point cloud (red, green, blue), not a Gaussian PLY "
-            f"(missing: {', '.join(missing)}); train a scene from the points first"
-        )
-    if "packed_position" in found:
-        raise InputError(
-            f"{path}: this is a compressed (packed) Gaussian PLY, which is not "
-            "supported; convert it to the standard, uncompressed PLY"
-        )
+    cloud = "f_dc_0" in missing and {"red", "green", "blue"} <= found.keys()
     if rest in _F_REST_COUNTS:
         missing += [f"f_rest_{i}" for i in range(rest) if f"f_rest_{i}" not in found]
-    if missing:
-        raise InputError(
-            f"{path}: element vertex lacks the properties {', '.join(missing)}; found "
-            f"{len(found)}: {', '.join([*found][:20])}; export the scene as a 3DGS PLY"
-        )
-    if rest not in _F_REST_COUNTS:
-        raise InputError(
-            f"{path}: expected {_F_REST_COUNTS} properties f_rest_* (SH degree 0 to "
-            f"{MAX_DEGREE}), got {rest}; export the scene again"
-        )
+    names, export = ", ".join(missing), "export the scene as a 3DGS PLY"
+    fault = ""
+    if lists:
+        fault = f"element vertex has the list properties {lists[:8]}; {export}"
+    elif cloud:
+        fault = "this is a point cloud (red, green, blue), not a Gaussian PLY "
+        fault += f"(missing: {names}); train a scene from the points first"
+    elif "packed_position" in found:
+        fault = "this is a compressed (packed) Gaussian PLY, which is not supported; "
+        fault += "convert it to the standard, uncompressed PLY"
+    elif missing:
+        fault = f"element vertex lacks the properties {names}; found {len(found)}: "
+        fault += f"{', '.join([*found][:20])}; {export}"
+    elif rest not in _F_REST_COUNTS:
+        fault = f"expected {_F_REST_COUNTS} properties f_rest_* (SH degree 0 to "
+        fault += f"{MAX_DEGREE}), got {rest}; {export}"
+    if fault:
+        raise InputError(f"{path}: {fault}")
     return 1 + rest // 3
 
 

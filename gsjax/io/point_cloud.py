@@ -57,7 +57,7 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
             "leave out some of them where the file was made",
         )
         points, colors, (darkest, brightest) = _read(file, header, names, unit, narrow)
-    bad = ~(np.abs(points) < 1e30).all(axis=1)
+    bad = np.isnan(points[:, 0])
     if bad.any():
         raise InputError(
             f"{path}: expected finite coordinates and colours, got others in "
@@ -95,5 +95,7 @@ def _read(
             darkest = min(darkest, values.min(initial=0.0))
             values = np.clip(values, 0, 1) * 255 if unit else values
             colors[rows, axis] = np.rint(np.clip(values, 0, np.iinfo(kind).max))
+        # Block by block: a temporary copy of all points would double the memory.
+        points[rows][~(np.abs(points[rows]) < 1e30).all(axis=1)] = np.nan
         start += size
     return points, colors, (darkest, brightest)

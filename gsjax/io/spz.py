@@ -12,7 +12,7 @@ import zlib
 from os import PathLike
 from pathlib import Path
 from struct import Struct
-from typing import BinaryIO, NamedTuple, cast
+from typing import BinaryIO, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -45,14 +45,6 @@ _BITS = (6, 5)  # kept of harmonics of degree 1, and above; zero bits compress w
 _MAX_RATIO = 1032  # of any deflated data
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
 _MIN_OPACITY = 0.25 / 255  # rounds to 0
-
-
-class _Header(NamedTuple):
-    version: int
-    rows: int
-    degree: int
-    fraction: int
-    flags: int
 
 
 def read_spz(path: str | PathLike[str]) -> Gaussians:
@@ -90,10 +82,10 @@ def read_spz(path: str | PathLike[str]) -> Gaussians:
 
 
 def _read(stream: BinaryIO, path: Path, size: int) -> Gaussians:
-    header = _read_header(stream, path)
-    bases, count = num_bases(header.degree), header.rows
+    version, count, degree, fraction, flags = _read_header(stream, path)
+    bases = num_bases(degree)
     widths = {"means": 9, "opacities": 1, "colors": 3, "scales": 3}
-    widths["quats"] = 3 if header.version == 2 else 4
+    widths["quats"] = 3 if version == 2 else 4
     widths["sh"] = 3 * (bases - 1)
     if count * sum(widths.values()) > _MAX_RATIO * size:
         raise InputError(
@@ -116,10 +108,10 @@ def _read(stream: BinaryIO, path: Path, size: int) -> Gaussians:
         parts[name] = np.frombuffer(raw, np.uint8).reshape(count, width)
     if stream.read(1):
         what = "bytes after the last Gaussian are ignored"
-        if header.flags & _EXTENSIONS:
+        if flags & _EXTENSIONS:
             what = "extensions are ignored, and may change colours"
         warn(f"{path}: {what}")
-    if header.flags & _ANTIALIASED:
+    if flags & _ANTIALIASED:
         warn(
             f"{path}: the scene was trained with antialiasing; render it with "
             "RasterConfig(antialias=True)"
@@ -127,10 +119,10 @@ def _read(stream: BinaryIO, path: Path, size: int) -> Gaussians:
     sh = np.zeros((count, bases, 3), np.float32)
     sh[:, 0] = (parts["colors"] / 255 - 0.5) / _COLOR
     rest = parts["sh"].reshape(count, bases - 1, 3)
-    signs = _signs(header.degree)
+    signs = _signs(degree)
     sh[:, 1:] = (rest.astype(np.float32) - 128) / 128 * signs[1:, None]
     return make_gaussians(
-        means=_integers(parts["means"]) / 2.0**header.fraction * _HALF_TURN,
+        means=_integers(parts["means"]) / 2.0**fraction * _HALF_TURN,
         quats=_unpack_quats(parts["quats"]),
         log_scales=parts["scales"].astype(np.float32) / _SCALE - _SHIFT,
         logit_opacities=_logits(parts["opacities"][:, 0]),
@@ -139,7 +131,8 @@ def _read(stream: BinaryIO, path: Path, size: int) -> Gaussians:
     )
 
 
-def _read_header(stream: BinaryIO, path: Path) -> _Header:
+def _read_header(stream: BinaryIO, path: Path) -> tuple[int, int, int, int, int]:
+    """Return version, number of Gaussians, degree, fraction and flags."""
     raw = stream.read(_HEADER.size)
     if len(raw) < _HEADER.size or raw[:4] != _MAGIC:
         raise InputError(
@@ -147,16 +140,17 @@ def _read_header(stream: BinaryIO, path: Path) -> _Header:
             f"{_MAGIC!r}, got {raw[:8]!r}; export or download it again"
         )
     _, version, rows, degree, fraction, flags, _ = _HEADER.unpack(raw)
-    header = _Header(version, rows, degree, fraction, flags)
-    known = {"version": (2, 3), "degree": range(5), "fraction": range(25)}
-    for name, values in known.items():
-        value = getattr(header, name)
-        if value not in values:
+    for name, value, least, most in (
+        ("version", version, 2, 3),
+        ("degree", degree, 0, 4),
+        ("fraction", fraction, 0, 24),
+    ):
+        if not least <= value <= most:
             raise InputError(
-                f"{path}: expected a header with {name} {values[0]} to {values[-1]}, "
-                f"got {value}; export the file in another version"
+                f"{path}: expected a header with {name} {least} to {most}, got {value}"
+                "; export the file in another version"
             )
-    return header
+    return version, rows, degree, fraction, flags
 
 
 def _logits(opacities: np.ndarray) -> np.ndarray:

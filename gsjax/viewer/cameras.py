@@ -88,19 +88,10 @@ def frusta_of(views: Sequence[View], photos: Sequence[Photo] = ()) -> list[Frust
     for index in np.unique(few.astype(int)):
         view = views[index]
         fov = 2 * np.arctan(view.height / (2 * view.K[1, 1]))
-        pixels = _thumbnail(photos[index].pixels) if len(photos) else None
+        pixels = images.shrink(photos[index].pixels, THUMBNAIL) if len(photos) else None
         aspect = view.width / view.height
         out.append(Frustum(view.name, view.viewmat, float(fov), aspect, pixels))
     return out
-
-
-def _thumbnail(pixels: np.ndarray) -> np.ndarray:
-    scale = THUMBNAIL / max(pixels.shape[:2])
-    if scale >= 1:
-        return pixels
-    height, width = (max(1, round(scale * side)) for side in pixels.shape[:2])
-    cv2 = images.opencv()
-    return cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def viewpoint_of_cameras(frusta: Sequence[Frustum]) -> Viewpoint:

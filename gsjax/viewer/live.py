@@ -49,7 +49,8 @@ class LiveViewer:
             step = int(progress.metrics.step)
             last, now = step == config.steps, time.monotonic()
             server = self.server
-            if server is not None and not last and not self.is_due(server, now):
+            early = server is not None and (now < self.due or server.busy)
+            if early and not last:
                 return
             gaussians = copy_to_one_device(state.gaussians)
             jax.block_until_ready(gaussians)
@@ -63,10 +64,6 @@ class LiveViewer:
             self.due = now + max(_INTERVAL, took / _SHARE)
 
         return after_step
-
-    def is_due(self, server: ViewerServer, now: float) -> bool:
-        """Return True if the next copy is due and the last one has been shown."""
-        return now >= self.due and not server.busy
 
     def wait_for_browsers(self) -> None:
         """Block until no browser is connected, or Ctrl-C."""

@@ -219,10 +219,7 @@ def _display(value, **options):
     try:
         from IPython.display import display
     except ImportError as error:
-        raise MissingExtraError(
-            "IPython, which notebooks run on, is missing; install it: "
-            "pip install ipython"
-        ) from error
+        raise MissingExtraError("IPython is missing: pip install ipython") from error
     return display(value, **options)
 
 

@@ -237,56 +237,29 @@ def test_opacities_of_zero_and_one_round_trip(tmp_path):
     assert np.isfinite(found).all()
 
 
-def test_an_empty_scene_is_written_and_read(tmp_path):
-    empty = gsjax.select(given(0), np.zeros(3, bool))
-    for suffix in (".spz", ".splat"):
-        gsjax.save(tmp_path / f"a{suffix}", empty)
-    assert int(gsjax.num_active(gsjax.load(tmp_path / "a.spz"))) == 0
-    assert (tmp_path / "a.splat").read_bytes() == b""
-
-
 # --- values out of range ---
 
 FEW = np.asarray([[1.0, 0, 0], [0, 0, 0], [1, 2, 3]])
 WHITE = np.zeros((3, 1, 3))
 WHITE[2, 0, 1] = 2.0
-CLIPPED = {
-    "log scales": (
-        "a.spz",
-        {"log_scales": np.full((3, 3), -11.0), "means": 0 * FEW},
-        "3 of 3 Gaussians have log scales",
-    ),
-    "colours": (
-        "a.spz",
-        {"sh": np.full((3, 1, 3), 4.0)},
-        "3 of 3 Gaussians have colours",
-    ),
-    "harmonics": (
-        "a.spz",
-        {"sh": np.ones((3, 4, 3)) * [[[0]], [[1.5]], [[-1]]]},
-        "1 of 3 Gaussians have harmonics",
-    ),
-    "means": ("a.spz", {"means": 9e4 * FEW}, "2 of 3 Gaussians have means"),
-    "splat colours": ("a.splat", {"sh": WHITE}, r"1 of 3 colours are out of \[0, 1\]"),
-    "splat means": (
-        "a.splat",
-        {"means": np.asarray([[5e6 + 0.3, 0, 0], [0, 0, 0], [1, 2, 3]])},
-        "1 of 3 Gaussians have means rounded by",
-    ),
-}
+CLIPPED = [
+    (".spz", {"log_scales": np.full((3, 3), -11.0), "means": 0 * FEW}, "3 of 3 .*log"),
+    (".spz", {"sh": np.full((3, 1, 3), 4.0)}, "3 of 3 Gaussians have colours"),
+    (".spz", {"sh": np.ones((3, 4, 3)) * [[[0]], [[1.5]], [[-1]]]}, "1 of 3 .*harmoni"),
+    (".spz", {"means": 9e4 * FEW}, "2 of 3 Gaussians have means"),
+    (".splat", {"sh": WHITE}, r"1 of 3 colours are out of \[0, 1\]"),
+    (".splat", {"means": 5e6 * FEW + [[0.3], [0], [0]]}, "1 of 3 Gaussians have means"),
+]
 
 
-@pytest.mark.parametrize("case", CLIPPED)
-def test_lost_precision_is_warned_about(tmp_path, case):
-    name, changes, message = CLIPPED[case]
-    with (
-        jax.enable_x64(case == "splat means"),
-        pytest.warns(UserWarning, match=message) as caught,
-    ):
-        gsjax.save(tmp_path / name, given(0, **changes))
+@pytest.mark.parametrize("row", range(len(CLIPPED)))
+def test_lost_precision_is_warned_about(tmp_path, row):
+    suffix, changes, message = CLIPPED[row]
+    with jax.enable_x64(True), pytest.warns(UserWarning, match=message) as caught:
+        gsjax.save(tmp_path / f"a{suffix}", given(0, **changes))
     assert len(caught) == 1
-    if case == "splat colours":
-        raw = (tmp_path / name).read_bytes()
+    if changes.get("sh") is WHITE:
+        raw = (tmp_path / "a.splat").read_bytes()
         assert {raw[32 * k + 25] for k in range(3)} == {128, 255}
 
 
@@ -303,16 +276,17 @@ def test_values_are_clipped_to_the_nearest(tmp_path):
         np.testing.assert_allclose(found.sh[0, basis], [1, -1, 0.5], atol=1 / 128)
 
 
-@pytest.mark.parametrize("suffix", [".spz", ".splat"])
-def test_gaussians_that_are_never_drawn_are_left_out(tmp_path, suffix):
+def test_gaussians_that_are_never_drawn_are_left_out(tmp_path):
     quats = np.asarray([[1, 0, 0, 0], [0, 0, 0, 0], [0, 1e-20, 0, 0]])
-    path = tmp_path / f"a{suffix}"
-    with pytest.warns(UserWarning, match="1 of 3 quaternions are zero"):
-        gsjax.save(path, given(0, quats=quats))
-    if suffix == ".splat":
-        assert path.stat().st_size == 64
-    else:
-        assert gsjax.load(path).capacity == 2
+    empty = gsjax.select(given(0), np.zeros(3, bool))
+    for suffix in (".spz", ".splat"):
+        with pytest.warns(UserWarning, match="1 of 3 quaternions are zero"):
+            gsjax.save(tmp_path / f"a{suffix}", given(0, quats=quats))
+        gsjax.save(tmp_path / f"empty{suffix}", empty)
+    assert gsjax.load(tmp_path / "a.spz").capacity == 2
+    assert len((tmp_path / "a.splat").read_bytes()) == 64
+    assert int(gsjax.num_active(gsjax.load(tmp_path / "empty.spz"))) == 0
+    assert (tmp_path / "empty.splat").read_bytes() == b""
 
 
 BOTH, NOT_FINITE = (".spz", ".splat"), "1 of 3 Gaussians are NaN or infinite"
@@ -369,25 +343,17 @@ def test_splat_files_follow_the_layout(tmp_path):
         np.testing.assert_allclose(found, rotations(given())[index], atol=0.03)
 
 
-# --- the command line ---
-
-
 def test_export_selects_the_format_by_suffix(tmp_path, capsys):
-    gsjax.save(tmp_path / "a.ply", given())
+    quats = np.asarray([[1, 0, 0, 0], [0, 0, 0, 0], [0, 1, 0, 0]])
+    gsjax.save(tmp_path / "a.ply", given(quats=quats))
     out = tmp_path / "new" / "b.spz"
     assert main(["export", str(tmp_path / "a.ply"), str(out)]) == 0
-    assert capsys.readouterr().out.startswith(f"{out}  3 Gaussians")
-    assert_alike(gsjax.load(out), given(), 1 / 32)
-    assert main(["info", str(out)]) == 0
-    assert "Gaussians         3" in capsys.readouterr().out
+    assert "2 of 3 Gaussians" in capsys.readouterr().out
+    assert gsjax.load(out).capacity == 2
     args = ["export", str(out), str(tmp_path / "c.splat")]
     assert main(args) == 0
     assert "degree 1 to 3 are left out" in capsys.readouterr().err
     assert main([*args, "--overwrite", "--sh-degree", "0"]) == 0
     assert capsys.readouterr().err == ""
-    quats = np.asarray([[1, 0, 0, 0], [0, 0, 0, 0], [0, 1, 0, 0]])
-    gsjax.save(tmp_path / "e.ply", given(quats=quats))
-    assert main(["export", str(tmp_path / "e.ply"), str(tmp_path / "e.spz")]) == 0
-    assert "2 of 3 Gaussians" in capsys.readouterr().out
     assert main(["export", str(out), str(tmp_path / "d.xyz")]) == 3
     assert "a suffix of .ply, .splat, .spz, got" in capsys.readouterr().err

@@ -57,17 +57,13 @@ def test_animations_round_trip(tmp_path, suffix, unit, width, height):
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
-def test_one_frame_is_an_animation(tmp_path):
-    data = encode_animation(".webp", pictures(1), 10)
-    (tmp_path / "a.webp").write_bytes(data)
-    assert len(animation_of(tmp_path / "a.webp")[0]) == 1
-
-
 def test_gifs_have_at_most_50_frames_per_second(tmp_path):
     write_movie(tmp_path / "a.gif", pictures(4), fps=200)
     assert animation_of(tmp_path / "a.gif")[1] == [20] * 4
     assert played_rate(".gif", 200) == 1000 / 20
     assert (played_rate(".gif", 24), played_rate(".webp", 200)) == (24, 200)
+    (tmp_path / "a.webp").write_bytes(encode_animation(".webp", pictures(1), 10))
+    assert len(animation_of(tmp_path / "a.webp")[0]) == 1
 
 
 @pytest.mark.parametrize(("width", "height"), [(65, 47), (64, 48), (1, 1)])
@@ -83,12 +79,6 @@ def test_webm_is_vp9_of_even_size(tmp_path, capfd, width, height):
     assert_alike([f[:height, :width] for f in found], expected, 10)
     assert capfd.readouterr().err == ""
     assert [p.name for p in tmp_path.iterdir()] == ["a.webm"]
-
-
-def test_a_relative_name_with_a_colon_is_a_file(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert write_movie(Path("2026-11-24T10:30/a.webm"), pictures(4)) == 4
-    assert len(video_of(tmp_path / "2026-11-24T10:30" / "a.webm")[0]) == 4
 
 
 @pytest.mark.parametrize("name", ["shots", "shots.png"])
@@ -111,14 +101,17 @@ def test_folders_of_pngs(tmp_path, name):
     assert (folder / "notes.txt").exists()
 
 
-def test_existing_files_are_replaced_only_when_asked(tmp_path):
-    path = tmp_path / "a.webm"
+def test_an_existing_file_is_replaced_only_when_asked(tmp_path, monkeypatch):
+    """Also by a relative name that FFmpeg would take for a network address."""
+    monkeypatch.chdir(tmp_path)
+    path = Path("2026-11-24T10:30/a.webm")
+    path.parent.mkdir()
     path.write_bytes(b"mine")
     with pytest.raises(gsjax.InputError, match="exists; pass --overwrite"):
         write_movie(path, pictures())
     assert path.read_bytes() == b"mine"
     write_movie(path, pictures(), overwrite=True)
-    assert len(path.read_bytes()) > 100
+    assert len(video_of(tmp_path / path)[0]) == 6
 
 
 def failing():

@@ -55,12 +55,9 @@ def test_bulk_parsing_agrees_with_python(lines, end, ended):
         np.testing.assert_array_equal(numbers, expected)
 
 
-@pytest.mark.parametrize("word", ["1_0", "\uff11", "", "x", "1e", "0x1", "nan(1)"])
-def test_other_words_are_rejected(word):
-    with pytest.raises(ValueError, match="could not convert"):
-        parse_number(word)
-
-
-def test_other_than_digits_counts_bytes():
+def test_other_words_are_rejected_and_counted():
+    for word in ("1_0", "\uff11", "", "x", "1e", "0x1", "nan(1)"):
+        with pytest.raises(ValueError, match="could not convert"):
+            parse_number(word)
     other = other_than_digits(as_bytes("12 3.5\n7a"))
     assert other.tolist() == [0, 0, 0, 0, 0, 1, 1, 1, 1, 2]
