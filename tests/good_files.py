@@ -1,4 +1,4 @@
-"""A small good file of every format that is read, and what reads it."""
+"""A small good file of every format, and the function that reads it."""
 
 import io
 import json
@@ -60,7 +60,7 @@ READ: dict[str, Callable[[Path], object]] = {
     "eval.json": lambda path: describe_run(path.parent),
     "cameras.json": lambda path: load_cameras(SCENE, path),
 }
-# A prefix of text may be another, shorter file: it is warned of where it can be told.
+# A prefix of text may be a valid shorter file, which gives a warning if it is detected.
 TEXT = (
     "ascii.ply",
     "cloud.ply",
@@ -107,7 +107,7 @@ def write_good_files(folder: Path) -> None:
 
 
 def npy(array) -> bytes:
-    """A .npy file."""
+    """Return an array as the bytes of a .npy file."""
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=True)
     return buffer.getvalue()
@@ -116,7 +116,7 @@ def npy(array) -> bytes:
 def entries(
     edit: Callable[[dict[str, bytes]], object], method: int = zipfile.ZIP_STORED
 ) -> Callable[[bytes], bytes]:
-    """Rewrites an archive with what ``edit`` makes of its entries: whole checksums."""
+    """Return a change that edits the entries of a ZIP archive, with valid checksums."""
 
     def change(data: bytes) -> bytes:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -132,7 +132,7 @@ def entries(
 
 
 def as_ascii(data: bytes) -> bytes:
-    """The same PLY as text."""
+    """Return the same PLY as text."""
     head, body = data.split(b"end_header\n")
     rows = np.frombuffer(body, "<f4").reshape(len(SCENE.points), 17)
     head = head.replace(b"binary_little_endian", b"ascii") + b"end_header\n"

@@ -16,8 +16,6 @@ from gsjax.runtime.files import read_bytes
 def read_text(path: Path, expected: str) -> bytes:
     """Return the UTF-8 text of a file, without byte order mark and carriage returns.
 
-    Warns if the last line has no end.
-
     Args:
       path: path of the file.
       expected: kind of file to pass instead, for the message.
@@ -38,28 +36,27 @@ def read_text(path: Path, expected: str) -> bytes:
             ) from error
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    if data and not data.endswith(b"\n"):
-        warnings.warn(
-            f"{path}: the last line has no end; the file may be truncated: export or "
-            "copy it again",
-            UserWarning,
-            stacklevel=3,
-        )
     return data
 
 
 def lines(path: Path, data: bytes) -> Iterator[tuple[str, bytes]]:
-    """Yield the place of each line, for messages, and its bytes without the end."""
+    """Yield the place of each line, for messages, and its bytes without the end.
+
+    Warns if the last line has no end.
+    """
     start = number = 0
     while start < len(data):
         number, end = number + 1, data.find(b"\n", start)
         end = len(data) if end < 0 else end
         yield f"{path}: line {number}", data[start:end]
         start = end + 1
+    _warn_if_unterminated(path, data)
 
 
 def blocks(path: Path, data: bytes, most: int) -> Iterator[tuple[int, bytes]]:
     """Yield blocks of whole lines, each with the number of lines before it.
+
+    Warns if the last line has no end.
 
     Raises:
       InputError: if a line has more than ``most`` bytes.
@@ -73,6 +70,17 @@ def blocks(path: Path, data: bytes, most: int) -> Iterator[tuple[int, bytes]]:
         block = data[start : end or len(data)]
         yield number, block
         start, number = start + len(block), number + block.count(b"\n")
+    _warn_if_unterminated(path, data)
+
+
+def _warn_if_unterminated(path: Path, data: bytes) -> None:
+    if data and not data.endswith(b"\n"):
+        warnings.warn(
+            f"{path}: the last line has no end; the file may be truncated: export or "
+            "copy it again",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def too_long(where: str, most: int) -> InputError:
