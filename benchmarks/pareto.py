@@ -22,9 +22,9 @@ import measure
 import scenes
 
 import gsjax
-from gsjax.bench.pareto import front, pareto, points, stages
+from gsjax.bench.pareto import front, make_points, measure_points, time_stages
 from gsjax.bench.report import front_picture, table
-from gsjax.bench.scenes import open_stress_scene
+from gsjax.bench.scenes import open_bench_scene
 from gsjax.io import images
 from gsjax.runtime import files
 from gsjax.synthetic.stress_scenes import STRESS_SCENES, StressScene
@@ -36,7 +36,7 @@ def trial_of(name: str) -> StressScene:
     """A scene of the benchmarks, or as `gsjax bench` opens it."""
     if name in REAL and not Path(name).exists():
         return StressScene(*REAL[name](), background=(0.0, 0.0, 0.0))
-    return open_stress_scene(name)
+    return open_bench_scene(name)
 
 
 def measured(trial: StressScene, planned: bool) -> bool:
@@ -47,11 +47,11 @@ def measured(trial: StressScene, planned: bool) -> bool:
         made = gsjax.plan(
             trial.gaussians, trial.camera, budget=1 / 255, background=behind
         )
-    rows = pareto(trial, points(trial.gaussians, made))
+    rows = measure_points(trial, make_points(trial.gaussians, made))
     print(f"{trial.name}, {trial.camera.width} × {trial.camera.height}")
     print(table(rows, front(rows)))
     measure.save(
-        f"pareto_{trial.name}", rows, claim=__doc__, stages=stages(trial),
+        f"pareto_{trial.name}", rows, claim=__doc__, stages=time_stages(trial),
         size=[trial.camera.width, trial.camera.height],
         reasons=made.lines() if made else [],
     )  # fmt: skip

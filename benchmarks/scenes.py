@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import gsjax
-from gsjax.bench.scenes import facing
+from gsjax.bench.scenes import facing_camera
 from gsjax.math.sh import rgb_to_dc
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -44,7 +44,7 @@ def guitar() -> Case:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # 667 opacities of +inf are clamped
         gaussians = gsjax.load(DATA / "guitar" / "guitar.ply")
-    return Case("guitar", gaussians, facing(gaussians, 800, 600))
+    return Case("guitar", gaussians, facing_camera(gaussians, 800, 600))
 
 
 def garden(count: int = 100_000, opacity: float = 0.1) -> Case:

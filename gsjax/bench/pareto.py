@@ -1,9 +1,8 @@
-"""Time against error: one scene, one view, one knob of accuracy or size at a time.
+"""Run time against error: one setting of accuracy or size changes at a time.
 
-The exact picture, and its gradient, are those of the renderer in float64 with cut and
-stop at 1e-9. At some pixels, the worst of every point among them, errors are held
-against what theory allows (`gsjax.bench.pixelwise`), and the exact picture against a
-dense one. Capacities are fitted to the view; programs are compiled at one size.
+The exact image and gradient are the renderer's in float64 with cutoffs of 1e-9. At some
+pixels, including the worst of every point, the error is compared with its bound
+(`gsjax.bench.pixelwise`), and the exact image with a dense one. Capacities are fitted.
 """
 
 from collections.abc import Sequence
@@ -20,7 +19,8 @@ from gsjax.cameras.camera import Camera
 from gsjax.gaussians import Gaussians, with_sh_degree
 from gsjax.math.numerics import in_float64
 from gsjax.planning.types import Plan
-from gsjax.raster.render import exact_config, render
+from gsjax.raster.exact import exact_config
+from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig
 from gsjax.runtime.console import progress
 from gsjax.runtime.devices import on_cpu
@@ -31,25 +31,26 @@ from gsjax.synthetic.stress_scenes import StressScene
 _EXACT = RasterConfig.accurate(
     alpha_min=1e-9,
     alpha_max=1 - 1e-12,
-    stop=1e-9,
+    transmittance_min=1e-9,
     outputs=("rgb",),
     num_size_buckets=1,
     devices=1,
 )
-_PIXELS = 48
+_CUTOFFS = {"1/255": 1 / 255, "1/1024": 1 / 1024, "1e-4": 1e-4}
+_PIXELS = 48  # random pixels to compare with bounds
 _LEAST = 1e-30
-_BETTER = 0.05  # a share
+_BETTER = 0.05  # relative improvement that is worth more time
 
 
 class Point(NamedTuple):
-    """One setting.
+    """One point of the plot.
 
     Attributes:
-      knob: what is turned.
-      value: to what.
-      config: all settings.
-      degree: of the spherical harmonics; None as the scene has.
-      double: whether in float64.
+      knob: the setting that changes.
+      value: its value, as text.
+      config: all points.
+      degree: SH degree; None keeps that of the scene.
+      double: use float64.
     """
 
     knob: str
@@ -58,13 +59,9 @@ class Point(NamedTuple):
     degree: int | None = None
     double: bool = False
 
-    @property
-    def label(self) -> str:
-        return f"{self.knob} {self.value}".strip()
 
-
-class _Runs(NamedTuple):
-    """Of one point: what to call, what came of it."""
+class _Program(NamedTuple):
+    """Compiled calls of one point, and their results."""
 
     forward: Any
     gradient: Any
@@ -72,73 +69,71 @@ class _Runs(NamedTuple):
     grads: list[np.ndarray]
 
 
-def points(gaussians: Gaussians, made: Plan | None = None) -> list[Point]:
-    """Knobs turned one at a time from `RasterConfig.accurate`, the presets, a plan."""
-    base = RasterConfig.accurate(outputs=("rgb",), num_size_buckets=1)
-    found = [
-        Point("compat", "", RasterConfig.compat(outputs=("rgb",), num_size_buckets=1)),
-        Point("accurate", "", base),
-        Point("fast", "", RasterConfig.fast(outputs=("rgb",), num_size_buckets=1)),
+def make_points(gaussians: Gaussians, plan: Plan | None = None) -> list[Point]:
+    """Return the presets, `RasterConfig.accurate` with one change each, and a plan."""
+    common: dict[str, Any] = {"outputs": ("rgb",), "num_size_buckets": 1}
+    base = RasterConfig.accurate(**common)
+    # The bound of the rule "before" is ε / (1 − alpha_max): it needs a low alpha_max.
+    before = base.replace(transmittance_min=1e-4, stop_rule="before", alpha_max=0.99)
+    changes = [
+        *(("cut", text, {"alpha_min": value}) for text, value in _CUTOFFS.items()),
+        *(("stop after", t, {"transmittance_min": float(t)}) for t in ("1e-2", "1e-3")),
     ]
-    for cut, text in ((1 / 255, "1/255"), (1 / 1024, "1/1024"), (1e-4, "1e-4")):
-        found.append(Point("cut", text, base.replace(alpha_min=cut)))
-    for stop in ("1e-2", "1e-3"):
-        found.append(Point("stop after", stop, base.replace(stop=float(stop))))
-    # The rule's bound is ε / (1 − cap): it wants the field's cap.
-    before = base.replace(stop=1e-4, stop_rule="before", alpha_max=0.99)
-    found.append(Point("stop before", "1e-4", before))
-    for degree in range(gaussians.sh_degree):
-        found.append(Point("SH degree", str(degree), base, degree))
-    for tile in (4, 16):
-        found.append(Point("tile", str(tile), base.replace(tile_size=tile)))
-    found.append(Point("chunk", "64", base.replace(chunk_size=64)))
-    found.append(Point("dtype", "float64", base, double=True))
-    if made is not None:
-        config = made.config.replace(
-            num_size_buckets=1,
-            outputs=("rgb",),
-            pair_capacity=None,
-            visible_capacity=None,
+    sizes = [("tile", 4, "tile_size"), ("tile", 16, "tile_size")]
+    sizes.append(("chunk", 64, "chunk_size"))
+    found = [
+        Point("compat", "", RasterConfig.compat(**common)),
+        Point("accurate", "", base),
+        Point("fast", "", RasterConfig.fast(**common)),
+        *(Point(knob, text, base.replace(**change)) for knob, text, change in changes),
+        Point("stop before", "1e-4", before),
+        *(Point("SH degree", str(d), base, d) for d in range(gaussians.sh_degree)),
+        *(Point(knob, str(n), base.replace(**{name: n})) for knob, n, name in sizes),
+        Point("dtype", "float64", base, double=True),
+    ]
+    if plan is not None:
+        config = plan.config.replace(
+            **common, pair_capacity=None, visible_capacity=None
         )
-        found.append(Point("plan", "", config, made.gaussians.sh_degree))
+        found.append(Point("plan", "", config, plan.gaussians.sh_degree))
     return found
 
 
-def pareto(
-    trial: StressScene, settings: Sequence[Point], repeats: int = 5
+def measure_points(
+    scene: StressScene, points: Sequence[Point], repeats: int = 5
 ) -> list[dict]:
-    """A row for each point: milliseconds, errors, and what theory allows.
+    """Return a row for each point: milliseconds, errors and their bounds.
 
-    Its keys: knob, value; "forward ms", "gradient ms" (value and gradient); "max",
-    "psnr" and "gradient" (relative L2) against the exact picture; "at worst" and
-    "bound", error and bound where they are nearest to each other; "inside": whether
-    every pixel looked at is within its bound.
+    Its keys are knob and value; "forward ms" and "gradient ms" (value and gradient);
+    "max", "psnr" and "gradient" (relative L2) against the exact image; "at worst" and
+    "bound", the error and its bound at the pixel where they are closest; and "inside",
+    True if every pixel compared is within its bound.
     """
     rng = np.random.default_rng(0)
-    shape = (trial.camera.height, trial.camera.width, 3)
+    shape = (scene.camera.height, scene.camera.width, 3)
     weights = rng.normal(size=shape)
-    exact, *runs = _ready_runs(trial, settings, weights)
-    errors = [np.abs(run.rgb - exact.rgb).max(axis=-1) for run in runs]
+    exact, *programs = _compile_all(scene, points, weights)
+    errors = [np.abs(each.rgb - exact.rgb).max(axis=-1) for each in programs]
     worst = [divmod(int(error.argmax()), shape[1])[::-1] for error in errors]
     others = rng.integers(0, shape[1::-1], (_PIXELS, 2))
     pixels = np.unique(np.concatenate([np.asarray(worst), others]), axis=0)
-    bounds, gap = _bounds(trial, settings, pixels, exact.rgb)
-    ms = [_times(runs, settings, name, repeats) for name in ("forward", "gradient")]
+    bounds, gap = _bounds(scene, points, pixels, exact.rgb)
+    ms = [_times(programs, points, name, repeats) for name in ("forward", "gradient")]
     rows = []
-    for index, (point, run) in enumerate(zip(settings, runs)):
+    for index, (point, program) in enumerate(zip(points, programs)):
         at = errors[index][pixels[:, 1], pixels[:, 0]]
         nearest = int(np.argmax(at / np.maximum(bounds[index], _LEAST)))
-        mean = float(np.mean((run.rgb - exact.rgb) ** 2))
+        mean = float(np.mean((program.rgb - exact.rgb) ** 2))
         rows.append(
             {
-                "scene": trial.name,
+                "scene": scene.name,
                 "knob": point.knob,
                 "value": point.value,
                 "forward ms": ms[0][index],
                 "gradient ms": ms[1][index],
                 "max": float(errors[index].max()),
                 "psnr": -10 * np.log10(max(mean, _LEAST)),
-                "gradient": _relative(run.grads, exact.grads),
+                "gradient": _relative(program.grads, exact.grads),
                 "at worst": float(at[nearest]),
                 "bound": float(bounds[index][nearest]),
                 "inside": bool((at <= bounds[index]).all()) and gap < 1e-5,
@@ -147,92 +142,94 @@ def pareto(
     return rows
 
 
-def _ready_runs(
-    trial: StressScene, settings: Sequence[Point], weights: np.ndarray
-) -> list[_Runs]:
-    """Of the exact picture, and of each point; all that will be timed is compiled."""
+def _compile_all(
+    scene: StressScene, points: Sequence[Point], weights: np.ndarray
+) -> list[_Program]:
+    """Return the program of the exact image and that of each point, all compiled."""
     exact = Point("exact", "", _EXACT, double=True)
-    fits = _Fits()
+    capacities = _Capacities()
 
-    def ready(point: Point) -> _Runs:
-        run = _run(trial, point, weights, fits)
+    def ready(point: Point) -> _Program:
+        program = _compile(scene, point, weights, capacities)
         if point is not exact:
             with jax.enable_x64(point.double):
-                jax.block_until_ready(run.forward())
-        return run
+                jax.block_until_ready(program.forward())
+        return program
 
-    every = [exact, *settings]
+    every = [exact, *points]
     if on_cpu():
-        # All cores compile one, and the programs, which take them all, would meet.
-        return [ready(point) for point in progress(every, "pictures")]
+        # Compilations and programs would compete for the cores.
+        return [ready(point) for point in progress(every, "points")]
     with ThreadPoolExecutor(usable_cores()) as pool:
-        # One core for each; an accelerator is idle meanwhile.
         return all_of(pool, ready, every)
 
 
-class _Fits:
-    """Capacities that fit a view, found once for all points of equal sizes."""
+class _Capacities:
+    """Capacities that fit a view, computed once for all points of equal sizes."""
 
     def __init__(self):
         self.found: dict[tuple, RasterConfig] = {}
         self.locks: dict[tuple, Lock] = {}
 
-    def __call__(self, point: Point, scene: Gaussians, camera: Camera) -> RasterConfig:
-        """The point's settings, with capacities; its own where it has them."""
+    def __call__(
+        self, point: Point, gaussians: Gaussians, camera: Camera
+    ) -> RasterConfig:
+        """Return the config of a point with capacities, unless it has its own."""
         config = point.config
         if config.pair_capacity is not None:
             return config
         sizes = config.alpha_min, config.tile_size, config.chunk_size, point.double
         with self.locks.setdefault(sizes, Lock()):
             if sizes not in self.found:
-                self.found[sizes] = exact_config(scene, camera, config)
+                self.found[sizes] = exact_config(gaussians, camera, config)
         fit = self.found[sizes]
         return config.replace(
             pair_capacity=fit.pair_capacity, visible_capacity=fit.visible_capacity
         )
 
 
-def _run(trial: StressScene, point: Point, weights: np.ndarray, fits: _Fits) -> _Runs:
-    """Compile, run once, and hand out what to time; ``fits`` keeps the capacities."""
+def _compile(
+    scene: StressScene, point: Point, weights: np.ndarray, capacities: _Capacities
+) -> _Program:
+    """Compile the calls of a point, and run its gradient once."""
     with jax.enable_x64(point.double):
-        scene, camera = trial.gaussians, trial.camera
+        gaussians, camera = scene.gaussians, scene.camera
         if point.double:
-            scene, camera = in_float64((scene, camera))
-        degree = scene.sh_degree if point.degree is None else point.degree
-        config = fits(point, scene, camera)
-        dtype = scene.params.means.dtype
-        behind = jnp.asarray(trial.background, dtype)
-        weigh = jnp.asarray(weights, dtype)
+            gaussians, camera = in_float64((gaussians, camera))
+        degree = gaussians.sh_degree if point.degree is None else point.degree
+        config = capacities(point, gaussians, camera)
+        params = gaussians.params
+        background = jnp.asarray(scene.background, params.means.dtype)
+        by_rgb = jnp.asarray(weights, params.means.dtype)
 
-        def picture(params):
-            seen = with_sh_degree(scene.replace(params=params), degree)  # pyright: ignore
-            return render(seen, camera, config, behind).rgb
+        def image(params):
+            seen = with_sh_degree(gaussians.replace(params=params), degree)  # pyright: ignore
+            return render(seen, camera, config, background).rgb
 
-        def loss(params, weigh):
-            rgb = picture(params)
-            return jnp.sum(rgb * weigh), rgb
+        def loss(params, weights):
+            rgb = image(params)
+            return jnp.sum(rgb * weights), rgb
 
-        # What is not called is not compiled: of the exact picture, the first.
-        forward = jax.jit(picture)
+        forward = jax.jit(image)
         gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))
-        (_, seen), grads = gradient(scene.params, weigh)
-        rgb = np.asarray(seen, np.float64)
-        leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(grads)]
-        params = scene.params
-        return _Runs(
-            lambda: forward(params), lambda: gradient(params, weigh), rgb, leaves
+        (_, rgb), grads = gradient(params, by_rgb)
+        return _Program(
+            lambda: forward(params),
+            lambda: gradient(params, by_rgb),
+            np.asarray(rgb, np.float64),
+            [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(grads)],
         )
 
 
 def _times(
-    runs: Sequence[_Runs], settings: Sequence[Point], name: str, repeats: int
+    programs: Sequence[_Program], points: Sequence[Point], name: str, repeats: int
 ) -> list[float]:
-    """Median ms of each, in turn; float64 apart, as it is another mode of JAX."""
-    out = [0.0] * len(runs)
+    """Return the median ms of each, in turn; float64 apart, as another mode of JAX."""
+    out = [0.0] * len(programs)
     for double in (False, True):
         chosen = {
-            str(i): getattr(run, name)
-            for i, (run, point) in enumerate(zip(runs, settings))
+            str(i): getattr(program, name)
+            for i, (program, point) in enumerate(zip(programs, points))
             if point.double == double
         }
         with jax.enable_x64(double):
@@ -242,55 +239,58 @@ def _times(
 
 
 def _bounds(
-    trial: StressScene, settings: Sequence[Point], pixels: np.ndarray, exact: np.ndarray
+    scene: StressScene, points: Sequence[Point], pixels: np.ndarray, exact: np.ndarray
 ) -> tuple[list[np.ndarray], float]:
-    """What theory allows each point at the pixels; how far dense and exact differ."""
+    """Return the error bound of each point at the pixels [P].
+
+    The second result is the difference between the dense and the exact image there.
+    """
     with jax.enable_x64(True):
-        scene, camera = in_float64((trial.gaussians, trial.camera))
-        found = pixelwise.dense(scene, camera, trial.background, pixels)
-        gap = np.abs(found.picture - exact[pixels[:, 1], pixels[:, 0]]).max()
+        gaussians, camera = in_float64((scene.gaussians, scene.camera))
+        found = pixelwise.composite_dense(gaussians, camera, scene.background, pixels)
+        gap = np.abs(found.rgb - exact[pixels[:, 1], pixels[:, 0]]).max()
         bounds = [
-            pixelwise.allowed(
+            pixelwise.error_bound(
                 found,
-                scene,
+                gaussians,
                 camera,
                 point.config,
-                degree=scene.sh_degree if point.degree is None else point.degree,
+                degree=gaussians.sh_degree if point.degree is None else point.degree,
                 dtype="float64" if point.double else "float32",
             )
-            for point in settings
+            for point in points
         ]
     return bounds, float(gap)
 
 
-def _relative(found: Sequence[np.ndarray], wanted: Sequence[np.ndarray]) -> float:
-    """Relative L2 of all gradients together."""
-    off = sum(np.sum((a - b) ** 2) for a, b in zip(found, wanted))
-    return float(np.sqrt(off / max(sum(np.sum(b**2) for b in wanted), 1e-300)))
+def _relative(found: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> float:
+    """Return the relative L2 error of all gradients together."""
+    off = sum(np.sum((a - b) ** 2) for a, b in zip(found, exact))
+    return float(np.sqrt(off / max(sum(np.sum(b**2) for b in exact), 1e-300)))
 
 
-def stages(trial: StressScene, repeats: int = 5) -> dict[str, float]:
-    """Milliseconds of a render's parts with the default settings.
+def time_stages(scene: StressScene, repeats: int = 5) -> dict[str, float]:
+    """Return milliseconds of the parts of a render with the default settings.
 
-    "lists" is projecting, binning and sorting; composite and backward are what the
-    whole picture, and the gradient, take beyond what comes before them.
+    "lists" is projecting, binning and sorting; "composite" and "backward" are the
+    additional time of the image and of its gradient.
     """
-    config = exact_config(trial.gaussians, trial.camera)
-    camera = trial.camera
-    behind = jnp.asarray(trial.background, trial.gaussians.params.means.dtype)
+    config = exact_config(scene.gaussians, scene.camera)
+    params = scene.gaussians.params
+    background = jnp.asarray(scene.background, params.means.dtype)
 
-    def picture(params):
-        scene = trial.gaussians.replace(params=params)  # pyright: ignore
-        return render(scene, camera, config, behind)
+    def image(params):
+        gaussians = scene.gaussians.replace(params=params)  # pyright: ignore
+        return render(gaussians, scene.camera, config, background)
+
+    def total(params):
+        return jnp.sum(jnp.asarray(image(params).rgb))
 
     functions = {
-        "lists": jax.jit(lambda params: picture(params).demand),
-        "forward": jax.jit(lambda params: picture(params)[:3]),
-        "gradient": jax.jit(
-            jax.value_and_grad(lambda params: jnp.sum(jnp.asarray(picture(params).rgb)))
-        ),
+        "lists": jax.jit(lambda params: image(params).demand),
+        "forward": jax.jit(lambda params: image(params)[:3]),
+        "gradient": jax.jit(jax.value_and_grad(total)),
     }
-    params = trial.gaussians.params
     ms = interleaved({n: lambda f=f: f(params) for n, f in functions.items()}, repeats)
     return {
         "lists": ms["lists"],
@@ -301,11 +301,12 @@ def stages(trial: StressScene, repeats: int = 5) -> dict[str, float]:
     }
 
 
-def front(rows: Sequence[dict], time: str = "forward ms", error: str = "max"):
-    """Indices of rows that no other beats in both, by time.
+def front(
+    rows: Sequence[dict], time: str = "forward ms", error: str = "max"
+) -> list[int]:
+    """Return the indices of the rows on the Pareto front of time and error, by time.
 
-    To be slower, a row has to be better by `_BETTER`: an error that is less by a
-    thousandth is worth no time.
+    A slower row must have an error that is smaller by 5 % at least.
     """
     order = sorted(range(len(rows)), key=lambda i: (rows[i][time], rows[i][error]))
     best, kept = float("inf"), []

@@ -1,7 +1,7 @@
-"""What theory allows a setting to change at single pixels, in float64.
+"""Error bounds of settings at single pixels, in float64.
 
-The same argument as in `gsjax.planning.bounds`, with the α of every splat at the pixel
-at hand: dense, so for some pixels only.
+The argument is that of `gsjax.planning.bounds`, with the α of every splat at the pixel
+known: dense, so for a few pixels only.
 
 Axis legend: N Gaussians, front to back, P pixels.
 """
@@ -16,7 +16,7 @@ from gsjax.gaussians import Gaussians, with_sh_degree
 from gsjax.raster.reference import reference_colors, reference_project
 from gsjax.raster.types import RasterConfig
 
-# What rounding may do, as a share of the largest colour.
+# Largest rounding error relative to the largest colour.
 ROUNDING = {"float32": 1e-4, "float64": 1e-9}
 _SEEN = 1e-14
 
@@ -26,11 +26,11 @@ class Dense(NamedTuple):
 
     Attributes:
       order: [N] their slots.
-      alpha: [N, P] without cut and cap.
+      alpha: [N, P] without cutoffs.
       colors: [N, 3].
-      spread: [P] range of the colours there, of the channel with the largest.
-      largest: [P] of the colours there, the background's among them.
-      picture: [P, 3] rgb.
+      spread: [P] colour range there, of the channel where it is largest.
+      largest: [P] largest absolute colour there, including the background.
+      rgb: [P, 3] image.
     """
 
     order: np.ndarray
@@ -38,14 +38,17 @@ class Dense(NamedTuple):
     colors: np.ndarray
     spread: np.ndarray
     largest: np.ndarray
-    picture: np.ndarray
+    rgb: np.ndarray
 
 
-def dense(
+def composite_dense(
     gaussians: Gaussians, camera: Camera, background, pixels: np.ndarray
 ) -> Dense:
-    """Splats at ``pixels`` [P, 2] (column, row); call it with float64 on, for single
-    cameras without antialiasing and with the dilation of 0.3."""
+    """Composite all splats at ``pixels`` [P, 2] (column, row).
+
+    Call it with float64 enabled, for a single camera, without antialiasing and with the
+    default dilation.
+    """
     projected = jax.jit(reference_project)(gaussians, camera)
     means2d, depth, cov2d, _, seen = (np.asarray(a) for a in projected)
     seen = seen & np.asarray(gaussians.active)
@@ -61,27 +64,24 @@ def dense(
         alpha[:, index] = opacity * np.exp(-0.5 * power)
     behind = np.asarray(background, np.float64)
     there = (alpha > _SEEN)[..., None]
-    low = np.minimum(
-        np.where(there, colors[:, None], np.inf).min(0, initial=np.inf), behind
-    )
-    high = np.maximum(
-        np.where(there, colors[:, None], -np.inf).max(0, initial=-np.inf), behind
-    )
+    low = np.where(there, colors[:, None], np.inf).min(0, initial=np.inf)
+    high = np.where(there, colors[:, None], -np.inf).max(0, initial=-np.inf)
+    low, high = np.minimum(low, behind), np.maximum(high, behind)
     weight, left = _weights(alpha)
-    picture = weight.T @ colors + left[:, None] * behind
+    rgb = weight.T @ colors + left[:, None] * behind
     spread = (high - low).max(axis=1)
     largest = np.maximum(np.abs(low), np.abs(high)).max(axis=1)
-    return Dense(order, alpha, colors, spread, largest, picture)
+    return Dense(order, alpha, colors, spread, largest, rgb)
 
 
 def _weights(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """α T [N, P], and the T that is left [P]."""
+    """Return the weights α T [N, P] and the final transmittance [P]."""
     after = np.cumprod(1 - alpha, axis=0)
     before = np.concatenate([np.ones_like(after[:1]), after[:-1]])
     return alpha * before, np.prod(1 - alpha, axis=0)
 
 
-def allowed(
+def error_bound(
     found: Dense,
     gaussians: Gaussians,
     camera: Camera,
@@ -90,23 +90,29 @@ def allowed(
     degree: int,
     dtype: str,
 ) -> np.ndarray:
-    """[P] how far a channel may be off at the pixels, one knob after another.
+    """Bound the error of a channel at the pixels, [P]: the sum over all settings.
 
-    Cap, cut, stop and SH degree as in `gsjax.planning.bounds`; rounding by `ROUNDING`.
+    Args:
+      found: the splats at the pixels.
+      gaussians, camera: as for `composite_dense`.
+      config: its cutoffs count, see `gsjax.planning.bounds`.
+      degree: SH degree that is rendered.
+      dtype: "float32" or "float64"; for the rounding, see `ROUNDING`.
     """
     alpha, spread = found.alpha, found.spread
     capped = np.minimum(alpha, config.alpha_max)
     over = (alpha > config.alpha_max).any(axis=0)
-    cap = over * (1 - config.alpha_max) / config.alpha_max
+    by_alpha_max = over * (1 - config.alpha_max) / config.alpha_max
     low = capped < config.alpha_min * (1 + 1e-3)
-    cut = -np.expm1(np.log1p(-np.where(low, capped, 0)).sum(axis=0))
+    by_alpha_min = -np.expm1(np.log1p(-np.where(low, capped, 0)).sum(axis=0))
     kept = np.where(low, 0, capped)
     _, left = _weights(kept)
-    most = config.stop
+    threshold = most = config.transmittance_min
     if config.stop_rule == "before":
-        most = config.stop / np.maximum(1 - kept.max(axis=0), 1e-16)
-    stop = np.where(left <= config.stop * (1 + 1e-3), np.minimum(most, 1), 0)
-    total = spread * (cap + cut + stop) + ROUNDING[dtype] * found.largest
+        most = threshold / np.maximum(1 - kept.max(axis=0), 1e-16)
+    by_stop = np.where(left <= threshold * (1 + 1e-3), np.minimum(most, 1), 0)
+    total = spread * (by_alpha_max + by_alpha_min + by_stop)
+    total = total + ROUNDING[dtype] * found.largest
     if degree < gaussians.sh_degree:
         total = total + _band_change(found, gaussians, camera, degree)
     return total
@@ -115,7 +121,7 @@ def allowed(
 def _band_change(
     found: Dense, gaussians: Gaussians, camera: Camera, degree: int
 ) -> np.ndarray:
-    """Σ w_i |change of the colour|, the largest channel, [P]."""
+    """Return Σ w_i |change of the colour| of the channel where it is largest, [P]."""
     fewer = jax.jit(reference_colors)(with_sh_degree(gaussians, degree), camera)
     change = np.abs(np.asarray(fewer)[found.order] - found.colors)
     return (_weights(found.alpha)[0].T @ change).max(axis=1)

@@ -1,4 +1,4 @@
-"""What `gsjax bench` measures on: a scene by its name, and a camera for it."""
+"""Scenes of `gsjax bench`, by name or file, each with a camera."""
 
 from pathlib import Path
 
@@ -20,14 +20,14 @@ from gsjax.synthetic.stress_scenes import STRESS_SCENES, StressScene
 _SIZE = (400, 300)
 
 
-def open_stress_scene(
+def open_bench_scene(
     name: str, *, cameras: Path | None = None, size: tuple[int, int] | None = None
 ) -> StressScene:
-    """A scene that is built in, a file or a run, with one camera.
+    """Open a built-in scene, a file or a run, with one camera.
 
     Args:
-      name: of `STRESS_SCENES`, unless there is a file or a folder of that name.
-      cameras: a transforms.json, whose first camera is taken.
+      name: of `STRESS_SCENES`, unless a file or folder has that name.
+      cameras: a transforms.json; its first camera is used.
       size: (width, height) in px.
 
     Raises:
@@ -35,14 +35,15 @@ def open_stress_scene(
     """
     path = Path(name)
     if name in STRESS_SCENES and not path.exists():
-        trial = STRESS_SCENES[name]()
+        scene = STRESS_SCENES[name]()
         if cameras is None:
-            return trial._replace(camera=_sized(trial.camera, size))
+            return scene._replace(camera=_sized(scene.camera, size))
         entries = load_transforms(cameras, size=size)
-        return trial._replace(camera=_first(cameras, entries))
+        return scene._replace(camera=_first(cameras, entries))
     if not path.exists():
         raise InputError(
-            f"{name}: neither a run nor a .ply or .spz, nor one of {', '.join(STRESS_SCENES)}"
+            f"{name}: expected a run, a .ply, a .spz, or one of "
+            f"{', '.join(STRESS_SCENES)}; no such file exists"
         )
     origin = camera = None
     if cameras is not None:
@@ -55,16 +56,16 @@ def open_stress_scene(
         max_size = settings.config.max_size
         entries = view_entries(split.views("train"), max_size=max_size)
         camera = _sized(entries[0].camera, size)
-    subject = open_scene_source(path, origin=origin)
-    gaussians = subject.load()
+    source = open_scene_source(path, origin=origin)
+    gaussians = source.load()
     if camera is None:
-        camera = facing(gaussians, *(size or _SIZE))
-    red, green, blue = subject.background
+        camera = facing_camera(gaussians, *(size or _SIZE))
+    red, green, blue = source.background
     return StressScene(path.stem, gaussians, camera, (red, green, blue))
 
 
-def facing(gaussians: Gaussians, width: int, height: int) -> Camera:
-    """A camera before a scene that nothing is known of, so that most of it shows.
+def facing_camera(gaussians: Gaussians, width: int, height: int) -> Camera:
+    """Return a camera that looks at the centre of a scene, with most of it in view.
 
     Raises:
       InputError: if no Gaussian is active and finite.
@@ -72,7 +73,9 @@ def facing(gaussians: Gaussians, width: int, height: int) -> Camera:
     means = np.asarray(gaussians.params.means, np.float64)
     means = means[np.asarray(gaussians.active) & np.isfinite(means).all(axis=1)]
     if not len(means):
-        raise InputError("the scene has no Gaussian to look at")
+        raise InputError(
+            "scene: expected an active Gaussian with a finite mean, got none"
+        )
     centre = np.median(means, axis=0)
     radius = np.percentile(np.linalg.norm(means - centre, axis=1), 95)
     eye = centre + np.asarray([0.3, 0.25, 1.0]) * max(float(radius), 1e-6) * 1.85
@@ -84,7 +87,7 @@ def facing(gaussians: Gaussians, width: int, height: int) -> Camera:
 
 def _first(path: Path, entries: list[CameraEntry]) -> Camera:
     if not entries:
-        raise InputError(f"{path}: there is no camera in it")
+        raise InputError(f"{path}: expected at least one camera, got none")
     return entries[0].camera
 
 

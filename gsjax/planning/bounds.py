@@ -1,14 +1,11 @@
-"""What leaving things out of a picture may change, bounded from above.
+"""Upper bounds on the error of leaving things out of an image, for every camera.
 
-The argument behind all of it: the weights w_i = α_i T_i and what is left for the
-background are the probabilities that a ray which passes splat i with probability
-1 − α_i ends there. Two pictures whose rays part with probability p differ by at most
-D p, D being the range of the colours, background included. So leaving out a set S
-costs at most D (1 − Π_S (1 − α_i)), stopping at a transmittance ε at most D ε, and
-colours that are off by δ_i at most Σ w_i δ_i.
+The weights w_i = α_i T_i and the weight of the background are the probabilities that a
+ray ends at splat i, if it passes splat i with probability 1 − α_i. If the rays of two
+images differ with probability p, the images differ by at most D p, where D is the range
+of the colours including the background. On the host, in float64.
 
-Bounds here hold for every camera; they know nothing of where splats are. On the host,
-in float64. Axis legend: N Gaussians, L bands of spherical harmonics.
+Axis legend: N Gaussians, L bands of spherical harmonics.
 """
 
 import numpy as np
@@ -18,7 +15,7 @@ from gsjax.math.sh import C0
 
 
 def opacities(gaussians: Gaussians) -> np.ndarray:
-    """Of the active Gaussians [N]: above their α at any pixel."""
+    """Return the opacities [N] of the active Gaussians, above their α at any pixel."""
     active = np.asarray(gaussians.active)
     logits = np.asarray(gaussians.params.logit_opacities, np.float64)[active]
     with np.errstate(over="ignore"):
@@ -26,10 +23,10 @@ def opacities(gaussians: Gaussians) -> np.ndarray:
 
 
 def band_changes(gaussians: Gaussians) -> np.ndarray:
-    """[N, L] how far each band above 0 can move a channel, in any direction.
+    """Return how far each band above 0 can move a channel, in any direction, [N, L].
 
-    By Cauchy and Schwarz: |Σ_m c_m Y_lm| ≤ ‖c‖ √((2l + 1) / 4π), since the squares of
-    a band add up to (2l + 1) / 4π everywhere (the addition theorem).
+    By Cauchy–Schwarz, |Σ_m c_m Y_lm| ≤ ‖c‖ √((2l + 1) / 4π), because the squares of a
+    band add up to (2l + 1) / 4π everywhere (addition theorem).
     """
     sh = np.asarray(gaussians.params.sh, np.float64)[np.asarray(gaussians.active)]
     bands = [
@@ -41,7 +38,7 @@ def band_changes(gaussians: Gaussians) -> np.ndarray:
 
 
 def highest_band(gaussians: Gaussians) -> int:
-    """Of the active Gaussians: the last that is not 0 throughout; 0 of none."""
+    """Return the last band with a non-zero coefficient of an active Gaussian, or 0."""
     sh = np.asarray(gaussians.params.sh)
     active = np.asarray(gaussians.active)
     for degree in range(gaussians.sh_degree, 0, -1):
@@ -51,12 +48,11 @@ def highest_band(gaussians: Gaussians) -> int:
 
 
 def degree_error(gaussians: Gaussians, degree: int) -> float:
-    """Largest change of rgb if the bands above ``degree`` are left out.
+    """Bound the change of rgb if the bands above ``degree`` are left out.
 
-    Σ w_i δ_i is largest, whatever the order and the place of the splats, when all of
-    them are met at their full opacity in the order of their δ, the greatest first:
-    exchanging two neighbours that are not so ordered, or adding one at the end, never
-    makes it smaller.
+    Σ w_i δ_i is largest if a ray meets all splats at their full opacity, sorted by
+    descending δ: exchanging two neighbours that are not in this order, or adding a
+    splat at the end, never decreases the sum.
     """
     change = band_changes(gaussians)[:, degree:].sum(axis=1)
     order = np.argsort(-change)
@@ -66,7 +62,7 @@ def degree_error(gaussians: Gaussians, degree: int) -> float:
 
 
 def color_range(gaussians: Gaussians, background=(0.0, 0.0, 0.0)) -> float:
-    """D: largest range of a channel, over all splats, directions and the background."""
+    """Return D, the largest range of a channel over splats, directions, background."""
     sh = np.asarray(gaussians.params.sh, np.float64)[np.asarray(gaussians.active), 0]
     swing = band_changes(gaussians).sum(axis=1)[:, None]
     middle = 0.5 + C0 * sh
@@ -76,24 +72,31 @@ def color_range(gaussians: Gaussians, background=(0.0, 0.0, 0.0)) -> float:
     return float((high - low).max())
 
 
-def cut_error(gaussians: Gaussians, cut: float, spread: float) -> float:
-    """Largest change of rgb if α below ``cut`` counts as 0; ``spread`` is D.
+def alpha_min_error(gaussians: Gaussians, alpha_min: float, spread: float) -> float:
+    """Bound the change of rgb if α below ``alpha_min`` counts as 0; ``spread`` is D.
 
-    As if all splats lay over one another: of use for few or very faint ones.
+    The bound assumes that all splats overlap, so it is useful for few or very faint
+    splats only.
     """
-    left_out = np.minimum(opacities(gaussians), min(cut, 1 - 1e-16))
+    left_out = np.minimum(opacities(gaussians), min(alpha_min, 1 - 1e-16))
     return float(-spread * np.expm1(np.log1p(-left_out).sum()))
 
 
-def cap_error(cap: float, spread: float) -> float:
-    """Largest change of rgb if α is at most ``cap``: D Σ_k (1 − cap)^k, k from 1.
+def alpha_max_error(alpha_max: float, spread: float) -> float:
+    """Bound the change of rgb if α is at most ``alpha_max``.
 
-    The k-th splat above the cap is reached with (1 − cap)^(k − 1) at most.
+    The transmittance before the k-th splat above the limit is at most
+    (1 − alpha_max)^(k − 1), so the sum is D Σ_k (1 − alpha_max)^k.
     """
-    return spread * (1 - cap) / cap
+    return spread * (1 - alpha_max) / alpha_max
 
 
-def stop_error(stop: float, rule: str, cap: float, spread: float) -> float:
-    """Largest change of rgb by stopping; "before" leaves out what would have stopped
-    it, which may have been reached at ε / (1 − cap)."""
-    return spread * min(1.0, stop if rule == "after" else stop / max(1 - cap, 1e-16))
+def stop_error(transmittance: float, rule: str, alpha_max: float, spread: float):
+    """Bound the change of rgb by stopping at a transmittance ε.
+
+    The rule "before" also leaves out the splat that crosses ε, which is reached at a
+    transmittance of up to ε / (1 − alpha_max).
+    """
+    if rule == "before":
+        transmittance = transmittance / max(1 - alpha_max, 1e-16)
+    return spread * min(1.0, transmittance)

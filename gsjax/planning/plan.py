@@ -1,10 +1,8 @@
-"""The settings that a scene needs and no more: `plan`, and the reasons for each.
+"""Choice of the settings that a scene needs, with a reason for each: `plan`.
 
-Two kinds of error are kept apart. A *bound* (see `gsjax.planning.bounds`) holds for
-every camera. An *estimate* was measured on the cameras given, and is multiplied by a
-margin for those that were not: what the α cut leaves out depends on how many faint
-splats happen to lie over one another, and a bound on that is of use in small scenes
-only.
+A *bound* (`gsjax.planning.bounds`) holds for every camera. An *estimate* is measured on
+the cameras given and multiplied by a margin for other cameras. For small scenes the
+α-cutoff error is a bound; for larger ones it is an estimate, and is labelled as one.
 """
 
 from collections.abc import Sequence
@@ -17,15 +15,16 @@ from gsjax.cameras.camera import Camera
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, select, with_sh_degree
 from gsjax.planning import bounds
-from gsjax.planning.accuracy import ROUNDING, within_budget
-from gsjax.planning.sizes import shown, tuned, with_capacities
+from gsjax.planning.accuracy import ROUNDING, fit_budget
+from gsjax.planning.sizes import drop_faint, fit_capacities, tune_sizes
 from gsjax.planning.types import Plan, Reason
-from gsjax.raster.render import DEFAULT_CONFIG, requires_concrete_values
+from gsjax.raster.argument_checks import requires_concrete_values
+from gsjax.raster.render import DEFAULT_CONFIG
 from gsjax.raster.types import COLOR_LIMIT, RasterConfig
 from gsjax.runtime.devices import platform_name
 
-_CAMERAS = 12  # to measure on, at most
-_SH_SHARE = 0.25
+_MAX_CAMERAS = 12
+_SH_SHARE = 0.25  # share of the budget for leaving out bands
 
 
 @requires_concrete_values()
@@ -39,85 +38,83 @@ def plan(
     outputs: Sequence[str] = ("rgb",),
     tune: bool = False,
 ) -> Plan:
-    """The settings that this scene needs, seen from such cameras, and no more.
+    """Choose the settings that a scene needs from such cameras.
 
-    From the host: it renders, and compiles a few programs. Pays where many views
-    follow.
+    It renders and compiles a few programs, so it pays off if many views follow. Call it
+    outside jit, vmap and scan.
 
     Args:
       gaussians: N slots, concrete.
-      cameras: one, a batch, or several; up to 12 of them, evenly chosen, are measured
-        on. Cameras to come should be like these.
-      budget: largest error of a channel of rgb against the exact picture, e.g.
-        1 / 255. None leaves accuracy as ``config`` has it, and skips only what changes
-        nothing.
-      config: its dilation and antialiasing belong to the scene and are kept; what
-        is not decided here too.
-      background: [3] that the views have.
-      outputs: what is wanted; the budget is one of rgb.
+      cameras: one, a batch, or several; at most 12, evenly spaced, are measured. Other
+        cameras should be similar.
+      budget: largest error of a channel of rgb against the exact image, e.g. 1 / 255.
+        None keeps the accuracy of ``config`` and leaves out only what is invisible.
+      config: other settings, such as dilation and antialiasing, are kept.
+      background: [3] colour behind the views.
+      outputs: images to compute; the budget concerns rgb.
       tune: also time tile and chunk sizes on the first camera.
 
     Returns:
       A plan; render its ``gaussians`` with its ``config``.
 
     Raises:
-      InputError: if there is no camera, or the budget is not above 0, or is below what
-        float32 rounding allows, or colours span too much for it; and under `jax.jit`,
+      InputError: if there is no camera; if the budget is not in (0, 1), is below the
+        rounding of float32, or is too small for the colour range; or under `jax.jit`,
         `vmap` or `scan`.
       CapacityError: as `render_exact`.
     """
-    views = _sampled(cameras)
+    views = _sample(cameras)
     _check_budget(budget, gaussians)
     config = config.replace(outputs=tuple(outputs), absgrad=False)
-    reasons = [_outputs_reason(config), _lens_reason(views)]
+    lenses = ", ".join(sorted({view.lens.name for view in views}))
+    reasons = [
+        Reason("outputs", f"only {', '.join(config.outputs)} are computed"),
+        Reason("lens", f"{lenses}: no other lens is compiled"),
+    ]
     slots = gaussians.capacity
-    gaussians, told = _without_bands(_drawn(gaussians), budget)
-    reasons.append(told)
+    gaussians, reason = _choose_sh_degree(_drop_invalid(gaussians), budget)
+    reasons.append(reason)
     measured = None
     if budget is not None and bool(np.any(np.asarray(gaussians.active))):
         left = budget - sum(reason.error for reason in reasons)
-        config, told, measured = within_budget(
-            gaussians, views, config, background, left
-        )
-        reasons += told
-    gaussians, told = shown(gaussians, config, slots)
-    reasons.append(told)
+        config, found, measured = fit_budget(gaussians, views, config, background, left)
+        reasons += found
+    gaussians, reason = drop_faint(gaussians, config, slots)
+    reasons.append(reason)
     if tune:
-        config, told = tuned(gaussians, views[0], config, background)
+        config, reason = tune_sizes(gaussians, views[0], config, background)
     else:
-        told = Reason(
+        reason = Reason(
             "tile_size, chunk_size",
             f"{config.tile_size} px and {config.chunk_size} Gaussians: the defaults "
             f"of {platform_name()}, not timed (tune=True does)",
         )
-    reasons.append(told)
+    reasons.append(reason)
     demands = None if measured is None or tune else measured.demands
-    config, told = with_capacities(gaussians, views, config, demands)
-    reasons += told
+    config, found = fit_capacities(gaussians, views, config, demands)
+    reasons += found
     error = None if measured is None else measured.error
     return Plan(gaussians, config, tuple(reasons), budget, error)
 
 
-def trimmed(gaussians: Gaussians, config: RasterConfig) -> Gaussians:
-    """The scene without what changes no render of any camera beyond rounding: bands of
-    spherical harmonics that are 0, Gaussians that are nowhere above the α cut. (Of a
-    movie of depths, the range of colours is that of the Gaussians that are left.)
+def trim_scene(gaussians: Gaussians, config: RasterConfig) -> Gaussians:
+    """Remove what changes no render of any camera beyond rounding.
+
+    That is SH bands that are 0, and Gaussians that are nowhere above the α cutoff. The
+    result has as many slots as Gaussians.
 
     Args:
       gaussians: N slots, concrete.
-      config: whose α cut it is.
-
-    Returns:
-      In as many slots as there are Gaussians left.
+      config: its ``alpha_min`` counts.
     """
     slots = gaussians.capacity
-    gaussians = _drawn(gaussians)
+    gaussians = _drop_invalid(gaussians)
     gaussians = with_sh_degree(gaussians, bounds.highest_band(gaussians))
-    return shown(gaussians, config, slots)[0]
+    return drop_faint(gaussians, config, slots)[0]
 
 
-def _sampled(cameras: Camera | Sequence[Camera]) -> list[Camera]:
-    """At most `_CAMERAS` single cameras, the first and the last among them."""
+def _sample(cameras: Camera | Sequence[Camera]) -> list[Camera]:
+    """Return at most `_MAX_CAMERAS` single cameras, with the first and the last."""
     given = [cameras] if isinstance(cameras, Camera) else list(cameras)
     singles = []
     for camera in given:
@@ -127,8 +124,8 @@ def _sampled(cameras: Camera | Sequence[Camera]) -> list[Camera]:
         else:
             singles.append(camera)
     if not singles:
-        raise InputError("no camera: a plan is made for cameras; pass one at least")
-    count = min(len(singles), _CAMERAS)
+        raise InputError("cameras: expected at least one camera, got none")
+    count = min(len(singles), _MAX_CAMERAS)
     return [singles[i] for i in np.linspace(0, len(singles) - 1, count).astype(int)]
 
 
@@ -137,55 +134,46 @@ def _check_budget(budget: float | None, gaussians: Gaussians) -> None:
         return
     if not 0 < budget < 1:
         raise InputError(
-            f"budget {budget}: an error above 0 and below 1 is wanted, as 1 / 255"
+            f"budget: expected an error above 0 and below 1, such as 1 / 255, got "
+            f"{budget}"
         )
     single = gaussians.params.means.dtype == jnp.float32
     if single and budget < 5 * ROUNDING:
         raise InputError(
-            f"budget {budget:g}: rounding in float32 comes to {ROUNDING:g}; ask for "
-            f"{5 * ROUNDING:g} or more, or turn on jax_enable_x64"
+            f"budget: expected at least {5 * ROUNDING:g} in float32, whose rounding is "
+            f"{ROUNDING:g}, got {budget:g}; raise it, or enable jax_enable_x64"
         )
 
 
-def _outputs_reason(config: RasterConfig) -> Reason:
-    return Reason("outputs", f"{', '.join(config.outputs)} and no more is computed")
+def _drop_invalid(gaussians: Gaussians) -> Gaussians:
+    """Remove Gaussians that the renderer leaves out: non-finite or with huge colours.
 
-
-def _lens_reason(views: list[Camera]) -> Reason:
-    lenses = sorted({view.model.name for view in views})
-    return Reason("lens", f"{', '.join(lenses)}: no other lens is in the program")
-
-
-def _drawn(gaussians: Gaussians) -> Gaussians:
-    """Without what has a number that is not finite, or a colour that counts as none;
-    the renderer leaves it out.
-
-    Before bands are cut: that could take the number away and bring it in.
+    This comes before bands are removed, which could make such a Gaussian valid.
     """
-    drawn = np.ones(gaussians.capacity, bool)
+    valid = np.ones(gaussians.capacity, bool)
     for leaf in jax.tree.leaves(gaussians.params):
-        drawn &= np.isfinite(np.asarray(leaf)).reshape(len(drawn), -1).all(axis=1)
+        valid &= np.isfinite(np.asarray(leaf)).reshape(len(valid), -1).all(axis=1)
     colors = np.abs(np.asarray(gaussians.params.sh)) < COLOR_LIMIT
-    drawn &= colors.all(axis=(1, 2))
-    return select(gaussians, jnp.asarray(drawn))
+    valid &= colors.all(axis=(1, 2))
+    return select(gaussians, jnp.asarray(valid))
 
 
-def _without_bands(
+def _choose_sh_degree(
     gaussians: Gaussians, budget: float | None
 ) -> tuple[Gaussians, Reason]:
-    """The lowest SH degree whose bound is within its share."""
+    """Reduce the SH degree to the lowest whose error bound is within its share."""
     degree = gaussians.sh_degree
     allowed = 0.0 if budget is None else _SH_SHARE * budget
     errors = [bounds.degree_error(gaussians, d) for d in range(degree + 1)]
     least = next((d for d in range(degree) if errors[d] <= allowed), degree)
     if degree == 0:
-        return gaussians, Reason("SH degree", "0: colours do not turn with the view")
+        return gaussians, Reason("SH degree", "0: colours do not depend on the view")
     if least == degree:
-        short = errors[degree - 1]
-        why = f"{degree}: without its last band rgb could be {255 * short:.3g}/255 off"
+        error = 255 * errors[degree - 1]
+        why = f"{degree}: without its last band rgb could change by {error:.3g}/255"
         return gaussians, Reason("SH degree", why)
-    kind = "are 0" if errors[least] == 0 else "do not show"
+    kind = "are 0" if errors[least] == 0 else "are invisible"
     why = f"{least} in place of {degree}: the bands above {kind}"
     basis = "bound" if errors[least] else "exact"
-    told = Reason("SH degree", why, errors[least], basis)
-    return with_sh_degree(gaussians, least), told
+    reason = Reason("SH degree", why, errors[least], basis)
+    return with_sh_degree(gaussians, least), reason

@@ -1,4 +1,4 @@
-"""What a plan consists of."""
+"""Result of a plan."""
 
 from typing import NamedTuple
 
@@ -7,13 +7,13 @@ from gsjax.raster.types import RasterConfig
 
 
 class Reason(NamedTuple):
-    """Why one thing is as it is.
+    """Reason for one setting.
 
     Attributes:
       what: the setting, or the part of the scene.
       why: in words.
-      error: what it may add to the largest error of rgb.
-      basis: "exact" (nothing), "bound" (for every camera), "estimate", or "rounding".
+      error: largest error of rgb that it may add.
+      basis: "exact" (none), "bound" (for every camera), "estimate", or "rounding".
     """
 
     what: str
@@ -23,15 +23,15 @@ class Reason(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What `plan` found.
+    """Result of `plan`.
 
     Attributes:
-      gaussians: the scene, without what does not show.
+      gaussians: the scene, without what is invisible.
       config: static settings for it.
-      reasons: for each of them.
-      budget: as asked for, or None.
-      measured: largest error of rgb seen on the cameras given, of the α cut; None where
-        bounds alone decided.
+      reasons: one for each decision.
+      budget: as requested, or None.
+      measured: largest error of rgb on the cameras given, caused by the α cutoff; None
+        if bounds alone decided.
     """
 
     gaussians: Gaussians
@@ -42,23 +42,23 @@ class Plan(NamedTuple):
 
     @property
     def error(self) -> float:
-        """Sum of what the reasons may add: at most the budget."""
+        """Sum of the errors of all reasons; at most the budget."""
         return sum(reason.error for reason in self.reasons)
 
     @property
     def bounded(self) -> bool:
-        """Whether that holds for every camera, and is not an estimate."""
+        """True if ``error`` is a bound for every camera, not an estimate."""
         return all(reason.basis != "estimate" for reason in self.reasons)
 
     def lines(self) -> list[str]:
-        """The reasons, one a line, errors in grey levels of 255."""
-        told = []
+        """Return the reasons, one a line, with errors in grey levels of 255."""
+        lines = []
         for what, why, error, basis in self.reasons:
             adds = f"; {basis}: {255 * error:.3g}/255" if error > 0 else ""
-            told.append(f"{what}: {why}{adds}")
+            lines.append(f"{what}: {why}{adds}")
         kind = "bound for every camera" if self.bounded else "estimate"
         if self.budget is not None:
             limit = f"{255 * self.budget:.3g}/255"
             error = f"{255 * self.error:.3g}/255 at most, of {limit} allowed"
-            told.append(f"in all: {error} ({kind})")
-        return told
+            lines.append(f"in all: {error} ({kind})")
+        return lines

@@ -1,8 +1,8 @@
-"""The instrument: what theory allows at a pixel, the front, the plot, the scenes."""
+"""`gsjax bench`: error bounds at pixels, the Pareto front, the plot, the scenes."""
 
-import itertools
 import json
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,28 +10,31 @@ from conftest import camera_of, frustum_points, gaussians_at
 
 import gsjax
 from gsjax import RasterConfig
-from gsjax.bench import pixelwise, report
-from gsjax.bench.fronts import Box, Mark, label_boxes, scatter
-from gsjax.bench.pareto import Point, front, pareto, points
-from gsjax.bench.report import front_picture, table
-from gsjax.bench.scenes import facing, open_stress_scene
+from gsjax.bench.pareto import Point, front, make_points, measure_points
+from gsjax.bench.pixelwise import Dense, composite_dense, error_bound
+from gsjax.bench.report import front_figure, front_picture, table
+from gsjax.bench.scenes import facing_camera, open_bench_scene
 from gsjax.cli.main import main
 from gsjax.errors import InputError
-from gsjax.plots.curves import BOTTOM, LEFT, RIGHT, TOP
 from gsjax.synthetic.stress_scenes import STRESS_SCENES, StressScene
 
 BEHIND = np.array([0.2, 0.5, 0.9])
 COUNT, SIZE = 60, 16
+PIXELS = np.stack(np.meshgrid(np.arange(SIZE), np.arange(SIZE)), -1).reshape(-1, 2)
 EXACT = RasterConfig(
-    alpha_min=1e-12, alpha_max=1.0, stop=0.0, stop_rule="after", outputs=("rgb",)
+    alpha_min=1e-12,
+    alpha_max=1.0,
+    transmittance_min=0.0,
+    stop_rule="after",
+    outputs=("rgb",),
 )
-# Each turned so far that it shows.
-TURNED = {
-    "cut": EXACT.replace(alpha_min=0.05),
-    "cap": EXACT.replace(alpha_max=0.7),
-    "after": EXACT.replace(stop=0.05),
-    "before": EXACT.replace(stop=0.02, stop_rule="before", alpha_max=0.9),
-    "all": EXACT.replace(alpha_min=0.02, alpha_max=0.9, stop=0.05),
+# Each changed so far that the image changes visibly.
+CHANGED = {
+    "alpha_min": EXACT.replace(alpha_min=0.05),
+    "alpha_max": EXACT.replace(alpha_max=0.7),
+    "after": EXACT.replace(transmittance_min=0.05),
+    "before": EXACT.replace(transmittance_min=0.02, stop_rule="before", alpha_max=0.9),
+    "all": EXACT.replace(alpha_min=0.02, alpha_max=0.9, transmittance_min=0.05),
 }
 
 
@@ -44,12 +47,11 @@ def view():
         viewmat=np.eye(4), degree=1,
     )  # fmt: skip
     camera = camera_of(SIZE, SIZE, np.eye(4), centre=(8, 8))
-    pixels = np.stack(np.meshgrid(np.arange(SIZE), np.arange(SIZE)), -1).reshape(-1, 2)
-    return scene, camera, pixelwise.dense(scene, camera, BEHIND, pixels)
+    return scene, camera, composite_dense(scene, camera, BEHIND, PIXELS)
 
 
-def blended(found: pixelwise.Dense, config: RasterConfig) -> np.ndarray:
-    """[P, 3] by the settings' own rules, one splat after another."""
+def blend(found: Dense, config: RasterConfig) -> np.ndarray:
+    """Blend by the rules of the config, one splat after another, [P, 3]."""
     alpha = np.minimum(found.alpha, config.alpha_max)
     alpha = np.where(alpha < config.alpha_min, 0, alpha)
     through, going = np.ones(alpha.shape[1]), np.ones(alpha.shape[1], bool)
@@ -57,7 +59,7 @@ def blended(found: pixelwise.Dense, config: RasterConfig) -> np.ndarray:
     left = np.ones_like(through)
     for a, color in zip(alpha, found.colors):
         tested = through * (1 - a) if config.stop_rule == "before" else through
-        going = going & (tested > config.stop)
+        going = going & (tested > config.transmittance_min)
         weight = np.where(going, a * through, 0)
         total += weight[:, None] * color
         left = left - weight
@@ -65,47 +67,44 @@ def blended(found: pixelwise.Dense, config: RasterConfig) -> np.ndarray:
     return total + left[:, None] * BEHIND
 
 
-def test_the_dense_picture_is_the_reference(view):
+def bound_of(view, config, degree=1):
     scene, camera, found = view
-    wanted = gsjax.reference_render(scene, camera, None, BEHIND)["rgb"]
-    np.testing.assert_allclose(
-        found.picture, np.asarray(wanted).reshape(-1, 3), atol=1e-12
-    )
-    assert found.picture.std() > 0.05
+    return error_bound(found, scene, camera, config, degree=degree, dtype="float64")
 
 
-@pytest.mark.parametrize("name", TURNED)
-def test_what_is_allowed_holds_at_every_pixel(view, name):
+def test_the_dense_image_is_the_reference(view):
     scene, camera, found = view
-    config = TURNED[name]
-    error = np.abs(blended(found, config) - found.picture).max(axis=1)
-    bound = pixelwise.allowed(found, scene, camera, config, degree=1, dtype="float64")
+    wanted = np.asarray(gsjax.reference_render(scene, camera, None, BEHIND)["rgb"])
+    np.testing.assert_allclose(found.rgb, wanted.reshape(-1, 3), atol=1e-12)
+    assert found.rgb.std() > 0.05
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_the_bound_of_a_setting_holds_at_every_pixel(view, name):
+    error = np.abs(blend(view[2], CHANGED[name]) - view[2].rgb).max(axis=1)
+    bound = bound_of(view, CHANGED[name])
     assert (error <= bound).all()
     assert error.max() > 0.01
-    assert (error / bound).max() > 0.1, "the bound says something"
-    # Nothing turned, nothing allowed.
-    still = pixelwise.allowed(found, scene, camera, EXACT, degree=1, dtype="float64")
-    assert still.max() < 1e-7
+    assert (error / bound).max() > 0.1, "the bound is not loose"
+    assert bound_of(view, EXACT).max() < 1e-7
 
 
-def test_what_is_allowed_for_bands_holds(view):
+def test_the_bound_of_bands_holds(view):
     scene, camera, found = view
     fewer = gsjax.with_sh_degree(scene, 0)
-    pixels = np.stack(np.meshgrid(np.arange(SIZE), np.arange(SIZE)), -1).reshape(-1, 2)
-    cut = pixelwise.dense(fewer, camera, BEHIND, pixels).picture
-    error = np.abs(cut - found.picture).max(axis=1)
-    bound = pixelwise.allowed(found, scene, camera, EXACT, degree=0, dtype="float64")
-    assert (error <= bound).all()
+    without = composite_dense(fewer, camera, BEHIND, PIXELS).rgb
+    error = np.abs(without - found.rgb).max(axis=1)
+    assert (error <= bound_of(view, EXACT, degree=0)).all()
     assert error.max() > 0.005
 
 
 @pytest.mark.parametrize("behind", [BEHIND, np.zeros(3)])
-def test_where_nothing_is_the_background_may_be_rounded(view, behind):
+def test_the_background_may_be_rounded(view, behind):
     scene, camera, _ = view
-    found = pixelwise.dense(scene, camera, behind, np.array([[10**4, 10**4]]))
-    np.testing.assert_array_equal(found.picture, [behind])
+    found = composite_dense(scene, camera, behind, np.array([[10**4, 10**4]]))
+    np.testing.assert_array_equal(found.rgb, [behind])
     error = np.abs(np.float32(behind) - behind).max()
-    bound = pixelwise.allowed(found, scene, camera, EXACT, degree=1, dtype="float32")
+    bound = error_bound(found, scene, camera, EXACT, degree=1, dtype="float32")
     assert error <= bound <= 1e-3
     assert (error > 0) == behind.any()
 
@@ -118,114 +117,74 @@ def row(ms: float, error: float, knob: str = "cut", inside: bool = True) -> dict
     }  # fmt: skip
 
 
-def test_the_front_is_what_nothing_beats():
+def test_no_row_beats_the_front():
     rows = [row(3, 1e-3), row(1, 1e-1), row(2, 1e-2), row(2.5, 2e-2), row(9, 1e-3)]
     assert front(rows) == [1, 2, 0]
     hardly = {**rows[0], "forward ms": 9.0, "max": 0.999 * rows[0]["max"]}
-    assert front([*rows, hardly]) == [1, 2, 0], "not for a thousandth"
+    assert front([*rows, hardly]) == [1, 2, 0], "0.1 % is not worth the time"
 
 
-def test_table_and_plot():
+def test_the_table_marks_rows_beyond_their_bound():
     rows = [row(1, 1e-1), row(2, 1e-2, "stop"), row(3, 0.0, "tile", inside=False)]
     lines = table(rows, front(rows)).splitlines()
     assert [line.endswith("OUTSIDE") for line in lines[2:5]] == [False, False, True]
     assert all(line.startswith("*") for line in lines[2:5])
-    picture = front_picture(rows, "x")
+
+
+def test_rows_and_fronts_of_all_devices_reach_the_figure():
+    mine = [row(30, 1e-1), row(20, 1e-2), row(40, 0.0)]
+    other = [row(1, 1e-1), row(3, 1e-1, "slower"), row(2, 1e-2)]
+    axes = front_figure(mine, "x", [("chip", other)]).axes
+    lines = [line.get_xdata().tolist() for line in axes[0].lines]
+    assert [line for line in lines if len(line) > 1] == [[20, 40], [1, 2]]
+    assert sorted(x for line in lines if len(line) == 1 for x in line) == [
+        1, 2, 20, 30, 40,
+    ]  # fmt: skip
+    labels = [text.get_text() for text in axes[0].texts if text.get_text()]
+    assert sum("chip" in label for label in labels) == 2
+    assert len(axes) == 2
+
+
+def test_many_equal_rows_give_a_picture():
+    picture = front_picture([row(1, np.nan), *[row(1, 1e-3, "w" * 90)] * 9], "x")
     assert picture.dtype == np.uint8
     assert picture.shape == (1120, 860, 3)
 
 
-def test_of_other_devices_the_fronts_are_drawn(monkeypatch):
-    drawn = []
-
-    def keep(marks, fronts, **words):
-        drawn.append((marks, [[marks[i].x for i in front] for front in fronts]))
-        return scatter(marks, fronts, **words)
-
-    monkeypatch.setattr(report, "scatter", keep)
-    mine = [row(30, 1e-1), row(20, 1e-2), row(40, 1e-3)]
-    other = [row(1, 1e-1), row(3, 1e-1, "slower"), row(2, 1e-2)]
-    assert front_picture(mine, "x", [("chip", other)]).shape == (1120, 860, 3)
-    assert len(drawn) == 2
-    marks, fronts = drawn[0]
-    assert fronts == [[20, 40], [1, 2]]
-    assert [mark.x for mark in marks if "chip" not in mark.label] == [30, 20, 40]
-    assert [mark.x for mark in marks if "chip" in mark.label] == [1, 2]
-
-
-def test_marks_are_where_their_values_are():
-    """To the right is slower, above is worse."""
-    marks = [Mark(1, 1e-1, "", "a"), Mark(100, 1e-3, "", "b")]
-    plot = scatter(marks, size=(400, 300)).astype(int)
-    colors = ((38, 98, 186), (214, 92, 52))
-    spots = []
-    for color in colors:
-        off = np.abs(plot - color).sum(axis=-1)
-        spots.append(np.argwhere(off < 20).mean(axis=0))
-    (above, left), (below, right) = spots
-    assert left < right - 100
-    assert above < below - 100
-
-
-def test_labels_are_clear_of_dots_and_of_one_another():
-    """Of dots in one place, at the edge too; beside the dot if that may be."""
-    spots = [(200, 150)] * 6 + [(390, 151)] * 6 + [(75, 149)] * 6 + [(206, 40)]
-    boxes = label_boxes(spots, ["label"] * len(spots), (400, 300))
-    for one, other in itertools.combinations(boxes, 2):
-        assert one.clear_of(other)
-    for box in boxes:
-        assert LEFT < box.left < box.right <= 400 - RIGHT
-        assert TOP <= box.top < box.bottom <= 300 - BOTTOM
-        dots = (Box(x - 4, y - 4, x + 4, y + 4) for x, y in spots)
-        assert all(box.clear_of(dot) for dot in dots)
-    first, second = sorted(boxes[:6], key=lambda box: abs(box.bottom - 150))[:2]
-    assert {first.left > 200, second.left > 200} == {True, False}
-    assert all(box.right < 390 for box in boxes[6:12])
-    (wide,) = label_boxes([(200, 150)], ["w" * 99], (400, 300))
-    assert wide.left == LEFT + 1
-
-
 @pytest.mark.parametrize("name", STRESS_SCENES)
-def test_scenes_that_are_built_in(name):
-    trial = open_stress_scene(name)
-    assert trial.name == name
-    assert trial.gaussians.capacity > 1000
-    params = trial.gaussians.params
+def test_built_in_scenes(name):
+    scene = open_bench_scene(name)
+    assert scene.name == name
+    assert scene.gaussians.capacity > 1000
+    params = scene.gaussians.params
     assert all(np.isfinite(leaf).all() for leaf in params.__dict__.values())
-    sized = open_stress_scene(name, size=(40, 30)).camera
+    sized = open_bench_scene(name, size=(40, 30)).camera
     assert (sized.width, sized.height) == (40, 30)
-    assert {point.knob for point in points(trial.gaussians)} >= {"cut", "tile", "dtype"}
+    knobs = {point.knob for point in make_points(scene.gaussians)}
+    assert knobs >= {"cut", "tile", "dtype"}
 
 
-def test_a_camera_for_a_scene_that_nothing_is_known_of(view):
+def test_a_facing_camera_looks_at_the_scene(view):
     scene = view[0]
-    camera = facing(scene, 40, 30)
+    camera = facing_camera(scene, 40, 30)
     middle = np.median(np.asarray(scene.params.means), axis=0)
     seen = np.asarray(camera.viewmat) @ np.append(middle, 1)
     np.testing.assert_allclose(seen[:2], 0, atol=1e-5)
     assert seen[2] > 0
-    with pytest.raises(InputError, match="no Gaussian"):
-        facing(gsjax.select(scene, jnp.zeros(COUNT, bool)), 40, 30)
-
-
-def test_scenes_that_are_not_there():
-    with pytest.raises(InputError, match="knot, fog"):
-        open_stress_scene("nowhere")
+    with pytest.raises(InputError, match="expected an active Gaussian"):
+        facing_camera(gsjax.select(scene, jnp.zeros(COUNT, bool)), 40, 30)
 
 
 @pytest.mark.long
-def test_points_are_measured(view):
-    """One compiled pair beside the exact one: times, errors, bounds, the gradient."""
+def test_a_point_is_measured(view):
+    """Times, errors, bounds and gradient of one point against the exact image."""
     scene, camera, _ = view
-    trial = StressScene("small", scene, camera, tuple(BEHIND))
-    light = {
-        "num_size_buckets": 1,
-        "devices": 1,
-        "outputs": ("rgb",),
-        "pair_capacity": 2048,
-    }
-    config = RasterConfig.compat(**light)
-    (found,) = pareto(trial, [Point("compat", "", config, double=True)], repeats=1)
+    small = StressScene("small", scene, camera, tuple(BEHIND))
+    config = RasterConfig.compat(
+        num_size_buckets=1, devices=1, outputs=("rgb",), pair_capacity=2048
+    )
+    points = [Point("compat", "", config, double=True)]
+    (found,) = measure_points(small, points, repeats=1)
     assert found["inside"]
     assert 1e-5 < found["max"] < 0.05
     assert found["at worst"] <= found["bound"]
@@ -234,16 +193,19 @@ def test_points_are_measured(view):
     json.dumps(found)
 
 
-def test_refusals_of_the_command(tmp_path, capsys):
-    plot = tmp_path / "a.png"
-    plot.touch()
-    for args, code, text in (
-        (["bench", "nowhere"], 3, "knot"),
-        (["bench", "--repeats", "0"], 2, "--repeats"),
-        (["bench", "--budget", "x"], 2, "--budget"),
-        (["bench", "--budget", "2"], 2, "above 0 and below 1"),
-        (["bench", "--plot", str(plot)], 3, "a.png"),
-        (["bench", "--plot", str(plot.with_suffix(".jpg"))], 2, "in .png is wanted"),
-    ):
-        assert main.main(args) == code
-        assert text in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("options", "code", "message"),
+    [
+        (["nowhere"], 3, "knot"),
+        (["--repeats", "0"], 2, "--repeats"),
+        (["--budget", "x"], 2, "--budget"),
+        (["--budget", "2"], 2, "--budget"),
+        (["--plot", "exists.png"], 3, "exists.png"),
+        (["--plot", "a.jpg"], 2, ".png"),
+    ],
+)
+def test_errors_of_the_command(options, code, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite("exists.png", np.zeros((2, 2), np.uint8))
+    assert main(["bench", *options]) == code
+    assert message in capsys.readouterr().err
