@@ -1,15 +1,13 @@
-"""Claim: on an accelerator a render moves bytes at the device's speed, or waits.
+"""Claim: on an accelerator each stage is limited by memory traffic or by launches.
 
-``python benchmarks/accelerator.py`` profiles a render, and its value and gradient, with
-the default settings: guitar and garden where their data are, and synthetic shells of
-0.1, 1 and 3 M Gaussians at 1920 × 1080. Of every stage: microseconds, launches, bytes
-and operations (`kernels`), their shares of what the device was seen to do at most, and
-what bounds it: bytes, arithmetic, launches (where kernels are so short that the next
-comes late), or none of them (where it does less than half of each: look-ups that wait
-for memory, threads that wait for one another). Bytes are counted as if nothing stayed
-in the caches, so a share may be above 1. What no kernel fills, the device waited for
-the host. It tells, too, how each sort and each product of matrices was compiled. There
-is nothing to see on a CPU.
+``python benchmarks/accelerator.py`` profiles a render and its value and gradient with
+the default settings: guitar and garden if their data are present, and synthetic shells
+of 0.1, 1 and 3 M Gaussians at 1920 × 1080. For each stage it reports microseconds,
+launches, bytes and operations (`kernels`), their share of the device's ceilings, and
+the limit: bytes, arithmetic, launches (kernels too short to hide the next launch), or
+none of them (below half of each ceiling). Bytes are counted as if caches were empty, so
+a share may exceed 1; time in which no kernel runs is waiting for the host. It also
+lists how sorts and matrix products were compiled. It needs an accelerator.
 """
 
 from __future__ import annotations
@@ -32,13 +30,15 @@ from gsjax.runtime.console import note
 
 COUNTS = (100_000, 1_000_000, 3_000_000)
 _TURNS = 32
-_HALF = 0.5  # of the most: less does not bound
-_SHORT = 5  # µs: shorter kernels are over before the next is launched
+_HALF = 0.5  # share of a ceiling below which it is no limit
+_SHORT = 5  # µs: shorter kernels end before the next is launched
 
 
 def ceilings() -> dict[str, float]:
-    """What this device does at most: GB/s of a copy, TFLOP/s of a product in full
-    float32, µs of a loop's turn that does nothing much, and of a call."""
+    """Measure the ceilings of the device.
+
+    GB/s of a copy, TFLOP/s of a float32 product, µs of a loop turn and of a call.
+    """
 
     def per_turn(turn, start):
         def run(value, turns):
@@ -65,8 +65,7 @@ def ceilings() -> dict[str, float]:
 
 
 def programs(case: scenes.Case):
-    """A render and its gradient, compiled: (name, what to call, its text, seconds) of
-    each; and the settings, with capacities that fit."""
+    """Compile a render and its gradient: [(name, call, HLO text, seconds)], config."""
     gaussians, camera = case.gaussians, case.camera
     config = gsjax.exact_config(gaussians, camera)
     shape = (camera.height, camera.width, 3)
@@ -94,7 +93,7 @@ def programs(case: scenes.Case):
 
 
 def how_compiled(text: str) -> dict[str, list[str]]:
-    """Sorts, and products of matrices, with what they say of their precision."""
+    """Return how sorts and matrix products were compiled, with their precision."""
     sorts, products = set(), set()
     for line in text.splitlines():
         arrays = re.search(r"= (\(.*?\)|\S+) ", line)
@@ -113,7 +112,7 @@ def how_compiled(text: str) -> dict[str, list[str]]:
 
 
 def measured(case: scenes.Case, made, limits: dict[str, float]) -> list[dict]:
-    """A row for each stage of each program."""
+    """Return a row for each stage of each program."""
     rows = []
     for name, call, text, seconds in made:
         ms = float(np.median(measure.time_ms(call)))
@@ -153,9 +152,9 @@ def measured(case: scenes.Case, made, limits: dict[str, float]) -> list[dict]:
 
 
 def main() -> None:
-    """Compile side by side, profile one after another, and save."""
+    """Compile in parallel, profile one after another, and save."""
     if jax.default_backend() == "cpu":
-        raise SystemExit("there is no accelerator: nothing to profile")
+        raise SystemExit("accelerator.py: expected an accelerator, got a CPU only")
     cases = [*scenes.real_cases(), *(scenes.shell(n, 1920, 1080) for n in COUNTS)]
     with ThreadPoolExecutor(8) as pool:
         made = list(pool.map(programs, cases))

@@ -1,6 +1,7 @@
-"""To import this sets a benchmark up as the command line is: memory in large pages, a
-device for each core, and calls that are waited for; with ``--queued``, where a program
-takes it, calls that may pile up, as is the library's default.
+"""Set up JAX as the command line does, on import.
+
+Memory in large pages, one device per core, and results that are waited for. With
+``--queued``, calls may queue, as is the default of the library.
 """
 
 import sys

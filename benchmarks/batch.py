@@ -1,7 +1,7 @@
-"""Claim: several cameras in one call cost no more than the same calls one by one.
+"""Claim: several cameras in one call cost no more than one call each.
 
-``python benchmarks/batch.py [CAMERAS]`` renders views of the garden (or its synthetic
-stand-in), moved sideways a little, in one call and one by one, in turn: default 8.
+``python benchmarks/batch.py [CAMERAS]`` renders slightly shifted views of the garden
+(or of its synthetic stand-in), in one call and one by one, alternating; default: 8.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""How much sooner held-out views are as good as with an earlier commit.
+"""Compare how soon two commits reach a quality in training.
 
-``python benchmarks/before.py COMMIT DATASET [IMAGE …]`` trains on the photographs of
-the demo as `gsjax demo` does, and on DATASET with `--preset fast`, the named images
-held out (else every 8th), both with the code of COMMIT and with that which is here, in
-processes that have nothing compiled. Residuals is after how many seconds a PSNR of the
-held-out views was passed: compiling counts, measuring and loading do not.
+``python benchmarks/before.py COMMIT DATASET [IMAGE …]`` trains on the demo photographs
+as `gsjax demo` does, and on DATASET with `--preset fast` and the named images held out
+(default: every 8th), with the code of COMMIT and with the working tree, each in a
+process without compiled programs. The result is the seconds until a PSNR of the
+held-out views is passed; compiling counts, evaluating and loading do not.
 """
 
 from __future__ import annotations
@@ -18,12 +18,16 @@ import measure
 from gsjax.runs.folder import run_files
 from gsjax.runs.history import read_metrics
 
-# As `gsjax demo`, but for measuring on the way.
+# As `gsjax demo`, with more evaluations; modules have moved since the first commits.
 DEMO = """
 import sys
 from pathlib import Path
-from gsjax import demo
-from gsjax.cli.common import start_jax
+try:
+    from gsjax.cli.common import start_jax
+    from gsjax.runs import demo
+except ImportError:
+    from gsjax import demo
+    from gsjax.commands.common import start_jax
 start_jax()
 usual = demo.demo_config
 demo.demo_config = lambda *given: usual(*given).replace(every_eval=20)
@@ -32,18 +36,18 @@ demo.run_demo(Path(sys.argv[1]), demo.DemoSettings(), overwrite=False)
 
 
 def trained(code: Path, arguments: list[str], run: Path) -> list[dict]:
-    """What one run with that code came to, measurement by measurement."""
+    """Train once with that code and return the evaluations."""
     measure.run_cold(arguments, code)
     return read_metrics(run_files(run).held_out)
 
 
 def passed(found: list[dict], psnr: float) -> float:
-    """Seconds until it was."""
+    """Return the seconds until a PSNR is passed."""
     return next(row["seconds"] for row in found if row["psnr"] >= psnr)
 
 
 def compared(scene: str, before: list[dict], now: list[dict]) -> list[dict]:
-    """Seconds to the last three whole decibels that both come to."""
+    """Return the seconds to the last three whole decibels that both reach."""
     most = int(min(max(row["psnr"] for row in found) for found in (before, now)))
     rows = []
     for psnr in range(most - 2, most + 1):
@@ -55,7 +59,7 @@ def compared(scene: str, before: list[dict], now: list[dict]) -> list[dict]:
 
 def main(commit: str, dataset: Path, held_out: list[str]) -> None:
     """Measure and save."""
-    options = ["-m", "gsjax.cli.main", "train", str(dataset.resolve())]
+    options = ["-m", "gsjax", "train", str(dataset.resolve())]
     options += ["--preset", "fast", "--eval-every", "25"]
     if held_out:
         options += ["--test-images", *held_out]

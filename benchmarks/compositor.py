@@ -1,14 +1,11 @@
-"""Claim: compositing in JAX keeps within a small factor of plain C++ on two cores.
+"""Claim: compositing in JAX takes at most a small multiple of plain C++ on two cores.
 
-``python benchmarks/compositor.py`` times, in one run and interleaved, the compositor
-of the default settings (8 × 8 tiles, its own lists) against a C++ compositor with two
-threads over the standard exact 16 × 16 lists of the same scene, without early
-termination; forward, and value and gradient. The C++ gradient comes in two forms: by
-Gaussian with the pixels vectorised (tuned), and by pixel, as GPU code has it (plain).
-Both also by chunks, as where XLA makes no single kernel of the loops.
-
-Folders of runs, as further arguments, are timed too, at one view each. With
-``--queued`` JAX has the threads that queued calls need: the price of that.
+``python benchmarks/compositor.py [--queued] [RUN…]`` times the default compositor (8 ×
+8 tiles, own lists) against C++ with two threads over the standard exact 16 × 16 lists
+of the same scene, without early termination, alternating; forward, and value and
+gradient. The C++ gradient is vectorised over pixels (tuned), or goes pixel by pixel as
+GPU code does (plain). The chunked compositor is timed too. One view of each run folder
+is added. ``--queued`` gives JAX the threads that queued calls need.
 """
 
 from __future__ import annotations
@@ -48,14 +45,14 @@ from gsjax.raster.primitives.ellipsoid import conics_of, project
 
 
 class Prepared(NamedTuple):
-    """A view up to the lists of its tiles, on every device.
+    """A view up to its tile lists, on every device.
 
     Attributes:
-      spread: (function, whether each argument has a device's part) → that, of the
-        arguments, with ``function(device, *arguments)`` on every device.
-      grid, room: what `composite` is told.
+      spread: (function, whether each argument is divided among devices) → a function of
+        the arguments that calls ``function(device, *arguments)`` on every device.
+      grid, room: arguments of `composite`.
       project, bin: the stages.
-      projected, lists, schedule: what they come to.
+      projected, lists, schedule: their results.
     """
 
     spread: Callable[..., Callable[..., Any]]
@@ -69,7 +66,7 @@ class Prepared(NamedTuple):
 
 
 def prepare(case: scenes.Case, config: gsjax.RasterConfig) -> Prepared:
-    """What comes before the compositor, jitted and done."""
+    """Compile and run the stages before the compositor."""
     gaussians, camera = case.gaussians, case.camera
     devices = jax.local_device_count()
     grid = binning.make_grid(camera.width, camera.height, config.tile_size, devices)
@@ -80,7 +77,7 @@ def prepare(case: scenes.Case, config: gsjax.RasterConfig) -> Prepared:
     index = jnp.arange(devices, dtype=jnp.int32)
 
     def spread(function, *sharded):
-        """``function(device, *arguments)`` on every device; see `binning.Grid`."""
+        """Call ``function(device, *arguments)`` on every device; see `binning.Grid`."""
 
         def local(device, *arguments):
             arguments = [
@@ -108,7 +105,7 @@ def prepare(case: scenes.Case, config: gsjax.RasterConfig) -> Prepared:
         return lists, schedules.make_schedule(lists, grid, group, chunk, steps)
 
     bin_all = jax.jit(spread(bin_local, False))
-    # On every device beforehand, as within one program.
+    # Replicated beforehand, as within one program.
     projected = projected_of(gaussians, camera)
     projected = jax.device_put(projected, NamedSharding(mesh, PartitionSpec()))
     lists, schedule = bin_all(projected)
@@ -118,7 +115,7 @@ def prepare(case: scenes.Case, config: gsjax.RasterConfig) -> Prepared:
 
 
 def stages(case: scenes.Case, config: gsjax.RasterConfig):
-    """Jitted stages of one view, each with its inputs ready: a dict of functions."""
+    """Return compiled stages of one view by name, with their inputs bound."""
     gaussians, camera = case.gaussians, case.camera
     spread, grid, steps, projected_of, bin_all, *given = prepare(case, config)
     projected, lists, schedule = given
@@ -131,15 +128,17 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     def chunks_local(device, projected, lists, schedule):
         return composite_chunks(projected, lists, schedule, device, grid, config)
 
-    # From one look at who is open to the next it takes so many Gaussians of each tile,
-    # or of a block of tiles, a whole number of turns.
+    # Number of Gaussians of a tile, or of a block of tiles, between two checks for open
+    # pixels.
     singly = fused.suits(3, projected.u.dtype.itemsize, grid)
     look, turn = (fused.LOOK, fused.TURN) if singly else (config.chunk_size,) * 2
     looks = 2 * schedules.step_capacity(share, grid, group, look)
 
     def count_local(device, projected, lists):
-        """[steps] each: evaluations made, and those of them that change the image; and
-        whether there was room for all."""
+        """Return evaluations, those that change the image, and whether all fit.
+
+        The first two are [steps].
+        """
         tables = tables_of(projected, config)
         by_look = schedules.make_schedule(lists, grid, group, look, looks)
         unrolled = schedules.make_steps(by_look, looks)
@@ -152,14 +151,14 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
             corner = binning.corners(by_look.tiles[block], grid, device, pixels.dtype)
             splats = take_rows(tables.splats, ranks)
             carried = jnp.where(first, 1, carried)
-            go = live & jnp.any(carried > config.stop, 1, keepdims=True)
+            go = live & jnp.any(carried > config.transmittance_min, 1, keepdims=True)
             go = (go if singly else jnp.any(go)) & jnp.ones((group, 1), bool)
             alpha = alphas(splats_of(splats, corner), pixels, config)
             total, before = running_product(alpha)
             reached = carried[:, None] * before
             if config.stop_rule == "before":
                 reached = reached * (1 - alpha)
-            blended = (alpha > 0) & (reached > config.stop)
+            blended = (alpha > 0) & (reached > config.transmittance_min)
             count = jnp.sum(ranks < none, 1, keepdims=True)
             made = -(-count // turn) * turn if singly else turn
             made = jnp.sum(go * made) * alpha.shape[2]
@@ -195,7 +194,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
     training = jax.jit(jax.value_and_grad(render_loss))
     *counts, fits = counting(projected, lists)
     if not np.all(fits):
-        raise SystemExit(f"{case.name}: no room for all looks to count by")
+        raise SystemExit(f"{case.name}: too few steps to count all evaluations")
     evaluations, contributions = (
         float(np.sum(np.asarray(number), dtype=np.float64)) for number in counts
     )
@@ -213,7 +212,7 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
 
 
 def reference(case: scenes.Case, projected, config: gsjax.RasterConfig):
-    """The C++ compositor over the standard lists: a dict of functions."""
+    """Return calls of the C++ compositor over the standard lists, by name."""
     width, height = case.camera.width, case.camera.height
     seen = np.asarray(projected.reach) > 0
     means2d = np.stack([projected.u, projected.v], -1)[seen]

@@ -1,7 +1,7 @@
-"""Claim: the demo is over within two minutes on two cores, at 30 dB or more.
+"""Claim: the demo takes less than two minutes on two cores and reaches 30 dB.
 
-``python benchmarks/demo.py`` runs `gsjax demo` in a process that has nothing compiled,
-from starting Python to the turntable. PSNR and SSIM are of the five held-out views.
+``python benchmarks/demo.py`` runs `gsjax demo` without compiled programs, from the
+start of Python to the turntable. PSNR and SSIM are those of the five held-out views.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
-"""Claim: a disk that is full loses nothing that was saved.
+"""Claim: a full disk loses nothing that was saved.
 
 ``python benchmarks/full_disk.py [COUNT]`` (as root: it mounts a small tmpfs) trains a
-small scene with `gsjax train` once with room to spare, then COUNT times (default 8)
-into a tmpfs that has room for a share of that only, from none of it to nearly all. It
-must end with exit code 3 and a line that names the remedy, with checkpoints that
-load and no temporary file. Then the tmpfs is made larger, and the run gone on with
-must end with the bits of the first.
+small scene once with enough space, then COUNT times (default 8) into a tmpfs with a
+part of that space, from none to nearly all. Each must end with exit code 3 and a line
+that names the remedy, with checkpoints that load and no temporary file. With more
+space, the resumed run must end with the bits of the first.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from gsjax.runs.checkpoint import load_checkpoint
 
 
 def mount(folder: Path, size: int, *, again: bool = False) -> None:
-    """A tmpfs of so many bytes, rounded to pages; or another size for one."""
+    """Mount a tmpfs of so many bytes, rounded to pages, or resize it."""
     options = f"{'remount,' if again else ''}size={size}"
     subprocess.run(
         ["mount", "-t", "tmpfs", "-o", options, "gsjax-full-disk", folder], check=True

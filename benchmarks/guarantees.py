@@ -1,14 +1,11 @@
-"""Claim: what each guarantee costs is known.
+"""Report the cost of each guarantee.
 
-``python benchmarks/guarantees.py`` renders guitar.ply at 400 × 300 (where the data are
-absent, a synthetic shell), all in turn in one run: float32 by default; float64; without
-the cap and the cut that the field has (`accurate`); on one device instead of all, which
-gives the same bits; by calls that are queued; derivatives in forward mode (`jax.jvp`,
-one direction), in reverse mode (value and gradient), and of second order (a
-Hessian–vector product). Ratios are to the first, but for the last: to the gradient.
-
-That a run gives the same bits again has no switch: sums go in a fixed order, and ties
-of depth by slot, in any setting.
+``python benchmarks/guarantees.py [--queued]`` renders guitar.ply at 400 × 300 (or a
+synthetic shell), all variants alternating: float32; float64; `accurate` cutoffs; one
+device instead of all, with the same bits; and derivatives in forward mode (`jax.jvp`),
+reverse mode (value and gradient) and of second order (a Hessian–vector product). Ratios
+are relative to the image, or to the gradient for the last. Reproducible bits cannot be
+switched off: sums have a fixed order, and ties of depth are resolved by slot.
 """
 
 from __future__ import annotations
@@ -24,7 +21,7 @@ from gsjax.math.numerics import in_float64
 
 
 def functions(gaussians, camera, config=gsjax.RasterConfig()) -> dict:  # noqa: B008
-    """Of a render, compiled: the picture and its derivatives."""
+    """Return compiled calls of the image and its derivatives, by name."""
     config = gsjax.exact_config(gaussians, camera, config.replace(outputs=("rgb",)))
 
     def picture(params):

@@ -1,11 +1,10 @@
-"""Claim: another program shows the PLY that we write as we show it.
+"""Claim: another program shows an exported PLY as gsjax does.
 
-``python benchmarks/independent_viewer.py RUN`` opens the ``splat.ply`` of a run, as it
-is, in GaussianSplats3D (Kellogg, MIT; WebGL, a reader and a renderer of its own), with
-the camera of a photograph, and renders the same view with ours at the same size. Both
-are kept side by side, with how far apart they are. (That viewer has colours in 8 bits,
-cuts splats at √8 standard deviations, and leaves out what is fainter than 1/255.) Wants
-``npm``, which fetches it, and Chromium.
+``python benchmarks/independent_viewer.py RUN`` opens the ``splat.ply`` of a run in
+GaussianSplats3D (Kellogg, MIT; WebGL) with the camera of a photograph, and renders the
+same view with gsjax. It saves both side by side and their difference. (That viewer has
+8-bit colours, cuts splats at √8 standard deviations, and drops α below 1/255.) It needs
+``npm``, which downloads the viewer, and Chromium.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from gsjax.runs.folder import load_settings, load_split, run_files
 from gsjax.runs.trajectories import view_entries
 
 PACKAGES = ("@mkkellogg/gaussian-splats-3d@0.4.7", "three@0.167.1")
-PATIENCE = 300.0  # s: the browser draws without a GPU
+PATIENCE = 300.0  # s; the browser renders without a GPU
 
 PAGE = """<!doctype html><meta charset="utf-8"><body style="margin:0">
 <script type="importmap">{"imports": {
@@ -64,7 +63,7 @@ const viewer = new Splats.DropInViewer({
   sharedMemoryForWorkers: false, gpuAcceleratedSort: false, integerBasedSort: false,
   sphericalHarmonicsDegree: degree, antialiased: false, dynamicScene: false,
   sceneRevealMode: Splats.SceneRevealMode.Instant, logLevel: 0});
-const scene = new THREE.Dataset();
+const scene = new THREE.Scene();
 scene.add(viewer);
 await viewer.addSplatScene("splat.ply", {showLoadingUI: false,
   splatAlphaRemovalThreshold: 1, progressiveLoad: false});
@@ -78,7 +77,7 @@ await tell("/picture", renderer.domElement.toDataURL("image/png"));
 
 
 class Handler(http.server.SimpleHTTPRequestHandler):
-    """Serves a folder, and takes what the page posts."""
+    """Serve a folder and keep what the page posts."""
 
     posted: ClassVar[dict[str, bytes]] = {}
     done = threading.Event()
@@ -92,11 +91,11 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         self.done.set()
 
     def log_message(self, format, *args):
-        """Say nothing."""
+        """Print nothing."""
 
 
 def theirs(folder: Path, splat: Path, camera: gsjax.Camera, origin, degree: int):
-    """[H, W, 3] uint8: the picture of the other program."""
+    """Return the image [H, W, 3] uint8 of the other program."""
     packages = ["npm", "install", "--no-audit", "--no-fund", *PACKAGES]
     subprocess.run(packages, cwd=folder, check=True, capture_output=True)
     shutil.copy(splat, folder / "splat.ply")
@@ -144,7 +143,7 @@ def theirs(folder: Path, splat: Path, camera: gsjax.Camera, origin, degree: int)
 
 
 def main() -> None:
-    """Draw both, compare and save."""
+    """Render both, compare and save."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, metavar="RUN")
     run = parser.parse_args().run

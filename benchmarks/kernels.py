@@ -1,8 +1,7 @@
-"""What a compiled program asks of a device, kernel by kernel, and what that took.
+"""Cost of a compiled program kernel by kernel: bytes, operations and microseconds.
 
-The bytes and the arithmetic are counted in XLA's own text of the program, the
-microseconds are those of a profile. Names of stages are the `jax.named_scope`s of the
-renderer.
+Bytes and operations are counted in XLA's text of the program, microseconds come from a
+profile. Stages are the `jax.named_scope`s of the renderer.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ _PARTS = {"dynamic-slice", "slice", "gather"}
 
 
 class Instruction(NamedTuple):
-    """A line of a program: what it makes, of what."""
+    """A line of a program."""
 
     kind: str
     arrays: str
@@ -40,7 +39,7 @@ class Instruction(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes made."""
+        """Return the bytes of the result."""
         return sum(
             _BYTES.get(kind, 0) * _count(shape)
             for kind, shape in _ARRAY.findall(self.arrays)
@@ -48,7 +47,7 @@ class Instruction(NamedTuple):
 
     @property
     def elements(self) -> int:
-        """Numbers made, of the first array."""
+        """Return the number of elements of the first result."""
         found = _ARRAY.search(self.arrays)
         return _count(found[2]) if found else 0
 
@@ -58,8 +57,9 @@ def _count(shape: str) -> int:
 
 
 class Cost(NamedTuple):
-    """Of a kernel: bytes read and written, operations, and the stage it belongs to;
-    and whether it is a product of matrices by a library, whose kernels have no name.
+    """Bytes read and written, operations and stage of a kernel.
+
+    ``product`` is True for a matrix product of a library, whose kernels have no name.
     """
 
     bytes: int
@@ -69,7 +69,7 @@ class Cost(NamedTuple):
 
 
 def parse(text: str) -> dict[str, dict[str, Instruction]]:
-    """Instructions by name, for each computation of a program."""
+    """Return the instructions of each computation, by name."""
     found: dict[str, dict[str, Instruction]] = {}
     lines: dict[str, Instruction] = {}
     for line in text.splitlines():
@@ -85,7 +85,7 @@ def parse(text: str) -> dict[str, dict[str, Instruction]]:
 
 
 def costs(text: str) -> dict[str, Cost]:
-    """What each instruction that is a kernel costs, by its name as kernels have it."""
+    """Return the cost of each instruction that is a kernel, by kernel name."""
     program = parse(text)
     made = {}
     for lines in program.values():
@@ -101,7 +101,7 @@ def costs(text: str) -> dict[str, Cost]:
 
 
 def _moved(line: Instruction, lines: dict, inner: dict[str, Instruction]) -> int:
-    """Bytes: each operand once, or what is taken of it; and what is made, or put in."""
+    """Count bytes: each operand once, or the part that is read; and the result."""
     users = defaultdict(list)
     for one in inner.values():
         for operand in one.operands:
@@ -127,7 +127,7 @@ def _moved(line: Instruction, lines: dict, inner: dict[str, Instruction]) -> int
 
 
 def _worked(inner: dict[str, Instruction]) -> int:
-    """Operations on floats; a multiplication with its addition counts as two."""
+    """Count operations on floats; a multiply–add counts as two."""
     total = 0
     for one in inner.values():
         if one.kind in _ARITHMETIC and one.arrays.startswith("f"):
@@ -145,7 +145,7 @@ def _worked(inner: dict[str, Instruction]) -> int:
 
 
 def _stage(rest: str) -> str:
-    """By the names in its metadata; "backward" where it is of a transpose."""
+    """Return the stage from the metadata, with "backward" if transposed."""
     found = re.search(r'op_name="([^"]*)"', rest)
     path = found[1] if found else ""
     parts = re.split(r"[/()]", path)
@@ -158,7 +158,7 @@ def _kernel(name: str) -> str:
 
 
 class Kernel(NamedTuple):
-    """Of a profile: launches and microseconds in a call."""
+    """Launches and microseconds of a kernel in one call, from a profile."""
 
     name: str
     operation: str
@@ -167,7 +167,7 @@ class Kernel(NamedTuple):
 
 
 def profile(function: Callable[[], Any], calls: int = 5) -> tuple[list[Kernel], float]:
-    """Kernels of a call, and microseconds in which any ran."""
+    """Return the kernels of a call, and the microseconds in which any ran."""
     from jax.profiler import ProfileData
 
     jax.block_until_ready(function())
@@ -197,10 +197,10 @@ def profile(function: Callable[[], Any], calls: int = 5) -> tuple[list[Kernel], 
 
 
 def by_stage(kernels: list[Kernel], known: dict[str, Cost]) -> dict[str, dict]:
-    """Microseconds, launches, bytes and operations of each stage.
+    """Return microseconds, launches, bytes and operations of each stage.
 
-    Library kernels bear no name of the program: a product of matrices is counted to
-    the stage that has most of them. "control" is what loops and branches take.
+    Library kernels have no name of the program: matrix products are counted for the
+    stage that has most of them. "control" is the time of loops and branches.
     """
     products = Counter(cost.stage for cost in known.values() if cost.product)
     product = products.most_common(1)[0][0] if products else "other"

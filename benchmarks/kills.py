@@ -1,13 +1,12 @@
-"""Claim: a run that is killed, or interrupted, at any moment goes on to the same bits.
+"""Claim: a run that is killed or interrupted at any moment resumes to the same bits.
 
-``python benchmarks/kills.py [COUNT] [--interrupt]`` trains a small scene with
-`gsjax train` once without interruption, then COUNT times (default 20) kills the process
-(SIGKILL; Ctrl-C's SIGINT with ``--interrupt``) at a random moment, from starting Python
-to writing the result, and goes on with ``--resume``, every fourth time with a second
-kill on the way. A run that was over before its moment came does not count, and another
-takes its place. The Gaussians, the last checkpoint and the log must be those of the
-first run, to the bit; seconds apart. Of Ctrl-C a run must also make exit status 130
-within 20 seconds, and no traceback.
+``python benchmarks/kills.py [COUNT] [--interrupt]`` trains a small scene once without
+interruption, then COUNT times (default 20) kills the process (SIGKILL, or SIGINT with
+``--interrupt``) at a random moment between the start of Python and the end, and
+continues with ``--resume``; every fourth run is killed twice. Runs that ended before
+their moment are repeated. Gaussians, last checkpoint and log must equal those of the
+first run, apart from times. After SIGINT the exit status must be 130 within 20 seconds,
+without a traceback.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ VARYING = {"seconds", "compile_seconds", "compilations"}
 
 
 def command(dataset: Path, run: Path, strategy: str, *more: str) -> list[str]:
-    """`gsjax train` of a run with a checkpoint every few steps."""
+    """Return the `gsjax train` command of a run with frequent checkpoints."""
     program = [
         sys.executable,
         "-m",
@@ -52,7 +51,7 @@ def command(dataset: Path, run: Path, strategy: str, *more: str) -> list[str]:
 
 
 def left_behind(run: Path) -> dict:
-    """What a finished run consists of, as far as it may not vary."""
+    """Return the results of a finished run that must not vary."""
     log = [json.loads(x) for x in (run / "metrics.jsonl").read_text().splitlines()]
     last = max((run / "checkpoints").glob("step_*.npz"))
     with np.load(last) as arrays:
@@ -68,7 +67,7 @@ def left_behind(run: Path) -> dict:
 
 
 class Stopped(NamedTuple):
-    """How a run took a signal: whether it was alive then, and how it ended."""
+    """State of a run at a signal: alive then, and ended well afterwards."""
 
     alive: bool
     good: bool
@@ -77,7 +76,7 @@ class Stopped(NamedTuple):
 def stopped_after(
     arguments: list[str], seconds: float, environment, how: signal.Signals
 ) -> Stopped:
-    """Start, and send a signal after so many seconds."""
+    """Start a run and send a signal after so many seconds."""
     pipe = subprocess.PIPE
     process = subprocess.Popen(
         arguments, env=environment, stdout=subprocess.DEVNULL, stderr=pipe, text=True
@@ -94,7 +93,7 @@ def stopped_after(
             return Stopped(True, False)
         if how == signal.SIGKILL:
             return Stopped(True, process.returncode == -signal.SIGKILL)
-        # Python's own start, and its end after all is written, take it as they do.
+        # Python handles signals by itself while it starts and after all is written.
         own = process.returncode == -signal.SIGINT and "gsjax" not in told
         done = process.returncode == 0
         good = process.returncode == 130 and "Traceback" not in told
@@ -104,8 +103,10 @@ def stopped_after(
 
 
 def prepared(folder: Path) -> dict[str, str]:
-    """Write a small dataset into ``folder``; the environment of runs that share what
-    they compile there.
+    """Write a small dataset into ``folder``.
+
+    Returns:
+      The environment of runs that share a compilation cache there.
     """
     size = DemoDatasetSettings(photos=9, width=48, height=32, points=150, seed=0)
     write_demo_dataset(folder / "dataset", size, overwrite=True)
@@ -114,7 +115,7 @@ def prepared(folder: Path) -> dict[str, str]:
 
 def main(count: int, how: signal.Signals) -> None:
     """Measure and save."""
-    # A shell has what it starts in the background ignore Ctrl-C, and that is inherited.
+    # Background jobs of a shell ignore SIGINT, and their children inherit it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     rng = np.random.default_rng(0)
     rows = []
@@ -135,7 +136,7 @@ def main(count: int, how: signal.Signals) -> None:
                 wanted[strategy] = left_behind(run)
 
         def stopped(run, strategy, times):
-            """When, and how the process took it: alive at least once."""
+            """Stop a run at random times, at least once while alive."""
             arguments = command(folder / "dataset", run, strategy, "--resume")
             while True:
                 at = list(rng.uniform(0, seconds[strategy], times))

@@ -1,4 +1,4 @@
-"""Where results go, and cold processes; timing is `gsjax.runtime.timing`."""
+"""Results as JSON files and tables, code of other commits, and cold processes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def code_of(commit: str, folder: Path) -> Path:
 
 
 def run_cold(arguments: list[str], code: Path | None = None) -> None:
-    """Python in a process that has nothing compiled, with the package in ``code``."""
+    """Run Python without a compilation cache, with the package in ``code``."""
     changes = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
     if code is not None:
         changes["PYTHONPATH"] = str(code)
@@ -38,54 +38,56 @@ def run_cold(arguments: list[str], code: Path | None = None) -> None:
     subprocess.run(command, check=True, cwd=code, env={**os.environ, **changes})
 
 
-def here(name: str) -> str:
-    """``name``, of an accelerator with what that is: "_gpu"."""
+def suffixed(name: str) -> str:
+    """Append the kind of accelerator to a name, such as "_gpu"."""
     backend = jax.default_backend()
     return name if backend == "cpu" else f"{name}_{backend}"
 
 
-def path_of(name: str) -> Path:
-    """Where what is measured here by that name is kept; a picture lies beside it."""
-    return RESULTS / f"{here(name)}.json"
+def result_path(name: str) -> Path:
+    """Return the result file of a name on this kind of device."""
+    return RESULTS / f"{suffixed(name)}.json"
 
 
-def kept(name: str) -> dict:
-    """What was measured by that name on this kind of device."""
-    return json.loads(path_of(name).read_text())
+def load_result(name: str) -> dict:
+    """Load the result of a name on this kind of device."""
+    return json.loads(result_path(name).read_text())
 
 
-def elsewhere(name: str, **same) -> list[tuple[str, list[dict]]]:
-    """(Device, rows) of what is kept of that name from other kinds of device, where
-    it says the ``same``."""
+def results_elsewhere(name: str, **same) -> list[tuple[str, list[dict]]]:
+    """Return (device, rows) of results from other kinds of devices.
+
+    Only results whose entries equal ``same`` count.
+    """
     found = []
     for kind in ("", "_gpu", "_tpu"):
         path = RESULTS / f"{name}{kind}.json"
-        if path.stem == here(name) or not path.exists():
+        if path.stem == suffixed(name) or not path.exists():
             continue
         told = json.loads(path.read_text())
         if all(told[key] == value for key, value in same.items()):
-            found.append((device_of(told["machine"]), told["rows"]))
+            found.append((device_name(told["machine"]), told["rows"]))
     return found
 
 
-def device_of(machine: dict[str, str]) -> str:
-    """What a kept result was measured on."""
+def device_name(machine: dict[str, str]) -> str:
+    """Return the device of a result."""
     device = machine["devices"].split(" × ")[1]
     return machine["cpu"] if device == "cpu" else device
 
 
 def save(name: str, rows: list[dict], **more) -> None:
-    """Write ``results/name.json``, see `here`, and print the rows as a table."""
+    """Write ``results/name.json`` (see `suffixed`) and print the rows as a table."""
     RESULTS.mkdir(exist_ok=True)
     content = {"machine": machine(), **more, "rows": rows}
-    path = path_of(name)
+    path = result_path(name)
     files.write_json(path, content)
     print(table(rows))
     print(f"written to {path.name}: {content['machine']}")
 
 
 def table(rows: list[dict]) -> str:
-    """Rows with the same keys as a Markdown table."""
+    """Return rows with the same keys as a Markdown table."""
     head = list(rows[0])
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
     for row in rows:

@@ -1,7 +1,7 @@
 """Claim: each notebook runs within three minutes on two cores.
 
-``python benchmarks/notebooks.py`` executes each as `.ci/run` does, but one after
-another, each in a kernel of its own that has nothing compiled.
+``python benchmarks/notebooks.py`` executes them one after another, each in a kernel
+without compiled programs.
 """
 
 from __future__ import annotations

@@ -1,13 +1,11 @@
-"""Claim: every setting errs by no more than theory allows, and what each costs.
+"""Claim: no setting exceeds its theoretical error bound; and the cost of each.
 
-``python benchmarks/pareto.py [NAME|RUN|PLY …]`` turns one knob at a time (α cut, stop
-and its rule, SH degree, tile, chunk, dtype), with a plan for 1/255 beside them (unless
-``--without-plan``), on the scenes that are built in, and guitar and garden where their
-data are, or on those named: milliseconds forward, and of value and gradient, against
-the errors of the picture and of the gradient. It exits with 1 if an error is beyond its
-bound at any pixel looked at. Fronts that are kept of another kind of device are drawn
-beside; with ``--draw NAME …`` nothing is measured, and what is kept is drawn. ``gsjax
-bench`` does one scene.
+``python benchmarks/pareto.py [--without-plan] [--draw] [NAME|RUN|PLY …]`` changes one
+setting at a time (α cutoff, stop and its rule, SH degree, tile, chunk, dtype) and adds
+a plan for 1/255, on the built-in scenes and on guitar and garden if present:
+milliseconds of image and gradient against their errors. The exit status is 1 if an
+error exceeds its bound. Fronts of other kinds of devices are drawn too; ``--draw`` only
+draws kept results. ``gsjax bench`` does the same for one scene.
 """
 
 from __future__ import annotations
@@ -33,14 +31,14 @@ REAL = {"guitar": scenes.guitar, "garden": scenes.garden}
 
 
 def trial_of(name: str) -> StressScene:
-    """A scene of the benchmarks, or as `gsjax bench` opens it."""
+    """Return a scene of the benchmarks, or one that `gsjax bench` opens."""
     if name in REAL and not Path(name).exists():
         return StressScene(*REAL[name](), background=(0.0, 0.0, 0.0))
     return open_bench_scene(name)
 
 
 def measured(trial: StressScene, planned: bool) -> bool:
-    """Measure and save; whether all are inside. ``planned``: with a plan's point."""
+    """Measure and save; return whether all points are within their bounds."""
     made = None
     if planned:
         behind = trial.background
@@ -59,17 +57,17 @@ def measured(trial: StressScene, planned: bool) -> bool:
 
 
 def draw(name: str) -> None:
-    """The picture of what is kept of a scene."""
+    """Draw the kept result of a scene."""
     stem = f"pareto_{name}"
-    told = measure.kept(stem)
-    others = measure.elsewhere(stem, size=told["size"])
+    told = measure.load_result(stem)
+    others = measure.results_elsewhere(stem, size=told["size"])
     picture = front_picture(told["rows"], name, others)
-    path = measure.path_of(stem).with_suffix(".png")
+    path = measure.result_path(stem).with_suffix(".png")
     files.write_file(path, images.encode_png(picture))
 
 
 def main() -> int:
-    """Measure, save and draw; a scene that is measured again replaces its rows."""
+    """Measure, save and draw."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME|RUN|PLY")
     parser.add_argument("--without-plan", action="store_true")
@@ -83,8 +81,7 @@ def main() -> int:
             inside &= measured(trial, not options.without_plan)
             name = trial.name
         draw(name)
-        # Each kernel is mapped by itself, and Linux lets a process have 65,530 maps:
-        # those of three scenes are more.
+        # Linux limits a process to 65,530 memory maps, and each kernel takes some.
         jax.clear_caches()
     return 0 if inside else 1
 

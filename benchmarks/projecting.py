@@ -1,14 +1,10 @@
-"""Claim: what the projection does once, and in parts, pays; and changes no bit that
-shows.
+"""Claim: materialising and dividing the projection pays, and changes no visible bit.
 
-``python benchmarks/projecting.py [RUN...]`` renders the real scenes, and those of runs'
-folders, and takes gradients, in turn: as it is; with masks and derivatives worked out
-anew wherever they are used (without `numerics.held` and `once`); and, where colours
-turn with the view, with every device projecting all ranks (without `devices.shard_rows`);
-and with parts always. Where a scene has no bands beyond the first, so that nothing is
-in parts, it is taken a second time with random ones up to degree 3. Beside the times,
-the seconds of compiling, and how far the pictures and the gradients are from one
-another.
+``python benchmarks/projecting.py [RUN...]`` times image and gradient, alternating: as
+is; without `materialize`, so that masks and derivatives are recomputed wherever they
+are used; without `shard_rows`, so that every device projects all ranks; and always
+divided. Scenes of degree 0 are timed again with random bands up to degree 3. It reports
+compile times and the differences of images and gradients too.
 """
 
 from __future__ import annotations
@@ -34,28 +30,31 @@ from gsjax.runtime.devices import replicate, shard_rows
 
 
 def unchanged(values, *_, **__):
-    """What stands in the place of what is left out."""
+    """Return the values: the replacement of a function that is left out."""
     return values
 
 
 def order_in_parts(gaussians, *given):
-    """`depth_order`, in parts whatever the colours are."""
+    """Return `depth_order` divided among devices."""
     order, count = depth_order(gaussians, *given)
     devices = jax.local_device_count()
     return shard_rows(order, devices, fill=gaussians.capacity), count
 
 
-# What is put in the place of what.
+# Replacements: (module, name, value).
 WAYS = {
     "as it is": [],
-    "not once": [(ellipsoid, "held", unchanged), (ellipsoid, "once", unchanged)],
+    "not once": [
+        (ellipsoid, "materialize_mask", unchanged),
+        (ellipsoid, "materialize", unchanged),
+    ],
     "not in parts": [(render_camera, "shard_rows", unchanged)],
     "always in parts": [(render_camera, "depth_order", order_in_parts)],
 }
 
 
 def with_bands(case: scenes.Case, degree: int) -> scenes.Case:
-    """The scene with small random coefficients up to a degree."""
+    """Return the scene with small random coefficients up to a degree."""
     params = case.gaussians.params
     count = (degree + 1) ** 2 - 1
     shape = (case.gaussians.capacity, count, 3)
@@ -66,7 +65,7 @@ def with_bands(case: scenes.Case, degree: int) -> scenes.Case:
 
 
 def row(case: scenes.Case) -> dict:
-    """Times of one scene, as ratios to how it is."""
+    """Return the times of one scene relative to the unchanged code."""
     scene, camera = replicate(case.gaussians), case.camera
     config = gsjax.exact_config(scene, camera)
     cotangent = jax.random.normal(jax.random.key(1), (camera.height, camera.width, 3))
@@ -109,7 +108,7 @@ def row(case: scenes.Case) -> dict:
 
 
 def relative(a, b) -> float:
-    """L2 of what differs, of all leaves together, over that of all."""
+    """Return the relative L2 difference over all leaves."""
     pairs = zip(
         map(np.asarray, jax.tree.leaves(a)), map(np.asarray, jax.tree.leaves(b))
     )

@@ -1,12 +1,11 @@
-"""Claim: time and memory grow with the pairs a view asks for, not with worse.
+"""Claim: time and memory grow at most linearly with the pairs of a view.
 
-``python benchmarks/scaling.py`` renders synthetic shells of 1 k … 1 M Gaussians, at
-sizes from 320 × 180 to 1920 × 1080, with room for up to 8 times as many, and up to 8
-cameras in a call; forward and gradient, each point in a process of its own so that its
-peak of memory can be read; fits slopes, and plots, with what is kept of another kind of
-device. On an accelerator there are fewer sizes, and up to 3 M Gaussians. With
-``--side-by-side N`` so many compile at once before anything is timed; first calls are
-then longer, by what they share the cores.
+``python benchmarks/scaling.py [--side-by-side N] [--draw]`` renders synthetic shells of
+1 k to 1 M Gaussians (3 M on accelerators) at 320 × 180 to 1920 × 1080, with up to 8
+times the capacity and up to 8 cameras per call, forward and gradient. Each point runs
+in its own process, so that its peak memory can be read. It fits slopes and plots them
+with kept results of other devices. ``--side-by-side`` compiles N points in parallel
+first; first calls then take longer.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from concurrent.futures import ThreadPoolExecutor
 import measure
 import numpy as np
 
-# This process asks JAX what there is, and leaves the memory to those it starts.
+# This process only queries JAX; its subprocesses need the memory.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 COUNTS = (1_000, 10_000, 100_000, 1_000_000)
@@ -34,7 +33,7 @@ SIZES = ((320, 180), (640, 360), (1280, 720), (1920, 1080))
 
 
 def point(count: int, width: int, height: int, room: int, cameras: int) -> dict:
-    """One scene at one size, in this process, with ``room`` times the slots."""
+    """Measure one scene at one size in this process, with ``room`` times the slots."""
     import as_cli  # noqa: F401
     import jax
     import jax.numpy as jnp
@@ -93,14 +92,14 @@ def point(count: int, width: int, height: int, room: int, cameras: int) -> dict:
 
 
 def shifted(camera, index: int):
-    """The camera moved sideways a little, so that a batch is not one view twice."""
+    """Move a camera sideways a little, so that the views of a batch differ."""
     move = np.zeros((4, 4), np.float32)
     move[0, 3] = 0.02 * index
     return dataclasses.replace(camera, viewmat=camera.viewmat + move)
 
 
 def _peak_gb() -> float:
-    """Peak memory: of the first accelerator if there is one, else resident."""
+    """Return the peak memory of the first accelerator, or of the process."""
     import jax
 
     if jax.default_backend() != "cpu":
@@ -109,7 +108,7 @@ def _peak_gb() -> float:
 
 
 def points(accelerator: bool) -> list[tuple[int, int, int, int, int]]:
-    """What is measured, each as `point` takes it: one thing at a time varies."""
+    """Return the arguments of `point`; one varies at a time."""
     counts = (*COUNTS, 3_000_000) if accelerator else COUNTS
     sizes = SIZES[::3] if accelerator else SIZES
     more = (8,) if accelerator else (2, 4, 8)
@@ -120,11 +119,10 @@ def points(accelerator: bool) -> list[tuple[int, int, int, int, int]]:
 
 
 def measured(values: tuple[int, ...], compiled: str | None = None) -> dict:
-    """`point`, in a process of its own; ``compiled`` keeps what one compiles for the
-    next.
+    """Run `point` in its own process; ``compiled`` is a compilation cache.
 
     Raises:
-      SystemExit: if that failed.
+      SystemExit: if it failed.
     """
     more = {}
     if compiled:
@@ -142,12 +140,12 @@ def measured(values: tuple[int, ...], compiled: str | None = None) -> dict:
 
 
 def compiled_before(wanted: list[tuple[int, ...]], at_once: int) -> Iterator[dict]:
-    """Rows, of which the first calls are from when ``at_once`` compiled at a time."""
+    """Yield rows; first calls are timed while ``at_once`` compile in parallel."""
 
     def begun(values: tuple[int, ...]) -> dict[str, float]:
         try:
             row = measured(values, folder)
-        except SystemExit:  # what fails beside others may have room alone
+        except SystemExit:  # it may fit into memory alone
             return {}
         return {key: row[key] for key in row if key.endswith(" s")}
 
@@ -159,7 +157,7 @@ def compiled_before(wanted: list[tuple[int, ...]], at_once: int) -> Iterator[dic
 
 
 def series(rows: list[dict]) -> dict[str, tuple[list[dict], Callable[[dict], float]]]:
-    """The rows in which one thing alone varies, and that thing, by its name."""
+    """Return the rows in which one quantity varies, and that quantity, by name."""
     plain = [row for row in rows if row["room"] == row["cameras"] == 1]
     small = [row for row in rows if row["width"] == 320]
     wide = [row for row in plain if row["width"] == 1280] or plain
@@ -184,7 +182,7 @@ def series(rows: list[dict]) -> dict[str, tuple[list[dict], Callable[[dict], flo
 
 
 def slopes(rows: list[dict]) -> dict[str, dict[str, float]]:
-    """Exponents of time, memory and first calls against each thing (log-log)."""
+    """Return log-log exponents of time, memory and first calls by quantity."""
     measured = ("forward ms", "v+g ms", "v+g GB", "first forward s", "first v+g s")
     return {
         name: {
@@ -198,7 +196,7 @@ def slopes(rows: list[dict]) -> dict[str, dict[str, float]]:
 
 
 def plot(kept: list[tuple[str, list[dict]]], path) -> None:
-    """Time and memory against each thing, a line for each device in ``kept``."""
+    """Plot time and memory by quantity, one line per device."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -226,7 +224,7 @@ def plot(kept: list[tuple[str, list[dict]]], path) -> None:
         axis.set_ylabel(unit if unit == "ms" else "peak memory, GB")
         axis.grid(True, which="both", alpha=0.3)
         low, high = axis.get_ylim()
-        if high < 100 * low:  # powers of ten alone would be too few
+        if high < 100 * low:  # powers of ten alone are too few
             axis.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 3, 5)))
             axis.yaxis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
             axis.yaxis.set_minor_formatter(ticker.NullFormatter())
@@ -239,19 +237,19 @@ def plot(kept: list[tuple[str, list[dict]]], path) -> None:
 
 
 def draw() -> None:
-    """The plot of what is kept, of every kind of device."""
-    told = measure.kept("scaling")
-    mine = measure.device_of(told["machine"]), told["rows"]
-    others = measure.elsewhere("scaling")
-    plot([mine, *others], measure.path_of("scaling").with_suffix(".png"))
+    """Plot the kept results of every kind of device."""
+    told = measure.load_result("scaling")
+    mine = measure.device_name(told["machine"]), told["rows"]
+    others = measure.results_elsewhere("scaling")
+    plot([mine, *others], measure.result_path("scaling").with_suffix(".png"))
 
 
 def main() -> None:
-    """Run every point in its own process, save, fit and plot."""
+    """Run every point, save, fit and plot."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--point", nargs=5, type=int, help="as of `point`")
+    parser.add_argument("--point", nargs=5, type=int, help="arguments of `point`")
     parser.add_argument("--side-by-side", type=int, default=1)
-    parser.add_argument("--draw", action="store_true", help="what is kept")
+    parser.add_argument("--draw", action="store_true", help="draw kept results only")
     options = parser.parse_args()
     if options.point:
         print(json.dumps(point(*options.point)))

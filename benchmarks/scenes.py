@@ -1,7 +1,7 @@
-"""The scenes that the benchmarks share, as `Gaussians` with a `Camera`.
+"""Scenes that the benchmarks share, as `Gaussians` with a `Camera`.
 
-Real data lie in ``shared/data`` beside the checkout and are never committed; where
-they are absent, only the synthetic scenes are there.
+Real data are in ``shared/data`` beside the checkout and are not part of it; without
+them, only the synthetic scenes exist.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _gaussians(means, quats, scales, opacities, colors) -> gsjax.Gaussians:
 
 
 def guitar() -> Case:
-    """guitar.ply, a trained scene of 91 k Gaussians, at 800 × 600."""
+    """Return guitar.ply, a trained scene of 91 k Gaussians, at 800 × 600."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # 667 opacities of +inf are clamped
         gaussians = gsjax.load(DATA / "guitar" / "guitar.ply")
@@ -48,7 +48,7 @@ def guitar() -> Case:
 
 
 def garden(count: int = 100_000, opacity: float = 0.1) -> Case:
-    """SfM points of the garden, as training starts from them, at 648 × 420."""
+    """Return SfM points of the garden, as training starts, at 648 × 420."""
     data = np.load(DATA / "garden" / "garden.npz", allow_pickle=False)
     rng = np.random.default_rng(0)
     chosen = rng.permutation(len(data["means3d"]))[:count]
@@ -69,11 +69,11 @@ def garden(count: int = 100_000, opacity: float = 0.1) -> Case:
 
 
 def shell(count: int, width: int, height: int, seed: int = 0) -> Case:
-    """Synthetic: flat splats on a bumpy sphere around the origin, trained-like.
+    """Return flat splats on a bumpy sphere around the origin, as after training.
 
     Three quarters lie on the surface with high opacity, a quarter is faint and
-    scattered; the size of the splats follows the count, so that the surface is
-    covered about four times whatever the count.
+    scattered. The splats shrink with the count, so that the surface is covered about
+    four times.
     """
     rng = np.random.default_rng(seed)
     normal = rng.normal(size=(count, 3))
@@ -107,12 +107,12 @@ def shell(count: int, width: int, height: int, seed: int = 0) -> Case:
 
 
 class Run(NamedTuple):
-    """What a run's folder holds.
+    """Contents of a run folder.
 
     Attributes:
       gaussians: its scene.
-      seen: the cameras of the photographs it was trained on.
-      between: 400 cameras on a smooth path through all of them.
+      seen: the training cameras.
+      between: 400 cameras on a smooth path through them.
     """
 
     gaussians: gsjax.Gaussians
@@ -121,7 +121,7 @@ class Run(NamedTuple):
 
 
 def of_run(folder: Path) -> Run:
-    """The scene and the cameras of a run that ``gsjax train`` made."""
+    """Load the scene and the cameras of a run of ``gsjax train``."""
     from gsjax.runs.folder import load_scene, load_settings, load_split, run_files
     from gsjax.runs.trajectories import CAMERA_PATHS, path_entries, view_entries
 
@@ -139,8 +139,9 @@ def of_run(folder: Path) -> Run:
 
 
 def real_cases(runs: Iterable[str] = ()) -> list[Case]:
-    """guitar and garden where the data are there, else a synthetic stand-in; and one
-    view of each of the folders ``runs``.
+    """Return guitar and garden if present, else a synthetic stand-in.
+
+    One view of each run folder is added.
     """
     cases = [shell(90_000, 800, 600)]
     if (DATA / "guitar").is_dir():

@@ -1,9 +1,9 @@
-"""Claim: what a view doesn't need isn't paid for.
+"""Claim: parts of a scene that a view does not show cost little.
 
 ``python benchmarks/skipping.py`` renders 100 k garden points (or a synthetic stand-in)
-and compares, in one run and interleaved, the same view with: four times the capacity;
-95 % of the Gaussians moved out of the view; an opaque wall of eight wide splats in
-front, and one of a thousand that overlap, which is also timed alone.
+and times, alternating, the same view with: four times the capacity; 95 % of the
+Gaussians moved out of view; and an opaque wall in front, of eight wide splats or of a
+thousand, the latter also alone.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gsjax.cameras.camera import camera_centre
 
 
 def behind_camera(case: scenes.Case, share: float) -> gsjax.Gaussians:
-    """The scene with ``share`` of its Gaussians mirrored to behind the camera."""
+    """Mirror ``share`` of the Gaussians to behind the camera."""
     viewmat = np.asarray(case.camera.viewmat)
     centre, forward = np.asarray(camera_centre(viewmat)), viewmat[2, :3]
     params = case.gaussians.params
@@ -34,7 +34,7 @@ def behind_camera(case: scenes.Case, share: float) -> gsjax.Gaussians:
 
 
 def wall_of(case: scenes.Case, across: int, layers: int) -> gsjax.Gaussians:
-    """An opaque wall of across² × layers splats close to the camera."""
+    """Return an opaque wall of across² × layers splats close to the camera."""
     camera = case.camera
     viewmat, K = np.asarray(camera.viewmat), np.asarray(camera.K)
     centre = np.asarray(camera_centre(viewmat))

@@ -1,9 +1,8 @@
-"""Claim: most of a view's time goes into compositing, and little into finding what.
+"""Claim: compositing takes most of the time of a view, and finding the lists little.
 
-``python benchmarks/stages.py [RUN...]`` times the stages of one view with the default
-settings, in turn, on the real scenes and those of runs' folders: projecting, binning
-with its sort, that sort alone (as many keys, two integers packed into one),
-compositing, its backward pass; and what a whole render and its gradient take.
+``python benchmarks/stages.py [RUN...]`` times the stages of one view, alternating:
+projection, binning with its sort, that sort alone, compositing, its backward pass, and
+the whole render with and without gradient.
 """
 
 from __future__ import annotations

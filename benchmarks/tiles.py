@@ -1,9 +1,8 @@
-"""Claim: tiles of 8 × 8 pixels are the fastest, though smaller ones evaluate less.
+"""Claim: tiles of 8 × 8 pixels are fastest, although smaller ones evaluate less.
 
 ``python benchmarks/tiles.py [RUN …]`` composites and renders the scenes of
-`compositor.py` with tiles of 4, 8 and 16 pixels a side, interleaved in one run, and
-counts what is evaluated (a Gaussian at a pixel) for each that changes the image. Of
-tiles of 2 it counts alone: their lists are what takes the time.
+`compositor.py` with tiles of 4, 8 and 16 pixels, alternating, and counts evaluations (a
+Gaussian at a pixel) per contribution to the image; for tiles of 2 it only counts.
 """
 
 from __future__ import annotations

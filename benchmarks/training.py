@@ -1,13 +1,11 @@
-"""Claim: a held-out photograph is shown well within minutes on two cores.
+"""Claim: training reaches a good held-out view within minutes on two cores.
 
-``python benchmarks/training.py DATASET [IMAGE …]`` trains with `gsjax train --preset
-fast`, once for each strategy (or the one of ``--strategy``), with the named images held
-out (else every 8th), in a process that has nothing compiled; with ``--steps N`` so many
-steps, ``--max-gaussians N`` no more Gaussians, ``--preset NAME`` another preset. Residuals
-are PSNR and SSIM of the held-out views over seconds; compiling counts, measuring does
-not. What was kept of other runs of that dataset stays. Drawn are PSNR over seconds,
-with the runs that are kept of another kind of device, and that of the ends over
-Gaussians where runs differ in these alone; with ``--draw`` of what is kept.
+``python benchmarks/training.py DATASET [IMAGE …]`` runs `gsjax train --preset fast`
+once for each strategy (or ``--strategy``) without compiled programs, with the named
+images held out (default: every 8th). ``--steps``, ``--max-gaussians`` and ``--preset``
+change the run. It records PSNR and SSIM of the held-out views over seconds, including
+compiling and excluding evaluation, keeps results of other runs, and draws PSNR over
+seconds and over Gaussians; ``--draw`` only draws kept results.
 """
 
 from __future__ import annotations
@@ -26,11 +24,11 @@ from gsjax.runs.folder import run_files
 from gsjax.runs.history import read_metrics
 from gsjax.runtime import files
 
-# This process asks JAX what there is, and leaves the memory to those it starts.
+# This process only queries JAX; its subprocesses need the memory.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 EVERY = 50
-LEAST = 0.5  # dB that a picture spans: runs that differ by nothing are 0.4 apart
+LEAST = 0.5  # dB, smallest range of a chart: equal runs differ by up to 0.4
 STRATEGIES = ("mcmc", "adaptive")
 CHANGES = ("preset", "steps", "max-gaussians")
 
@@ -38,7 +36,7 @@ CHANGES = ("preset", "steps", "max-gaussians")
 def train(
     dataset: Path, held_out: list[str], strategy: str, other: list[str], run: Path
 ) -> None:
-    """One run, from a cold start."""
+    """Train once without compiled programs."""
     program = ["-m", "gsjax.cli.main", "train", str(dataset), "-o", str(run)]
     options = ["--strategy", strategy, "--eval-every", str(EVERY), *other]
     if held_out:
@@ -47,10 +45,10 @@ def train(
 
 
 def earlier(stem: str, held_out: list[str], new: list[str]) -> list[dict]:
-    """Rows of an earlier result, of the same images, but for those measured anew."""
-    if not measure.path_of(stem).exists():
+    """Return kept rows of the same images, except those measured again."""
+    if not measure.result_path(stem).exists():
         return []
-    told = measure.kept(stem)
+    told = measure.load_result(stem)
     same = told["held out"] == held_out
     return [row for row in told["rows"] if same and row["strategy"] not in new]
 
@@ -58,7 +56,7 @@ def earlier(stem: str, held_out: list[str], new: list[str]) -> list[dict]:
 def main(
     dataset: Path, held_out: list[str], strategies: list[str], changes: dict[str, str]
 ) -> None:
-    """Measure, save and draw; ``changes`` to the preset "fast", by their options."""
+    """Measure, save and draw; ``changes`` are changes to the preset "fast"."""
     stem = f"training_{dataset.name}"
     more = "".join(f", {name} {value}" for name, value in changes.items())
     changes = {"preset": "fast", **changes}
@@ -75,14 +73,14 @@ def main(
             rows += [{"strategy": strategy + more, **record} for record in found]
             rows[-1] |= {**last, "date": machine["date"], "cpu": machine["cpu"]}
     content = {"machine": machine, "claim": __doc__, "held out": held_out}
-    files.write_json(measure.path_of(stem), {**content, "rows": rows})
+    files.write_json(measure.result_path(stem), {**content, "rows": rows})
     for row in rows:
         print(row)
     draw(dataset.name)
 
 
 def by(rows: list[dict], key: Callable[[dict], str]) -> dict[str, list[dict]]:
-    """Rows of a key together, in their order."""
+    """Group rows by a key, in order."""
     found: dict[str, list[dict]] = {}
     for row in rows:
         found.setdefault(key(row), []).append(row)
@@ -90,13 +88,13 @@ def by(rows: list[dict], key: Callable[[dict], str]) -> dict[str, list[dict]]:
 
 
 def draw(name: str) -> None:
-    """Pictures of what is kept of a dataset."""
+    """Draw the kept results of a dataset."""
     stem = f"training_{name}"
-    path, told = measure.path_of(stem), measure.kept(stem)
+    path, told = measure.result_path(stem), measure.load_result(stem)
     rows, held_out = told["rows"], {"held out": told["held out"]}
     others = [
         {**row, "strategy": f"{row['strategy']}, {device}"}
-        for device, found in measure.elsewhere(stem, **held_out)
+        for device, found in measure.results_elsewhere(stem, **held_out)
         for row in found
     ]
     title = f"{name}: PSNR of what was held out, dB"
@@ -108,13 +106,13 @@ def draw(name: str) -> None:
 
 
 def over_seconds(rows: list[dict]) -> list[Series]:
-    """A line a run."""
+    """Return one line per run."""
     runs = by(rows, lambda row: row["strategy"])
     return [line(name, run, "seconds", 1) for name, run in runs.items()]
 
 
 def over_gaussians(rows: list[dict]) -> list[Series]:
-    """A line for runs that differ in their most Gaussians alone: the ends of each."""
+    """Return a line for runs that differ in their largest number of Gaussians only."""
     ends = [run[-1] for run in by(rows, lambda row: row["strategy"]).values()]
     alike = by(ends, lambda row: row["strategy"].split(", max-gaussians")[0])
     several = {name: found for name, found in alike.items() if len(found) > 1}
@@ -124,19 +122,24 @@ def over_gaussians(rows: list[dict]) -> list[Series]:
 
 
 def line(name: str, rows: list[dict], over: str, unit: float) -> Series:
-    """PSNR over one of what was kept."""
+    """Return PSNR over a column."""
     return Series(name, [unit * r[over] for r in rows], [r["psnr"] for r in rows])
 
 
 def write(
     path: Path, series: list[Series], title: str, x_label: str, log_x: bool
 ) -> None:
-    """Write a picture of the lines, if there are any."""
+    """Write a chart of the lines, if there are any."""
     if series:
-        # The names of the lines stand beside the title.
+        # The legend is beside the title.
         size = (720 if len(series) < 4 else 1200, 420)
         picture = curves(
-            series, title=title, x_label=x_label, size=size, log_x=log_x, min_y_span=LEAST
+            series,
+            title=title,
+            x_label=x_label,
+            size=size,
+            log_x=log_x,
+            min_y_span=LEAST,
         )
         files.write_file(path, images.encode_png(picture))
 

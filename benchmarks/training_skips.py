@@ -1,21 +1,15 @@
-"""Claim: what training leaves out changes nothing that counts, and is worth so much.
+"""Claim: what training leaves out changes nothing relevant; and how much it saves.
 
-``python benchmarks/training_skips.py DATASET...`` trains a dataset twice with ``fast``,
-every 8th view held out: as it is, and with pictures of half the size for the first
-quarter (``levels``). On the scene of the first run it measures the other skips, each
-with its switch on and off:
+``python benchmarks/training_skips.py DATASET...`` trains with ``fast`` and every 8th
+view held out, as is and with half-size images in the first quarter (``levels``). On the
+result it measures, with and without:
 
-- ``prune_invisible``: Gaussians that no photograph shows, what the file weighs without
-  them, and whether a view that was trained on changes in a bit;
-- ``skip_masked``: a step with a disc of each photograph left over by a mask, and by how
-  much the gradients differ, relative to the largest.
-
-And what training leaves out because it is worth nothing there: the search for what is
-hidden (``RasterConfig.occlusion``), by the compiling and the time of a step's gradient,
-and by how many pairs of all views are hidden. ("with" is with the skip: no search.)
-
-What is not skipped: the optimiser's updates of Gaussians without a gradient. The whole
-optimiser is a twentieth of a step (``benchmarks/training_step.py``).
+- ``prune_invisible``: Gaussians that no photograph shows, by the size of the file and
+  the bits of the training views;
+- ``skip_masked``: a step whose photographs are masked except for a disc, and the
+  relative difference of the gradients;
+- occlusion culling, which is off in training: time and compile time of a gradient, and
+  the number of pairs that it removes.
 """
 
 from __future__ import annotations
@@ -44,11 +38,11 @@ from gsjax.train.setup import make_setup
 from gsjax.train.step import make_stages, make_train_step
 from gsjax.train.visibility_pruning import prune_invisible
 
-SHARES = (0.75, 0.5, 0.25)  # of the pixels that the mask leaves
+SHARES = (0.75, 0.5, 0.25)  # of the pixels that stay valid
 
 
 class Trained:
-    """A dataset with what was learnt of it."""
+    """A dataset and what was trained on it."""
 
     def __init__(self, folder: Path, config: TrainConfig):
         scene = gsjax.load_dataset(folder)
@@ -62,20 +56,20 @@ class Trained:
         self.frames = make_frames(self.scene.views, self.photos)
 
     def fit(self, config: TrainConfig) -> tuple[FitResult, float]:
-        """The result and seconds, compilation included."""
+        """Train; return the result and the seconds, compiling included."""
         begun = time.perf_counter()
         result = fit(self.scene, self.photos, config)
         jax.block_until_ready(result.state.gaussians)
         return result, time.perf_counter() - begun
 
     def psnr(self, gaussians) -> float:
-        """dB, mean over the held-out views."""
+        """Return the mean PSNR of the held-out views, dB."""
         found = evaluate_views(gaussians, self.test, self.held_out, self.config)
         return float(np.mean([view.psnr for view in found]))
 
 
 def of_levels(name: str, trained: Trained, result: FitResult, seconds: float) -> dict:
-    """Small pictures at first, against full ones from the start."""
+    """Compare small images at first with full ones from the start."""
     config = trained.config.replace(levels=(Level(0.0, 2), Level(0.25, 1)))
     jax.clear_caches()
     other, coarse = trained.fit(config)
@@ -88,7 +82,7 @@ def of_levels(name: str, trained: Trained, result: FitResult, seconds: float) ->
 
 
 def of_unseen(name: str, trained: Trained, result: FitResult) -> dict:
-    """Without the Gaussians that no photograph shows."""
+    """Compare with and without the Gaussians that no photograph shows."""
     config, frames = trained.config, trained.frames
     after, dropped = prune_invisible(
         result.state, frames, make_setup(config, trained.extent)
@@ -119,7 +113,7 @@ def of_unseen(name: str, trained: Trained, result: FitResult) -> dict:
 
 
 def of_masks(name: str, trained: Trained, result: FitResult, share: float) -> dict:
-    """A step whose photographs are masked but for a disc in the middle."""
+    """Time a step whose photographs are masked except for a disc in the middle."""
     config, frames, state = trained.config, trained.frames, result.state
     height, width = frames.pixels.shape[1:3]
     y, x = np.mgrid[:height, :width]
@@ -137,7 +131,7 @@ def of_masks(name: str, trained: Trained, result: FitResult, share: float) -> di
         )
         for skip in (True, False)
     }  # fmt: skip
-    # Adam's step makes much of little: the gradients stand in its moments.
+    # Adam normalises steps, so gradients are compared by the first moments.
     fresh = state.replace(step=jnp.int32(1))
     zero = jax.tree.map(jnp.zeros_like, state.moments)
     fresh = fresh.replace(moments=zero)
@@ -157,7 +151,7 @@ def of_masks(name: str, trained: Trained, result: FitResult, share: float) -> di
 
 
 def of_occlusion(name: str, trained: Trained, result: FitResult) -> list[dict]:
-    """The gradient of a step, and its compiling, without the search."""
+    """Time the gradient of a step and its compiling without occlusion culling."""
     config, frames, state = trained.config, trained.frames, result.state
     raster = config.raster.replace(pair_capacity=pairs_for(state, frames, config))
     batch = draw(frames, jnp.zeros(config.batch, jnp.int32))

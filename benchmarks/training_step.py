@@ -1,10 +1,8 @@
-"""Claim: a training step costs at most 1.5 times the gradient of its picture.
+"""Claim: a training step costs at most 1.5 times the gradient of its image.
 
-``python benchmarks/training_step.py RUN...`` takes the last checkpoint of runs that
-``gsjax train`` made, and times one step from there, in turn with its parts: the value
-and gradient of the picture by all parameters, the loss with its gradient by the
-picture, the optimiser, and one edit of the strategy (not part of a step, as it is not
-due at each).
+``python benchmarks/training_step.py RUN...`` loads the last checkpoint of runs and
+times one step, alternating with its parts: value and gradient of the image, the loss
+with its gradient, the optimiser, and one edit of the strategy (not part of every step).
 """
 
 from __future__ import annotations
@@ -29,13 +27,13 @@ from gsjax.train.frames import draw, make_frames, targets, views_of_step
 from gsjax.train.initialisation import empty_state
 from gsjax.train.loop import subset
 from gsjax.train.losses import photometric_batch
-from gsjax.train.state import gradients_like
 from gsjax.train.setup import make_setup
+from gsjax.train.state import gradients_like
 from gsjax.train.step import make_stages, optimise
 
 
 def parts(folder: Path) -> tuple[dict, dict]:
-    """What the step works on, and functions that do it and its parts."""
+    """Return a description of the step, and calls of the step and its parts by name."""
     settings, split = load_settings(folder), load_split(load_settings(folder))
     config, scene = settings.config, subset(split.dataset, split.train)
     checkpoint = load_latest(run_files(folder).checkpoints)
@@ -54,7 +52,7 @@ def parts(folder: Path) -> tuple[dict, dict]:
     probe = jnp.zeros((config.batch, slots, 2))
     name = "abs_probe" if strategy.absgrad else "probe"
 
-    # Two programs, as in a run; but for the state, whose memory is not taken over.
+    # Two programs, as in a run, but without donating the state.
     @jax.jit
     def differentiate(state, frames, view):
         return stages.differentiate(state, draw(frames, view))
@@ -80,9 +78,7 @@ def parts(folder: Path) -> tuple[dict, dict]:
 
     @jax.jit
     def edit(state):
-        plan, fresh = strategy.plan(
-            state.key, state.step, state.gaussians, state.stats
-        )
+        plan, fresh = strategy.plan(state.key, state.step, state.gaussians, state.stats)
         return apply_edit(plan, state.moments), fresh
 
     differentiated = (state.gaussians.params, probe)

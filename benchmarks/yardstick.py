@@ -29,7 +29,7 @@ TILE_SIZES = (8, 16, 32)
 
 
 def _cache_folder() -> Path:
-    """The folder of compiled libraries, created if need be."""
+    """Return the folder of compiled libraries; create it if missing."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     try:
         folder = Path(base) / "gsjax-yardstick"
@@ -47,7 +47,7 @@ def _library() -> ctypes.CDLL:
     compiler = shutil.which("g++")
     if compiler is None:
         raise RuntimeError("the yardstick needs g++, which was not found")
-    # What -march=native means depends on the machine, so it goes into the hash.
+    # The meaning of -march=native depends on the machine, so it is part of the hash.
     target = [compiler, "-march=native", "-Q", "--help=target", "--version"]
     version = subprocess.run(target, capture_output=True, check=True).stdout
     source = SOURCE.read_bytes()
@@ -75,7 +75,7 @@ def _library() -> ctypes.CDLL:
 
 
 def available() -> bool:
-    """Whether the C++ compositor can be compiled and loaded here."""
+    """Return whether the C++ compositor can be compiled and loaded here."""
     try:
         _library()
     except (RuntimeError, OSError, subprocess.CalledProcessError):
@@ -84,7 +84,7 @@ def available() -> bool:
 
 
 def _array(value, shape, dtype=np.float32) -> np.ndarray:
-    """``value`` as a contiguous array of the given shape, or ValueError."""
+    """Return ``value`` as a contiguous array of a shape, or raise ValueError."""
     array = np.ascontiguousarray(value, dtype)
     if array.shape != shape:
         raise ValueError(f"expected shape {shape}, got {array.shape}")
@@ -104,7 +104,7 @@ def _arguments(
     ranges = _array(tile_ranges, (tiles, 2), np.int32)
     if ranges.size and not (ranges.min() >= 0 and ranges.max() <= pairs):
         raise ValueError("tile_ranges out of range")
-    used = ids[: ranges.max(initial=0)]  # what follows may be padding
+    used = ids[: ranges.max(initial=0)]  # the rest may be padding
     if used.size and not (used.min() >= 0 and used.max() < count):
         raise ValueError("ids out of range")
     return (
@@ -210,7 +210,7 @@ def forward_backward(
 
 
 def time_ms(fn, repeats=5) -> list[float]:
-    """Milliseconds of each of ``repeats`` calls of ``fn()``, after one untimed call."""
+    """Return milliseconds of each of ``repeats`` calls, after one untimed call."""
     fn()
     times = []
     for _ in range(repeats):
@@ -221,7 +221,7 @@ def time_ms(fn, repeats=5) -> list[float]:
 
 
 def _rectangle_minimum(a, b, c, x0, x1, y0, y1) -> np.ndarray:
-    """Minimum of 0.5 (a x^2 + c y^2) + b x y over [x0, x1] x [y0, y1], elementwise."""
+    """Return the minimum of the quadratic form over rectangles, elementwise."""
 
     def sigma(x, y):
         return 0.5 * (a * x * x + c * y * y) + b * x * y
@@ -238,7 +238,7 @@ def _rectangle_minimum(a, b, c, x0, x1, y0, y1) -> np.ndarray:
 def exact_lists(
     means2d, conics, opacities, depths, width, height, tile_size=16, cut=1 / 255
 ):
-    """Per-tile lists of Gaussians, each sorted by (depth, id).
+    """Return per-tile lists of Gaussians, each sorted by (depth, id).
 
     A pair is listed iff the ellipse {sigma <= ln(opacity / cut)} meets the closed
     rectangle of the tile. Gaussians with opacity <= cut, with a non-finite depth or
@@ -308,7 +308,7 @@ def exact_lists(
 
 
 def random_splats(count, width, height, seed=0, scale=4.0) -> dict[str, np.ndarray]:
-    """Random 2D Gaussians of standard deviations around ``scale`` pixels.
+    """Return random 2D Gaussians of standard deviations around ``scale`` pixels.
 
     Returns:
         ``means2d`` [N, 2], ``conics`` [N, 3], ``opacities`` [N], ``colors`` [N, 3]
