@@ -1,56 +1,90 @@
-"""Set-up of all tests: float64, two host devices, small scenes, shared compilations.
+"""Set-up of all tests: float64, two CPU devices, small scenes, shared compilations.
 
-Compiling dominates the run time, so every scene of the catalogue has the same number
-of Gaussians and the same image size, and all tests call the same jitted functions.
+Compiling dominates the run time. So the scenes of the catalogue share one number of
+Gaussians and one image size, tests share jitted functions, XLA optimises little, and
+compiled programs are cached on disk for all processes of a run.
 """
 
 import gc
+import json
 import os
 import signal
 import subprocess
 import sys
 import tempfile
-from functools import cache, partial
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 
 import hypothesis
+
+# XLA compiles a third as long with its older kernel emitters. Results are the same but
+# for rounding, which then depends on the position of a number in an array.
+QUICK_FLAGS = (
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_cpu_parallel_codegen_split_count=1",  # the other tests use the other cores
+)
+
+
+# Tests that need the kernels of users, and how they differ from the quick ones:
+# "as_users": compiled as for users, for bounds that rest on how kernels round.
+# "new_emitters": kernels of users, optimised little: bits do not depend on sizes.
+KINDS = {"as_users": "0", "new_emitters": "1"}  # JAX_DISABLE_MOST_OPTIMIZATIONS
+
+
+def _set_up_environment():
+    """Configure JAX for this process, the workers of xdist, and processes of tests."""
+    if "GSJAX_TESTS_CACHE" in os.environ:  # a worker
+        return None
+    folder = tempfile.TemporaryDirectory(prefix="gsjax-tests-")
+    flags = [
+        "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=131072"
+    ]
+    if version("jaxlib").startswith("0.10."):  # XLA aborts at flags it does not know
+        flags += QUICK_FLAGS
+    os.environ |= {
+        "GSJAX_AUTO_SETUP": "0",
+        "GSJAX_TESTS_CACHE": folder.name,
+        "XDG_CACHE_HOME": folder.name,
+        "XLA_FLAGS": " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip(),
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+        "JAX_COMPILATION_CACHE_DIR": f"{folder.name}/programs",
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0",
+    }
+    return folder
+
+
+_FOLDER = _set_up_environment()
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax._src import compiler
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 # A commit always passes, or never; --hypothesis-profile=default searches anew.
 hypothesis.settings.register_profile("gate", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("gate")
-# Commands keep what they compile: for as long as these tests run, and not at home.
-_CACHE = tempfile.TemporaryDirectory(prefix="gsjax-tests-")
-os.environ["GSJAX_AUTO_SETUP"] = "0"
-os.environ["XDG_CACHE_HOME"] = _CACHE.name
-# What a shell starts in the background ignores Ctrl-C, and so would our processes.
+# A shell starts background processes with Ctrl-C ignored, and ours would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
-
-import jax.numpy as jnp
 
 import gsjax
 import gsjax.runtime.setup
 from gsjax import Gaussians, RasterConfig
 from gsjax.cameras.camera import Camera
-from gsjax.stress.scenes import fields_at
+from gsjax.stress.scenes import gaussian_fields
 
-# What is traced are objects by the million, and few of them in cycles.
-gc.set_threshold(200_000, 20, 50)
-# Thousands of programs of all sizes in one process: memory kept would only pile up.
+gc.set_threshold(200_000, 20, 50)  # tracing makes millions of objects, few in cycles
+# Thousands of programs of all sizes in one process: kept memory would pile up.
 gsjax.runtime.setup.keep_memory = lambda: False
-gsjax.runtime.setup.compile_loops_as_kernels()  # as the command line does
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
-# One size of the ladder and one device: anything more is compiled again. Nor is what is
-# hidden looked for, which compiles longer (see benchmarks/training_skips.py): tests of
-# the oracle, of equal bits, of batches and of bad numbers do, by `WHOLE` and `PRESETS`.
+# Small programs: one array size, one device, and no search for what is hidden. Tests of
+# the oracle, of equal bits, of batches and of bad numbers use `WHOLE` and `PRESETS`.
 LIGHT = {"num_size_buckets": 1, "devices": 1, "pair_capacity": 8192, "occlusion": False}
 ALL = ("rgb", "alpha", "depth", "median_depth")
 COMPAT = RasterConfig.compat(**LIGHT, outputs=ALL)
@@ -65,94 +99,101 @@ PRESETS = {
 COUNT, WIDTH, HEIGHT = 192, 45, 29
 BACKGROUND = np.array([0.2, 0.5, 0.9])
 
-# Every program is a handful of mappings, of which Linux gives a process 65 530. Where
-# they run out XLA crashes, or hangs, wherever it is.
-_MANY_MAPPINGS = 30_000
-_MUCH_MEMORY = 2e9  # bytes: programs that are kept, too
-
-
-class Programs:
-    """How what this process keeps was compiled: as a mark of the test says, or quickly.
-
-    Attributes:
-      kind: "as_users": as users have it, for bounds that rest on how kernels round.
-        "new_emitters": optimised little. Kernels are those of users otherwise: equal
-        bits whatever the sizes, and the memory that they reserve.
-        "quickly": besides, by XLA's older emitters of kernels, in a third of the time.
-        The same to rounding, which depends on where in an array a number stands.
-    """
-
-    kind = "as_users"
-    kinds = ("as_users", "new_emitters")
-
-
-OLDER_EMITTERS = {
-    "xla_cpu_use_fusion_emitters": False,
-    "xla_cpu_parallel_codegen_split_count": 1,  # other tests have the other cores
-}
-
-
-@cache
-def older_emitters() -> dict[str, int]:
-    """`OLDER_EMITTERS` where this XLA knows them, else nothing."""
-    if jax.default_backend() != "cpu":
-        return {}
-    try:
-        jax.jit(lambda x: x + 1, compiler_options=OLDER_EMITTERS)(1.0)
-    except jax.errors.JaxRuntimeError:
-        return {}
-    return OLDER_EMITTERS
-
-
-def _compiled_by_kind(get_compile_options):
-    """JAX has no setting for XLA's options, and XLA's own are of a whole process."""
-
-    def get(*args, **kwargs):
-        options = get_compile_options(*args, **kwargs)
-        if Programs.kind == "quickly":
-            options.env_option_overrides += list(older_emitters().items())
-        return options
-
-    return get
-
-
-if hasattr(compiler, "get_compile_options"):  # private; without it, tests take longer
-    older_emitters()
-    compiler.get_compile_options = _compiled_by_kind(compiler.get_compile_options)
-
-
-def _kind(item) -> str:
-    marks = (mark.name for mark in item.iter_markers() if mark.name in Programs.kinds)
-    return next(marks, "quickly")
+# Linux gives a process 65 530 memory mappings, and every program takes a handful. XLA
+# crashes or hangs when they run out.
+_MAX_MAPPINGS = 30_000
+_MAX_MEMORY = 2e9  # bytes
 
 
 def pytest_collection_modifyitems(items):
-    """Modules that take long, or hold tests that are not compiled quickly, come first,
-    lest one process waits for the other; in each, tests of a kind together.
-    """
+    """Run the slowest modules first, lest one process waits for another at the end."""
     slow = {item.path for item in items if item.get_closest_marker("long")}
-    slow |= {item.path for item in items if _kind(item) != "quickly"}
     paths = list(dict.fromkeys(item.path for item in items))
-    items.sort(key=lambda x: (x.path not in slow, paths.index(x.path), _kind(x)))
+    items.sort(key=lambda item: (item.path not in slow, paths.index(item.path)))
+
+
+def _kind(item) -> str | None:
+    """Return the kind of `KINDS` that a test is marked as; the closest mark counts."""
+    return next((m.name for m in item.iter_markers() if m.name in KINDS), None)
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item):
-    """Before any fixture; one of a module is compiled as its first test wants it."""
+def pytest_runtest_protocol(item):
+    """Run the marked tests of a module in one process with XLA's flags of users."""
     kind = _kind(item)
-    if kind != Programs.kind:  # they round differently, and would be compared
-        jax.clear_caches()
-        jax.config.update("jax_disable_most_optimizations", kind != "as_users")
-        Programs.kind = kind
+    if kind is None or "GSJAX_TESTS_KIND" in os.environ:
+        return None
+    if (item.path, kind) not in _OUTCOMES:
+        of_kind = [
+            other.nodeid
+            for other in item.session.items
+            if (other.path, _kind(other)) == (item.path, kind)
+        ]
+        _OUTCOMES[item.path, kind] = _run_marked(item.config.rootpath, kind, of_kind)
+    outcomes = _OUTCOMES[item.path, kind]
+    failed = ("call", "failed", 0.0, outcomes.get("", "not run"))
+    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    for when, outcome, duration, text in outcomes.get(item.nodeid, [failed]):
+        if outcome == "skipped":
+            text = (str(item.path), item.location[1], text)
+        report = pytest.TestReport(
+            item.nodeid, item.location, {}, outcome, text, when, (), duration
+        )
+        item.ihook.pytest_runtest_logreport(report=report)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
+
+
+_OUTCOMES: dict[tuple[Path, str], dict] = {}  # by module and kind, then by test
+
+
+def _run_marked(root: Path, kind: str, tests: list[str]) -> dict:
+    """Run tests in a process; return their phases, and the output by ""."""
+    flags = os.environ["XLA_FLAGS"]
+    for flag in QUICK_FLAGS:
+        flags = flags.replace(flag, "")
+    with tempfile.TemporaryDirectory() as folder:
+        changes = {
+            "GSJAX_TESTS_KIND": kind,
+            "GSJAX_TESTS_OUTCOMES": f"{folder}/outcomes",
+            "JAX_DISABLE_MOST_OPTIMIZATIONS": KINDS[kind],
+            "XLA_FLAGS": flags,
+        }
+        for name in ("PYTEST_XDIST_WORKER", "PYTEST_XDIST_WORKER_COUNT"):
+            changes[name] = ""
+        done = subprocess.run(
+            [sys.executable, "-m", "pytest", "-n0", "-q", "--durations=0", *tests],
+            cwd=root,
+            env=os.environ | changes,
+            capture_output=True,
+            text=True,
+        )
+        outcomes: dict = {"": f"{done.stdout[-3000:]}\n{done.stderr[-3000:]}"}
+        with open(f"{folder}/outcomes", encoding="utf-8") as file:
+            for line in file:
+                name, *phase = json.loads(line)
+                outcomes.setdefault(name, []).append(phase)
+    return outcomes
+
+
+def pytest_runtest_logreport(report):
+    """In a process of marked tests: store what the process that started it reports."""
+    if "GSJAX_TESTS_OUTCOMES" in os.environ:
+        text = report.longreprtext or None
+        if report.outcome == "skipped":
+            text = report.longrepr[-1]
+        phase = (report.nodeid, report.when, report.outcome, report.duration, text)
+        with open(os.environ["GSJAX_TESTS_OUTCOMES"], "a", encoding="utf-8") as file:
+            file.write(json.dumps(phase) + "\n")
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _room_for_programs():
+def _clear_programs():
     yield
     mappings, sizes = Path("/proc/self/maps"), Path("/proc/self/statm")
     if mappings.exists() and (
-        mappings.read_bytes().count(b"\n") > _MANY_MAPPINGS
-        or int(sizes.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > _MUCH_MEMORY
+        mappings.read_bytes().count(b"\n") > _MAX_MAPPINGS
+        or int(sizes.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > _MAX_MEMORY
     ):
         jax.clear_caches()
         gc.collect()
@@ -160,7 +201,7 @@ def _room_for_programs():
 
 @pytest.fixture(scope="module")
 def float32():
-    """As users have it: the tests compute in float64 otherwise."""
+    """Compute in float32, as users do; the tests compute in float64 otherwise."""
     jax.config.update("jax_enable_x64", False)
     yield
     jax.config.update("jax_enable_x64", True)
@@ -189,7 +230,7 @@ def shared_programs():
         setup = self.setup
         parts = (setup.strategy.plan.__qualname__, setup.loss_terms, id(setup.model))
         extent, settings = np.float32(setup.extent), as_compiled(self.config)
-        key = (Programs.kind, settings, extent, frames.valid is None, parts)
+        key = (settings, extent, frames.valid is None, parts)
         compiler = self.compiler
         compiler.by_sizes, compiler.by_slots = compiled.setdefault(key, ({}, {}))
         return compile_one(self, state, frames, raster)
@@ -201,24 +242,28 @@ def shared_programs():
 
 @pytest.fixture
 def in_a_process():
-    """``in_a_process(code, option=True)``: what Python code prints in a process of its
-    own that no flags of XLA's are told; without the ``option``, not by
-    `gsjax.use_all_cores` either, so that small loops alone are kernels."""
+    """Return ``run(code, option=True)``: what code prints in a process of its own.
 
-    def printed(code: str, option: bool = True) -> str:
+    XLA has no flags there, but for the default number of bytes if not ``option``, so
+    that `gsjax.use_all_cores` leaves only small loops kernels.
+    """
+    default = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1024"
+
+    def run(code: str, option: bool = True) -> str:
         folder = Path(__file__).parent
         path = os.pathsep.join(map(str, (folder, folder.parent)))
-        bare = "import gsjax.runtime.setup as d; d.compile_loops_as_kernels = lambda: None; "
+        changes = {"XLA_FLAGS": "" if option else default, "PYTHONPATH": path}
+        changes |= {"GSJAX_TESTS_CACHE": "", "JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
         done = subprocess.run(
-            [sys.executable, "-c", code if option else bare + code],
-            env={**os.environ, "XLA_FLAGS": "", "PYTHONPATH": path},
+            [sys.executable, "-c", code],
+            env=os.environ | changes,
             capture_output=True,
             text=True,
         )
         assert done.returncode == 0, done.stderr[-2000:]
         return done.stdout
 
-    return printed
+    return run
 
 
 needs_two_devices = pytest.mark.skipif(
@@ -248,7 +293,14 @@ def reference(
 ) -> dict[str, jax.Array]:
     """`gsjax.reference_render`, jitted, of scenes without inactive slots."""
     if config is not None:  # only these matter; the rest would compile it again
-        names = ("alpha_min", "alpha_max", "transmittance_min", "stop_rule", "dilation", "antialias")
+        names = (
+            "alpha_min",
+            "alpha_max",
+            "transmittance_min",
+            "stop_rule",
+            "dilation",
+            "antialias",
+        )
         config = RasterConfig(**{name: getattr(config, name) for name in names})
     return _reference(gaussians, camera, config, background, features)
 
@@ -342,7 +394,7 @@ def gaussians_at(points, scales, opacities, *, viewmat=None, seed=0, degree=3):
     Values are those of float32, as float64. Colours stay clear of the clip at 0.
     """
     viewmat = np.asarray(pose() if viewmat is None else viewmat, np.float32)
-    fields = fields_at(points, scales, opacities, viewmat, seed, degree)
+    fields = gaussian_fields(points, scales, opacities, viewmat, seed, degree)
     return gsjax.make_gaussians(**fields)
 
 

@@ -72,17 +72,7 @@ def run_pages(paths: list[Path], *, claims: str = "", cwd: Path) -> str:
       claims: Python to run after each page.
       cwd: the working directory.
     """
-    from conftest import older_emitters
-
-    flags = [f"--{name}={value}" for name, value in older_emitters().items()]
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(ROOT),
-        "JAX_ENABLE_X64": "0",
-        # There are many programs, each run once.
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-        "XLA_FLAGS": " ".join([os.environ.get("XLA_FLAGS", ""), *flags]),
-    }
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_ENABLE_X64": "0"}
     done = subprocess.run(
         [sys.executable, "-W", "error::UserWarning", __file__, *map(str, paths)],
         cwd=cwd,

@@ -92,7 +92,8 @@ def test_each_is_one_kernel_that_copies_nothing_in_a_turn(in_a_process):
     where XLA is told nothing, as in a program that has not called `use_all_cores`.
     """
     names = "cumulative_sum", "append", "places", "scatter_items"
-    code = f"import test_loops; print(chr(0).join(map(test_loops.compiled, {names})))"
+    code = "from runtime.test_loops import compiled; "
+    code += f"print(chr(0).join(map(compiled, {names})))"
     programs = in_a_process(code, option=False).split(chr(0))
     assert len(programs) == len(names)
     for program in programs:
