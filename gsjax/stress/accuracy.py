@@ -1,10 +1,10 @@
-"""What the cut-offs leave out, against what they may: the share of the bound taken.
+"""Error of the cut-offs of a render, as a share of its theoretical bound.
 
-At a pixel, leaving out a set S changes the colour by at most D (1 − Π_S (1 − α)),
-D being the colour range including the background.
+Omitting a set S of Gaussians at a pixel changes the colour by at most
+D (1 − Π_S (1 − α)), where D is the colour range including the background.
 """
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -14,26 +14,15 @@ from gsjax.math.numerics import in_float64
 from gsjax.raster.reference import reference_render
 from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig
-from gsjax.stress.scenes import (
-    BACKGROUND,
-    SLOTS,
-    camera_of,
-    each_alpha_oracle,
-    fields_at,
-    frustum,
-    scene_of,
-    unequal,
-    usual,
-)
-from gsjax.stress.types import Case, Measured
+from gsjax.stress import scenes
+from gsjax.stress.scenes import BACKGROUND, COMPAT, SLOTS, camera_of
+from gsjax.stress.types import Measurement, StressCase
 
-_EXACT = RasterConfig(
+_EXACT = COMPAT.replace(
     alpha_min=1e-7,
     alpha_max=1 - 1e-6,
     transmittance_min=0.0,
     outputs=("rgb",),
-    num_size_buckets=1,
-    devices=1,
     pair_capacity=4096,
 )
 _ROUNDING = 1e-6
@@ -41,19 +30,24 @@ _render = jax.jit(render, static_argnames="config")
 
 
 def _dense():
-    """Fog and things in it, deep enough for every cut-off to bite."""
+    """Return fog with objects in it, deep enough for every cut-off to matter."""
     rng = np.random.default_rng(5)
     scales = np.exp(rng.normal(-1.2, 0.7, (SLOTS, 3)))
     opacities = rng.choice([0.01, 0.05, 0.4, 0.995], SLOTS)
-    return scene_of(fields_at(frustum(rng), scales, opacities))
+    points = scenes.frustum_points(rng)
+    return scenes.scene_of(scenes.gaussian_fields(points, scales, opacities))
+
+
+def _rgb(gaussians, config: RasterConfig) -> np.ndarray:
+    out = _render(gaussians, camera_of(), config, jnp.asarray(BACKGROUND))
+    return np.asarray(out.rgb)
 
 
 @cache
 def _exact():
-    """Without cut-offs, in float64: image, α [N, H, W], and the range of colours."""
-    camera = camera_of()
+    """Return the image without cut-offs and α [N, H, W], both in float64, and D."""
     with jax.enable_x64(True):
-        given = in_float64((_dense().params, camera, BACKGROUND))
+        given = in_float64((_dense().params, camera_of(), BACKGROUND))
 
         def slow(params, camera, background):
             active = np.ones(SLOTS, bool)
@@ -61,91 +55,77 @@ def _exact():
             return reference_render(scene, camera, None, background)["rgb"]
 
         image = np.asarray(jax.jit(slow)(*given))
-    alpha = each_alpha_oracle(_dense(), camera)
-    # Colours of `fields_at` are drawn from this range; see there.
+    alpha = scenes.reference_alpha(_dense(), camera_of())
+    # `gaussian_fields` draws colours from this range.
     sh = np.asarray(_dense().params.sh, np.float64)
     spread = 0.283 * np.abs(sh[:, 0]).max() + 1.1 * np.abs(sh[:, 1:]).sum(1).max() + 0.5
     return image, alpha, float(max(spread, 1.0))
 
 
-def _share(config: RasterConfig, bound: np.ndarray) -> float:
-    image, _, _ = _exact()
-    found = np.asarray(
-        _render(_dense(), camera_of(), config, jnp.asarray(BACKGROUND)).rgb
-    )
-    error = np.abs(found - image).max(-1)
-    if error.max() < 1e-5:
-        return float("nan")  # the cut-off did not bite: nothing was measured
-    return float(np.max(error / (bound + _ROUNDING)))
+def _share(config: RasterConfig, bound: np.ndarray, note: str) -> Measurement:
+    """Measure the error as a share of its bound; NaN if the cut-off had no effect."""
+    error = np.abs(_rgb(_dense(), config) - _exact()[0]).max(-1)
+    share = float(np.max(error / (bound + _ROUNDING)))
+    return Measurement(share if error.max() >= 1e-5 else np.nan, note)
 
 
-def cut(alpha_min: float):
-    """α below the cut are left out."""
-
-    def measure(full: bool) -> Measured:
-        del full
-        _, alpha, spread = _exact()
-        left_out = np.where(alpha < alpha_min, alpha, 0)
-        bound = spread * (1 - np.prod(1 - left_out, axis=0))
-        share = _share(_EXACT.replace(alpha_min=alpha_min), bound)
-        return Measured(share, f"bound {bound.max():.1e} at most")
-
-    return measure
-
-
-def stop(rule: str, epsilon: float):
-    """Pixels stop at a transmittance of ``epsilon``."""
-
-    def measure(full: bool) -> Measured:
-        del full
-        _, alpha, spread = _exact()
-        bound = spread * epsilon * np.ones(alpha.shape[1:])
-        if rule == "before":
-            bound = bound / (1 - alpha.max(0))
-        share = _share(_EXACT.replace(transmittance_min=epsilon, stop_rule=rule), bound)
-        return Measured(share, f"bound {bound.max():.1e} at most")
-
-    return measure
-
-
-def cap(full: bool) -> Measured:
-    """α above the cap are lowered to it."""
-    del full
+def alpha_cutoff(alpha_min: float, _full: bool) -> Measurement:
+    """Measure the error of omitting α below ``alpha_min``."""
     _, alpha, spread = _exact()
-    excess = np.maximum(alpha - 0.99, 0).sum(0)
-    return Measured(
-        _share(_EXACT.replace(alpha_max=0.99), spread * excess),
-        f"{int((alpha > 0.99).any(0).sum())} pixels",
-    )
+    left_out = np.where(alpha < alpha_min, alpha, 0)
+    bound = spread * (1 - np.prod(1 - left_out, axis=0))
+    note = f"bound {bound.max():.1e} at most"
+    return _share(_EXACT.replace(alpha_min=alpha_min), bound, note)
 
 
-def sizes_of_work(full: bool) -> Measured:
-    """Numbers that change with what must not matter: capacities, num_size_buckets, slots."""
-    del full
-    wanted = _render(usual(), camera_of(), _EXACT, jnp.asarray(BACKGROUND)).rgb
-    count = 0
+def early_stop(rule: str, epsilon: float, _full: bool) -> Measurement:
+    """Measure the error of stopping at a transmittance of ``epsilon``."""
+    _, alpha, spread = _exact()
+    bound = spread * epsilon * np.ones(alpha.shape[1:])
+    if rule == "before":
+        bound = bound / (1 - alpha.max(0))
+    config = _EXACT.replace(transmittance_min=epsilon, stop_rule=rule)
+    return _share(config, bound, f"bound {bound.max():.1e} at most")
+
+
+def alpha_cap(_full: bool) -> Measurement:
+    """Measure the error of clipping α to 0.99."""
+    _, alpha, spread = _exact()
+    bound = spread * np.maximum(alpha - 0.99, 0).sum(0)
+    note = f"{int((alpha > 0.99).any(0).sum())} pixels"
+    return _share(_EXACT.replace(alpha_max=0.99), bound, note)
+
+
+def capacity_settings(_full: bool) -> Measurement:
+    """Count numbers that change with capacities, size buckets or the order of slots."""
+    scene, count = scenes.default_scene(), 0
+    wanted = _rgb(scene, _EXACT)
     for changes in (
         {"pair_capacity": 8191},
         {"num_size_buckets": 4, "pair_capacity": 2**18},
         {"visible_capacity": SLOTS},
     ):
-        config = _EXACT.replace(**changes)
-        out = _render(usual(), camera_of(), config, jnp.asarray(BACKGROUND))
-        count += unequal(out.rgb, wanted)
+        count += scenes.count_unequal(_rgb(scene, _EXACT.replace(**changes)), wanted)
     order = np.random.default_rng(0).permutation(SLOTS)
-    shuffled = jax.tree.map(lambda a: a[order], usual())
-    out = _render(shuffled, camera_of(), _EXACT, jnp.asarray(BACKGROUND))
-    count += unequal(out.rgb, wanted)
-    return Measured(count, "3 capacities, order of slots")
+    shuffled = jax.tree.map(lambda a: a[order], scene)
+    count += scenes.count_unequal(_rgb(shuffled, _EXACT), wanted)
+    return Measurement(count, "3 capacities, order of slots")
 
 
-_SHARE = "error, as a share of its bound"
+_SHARES = {
+    "cut/1 of 255": partial(alpha_cutoff, 1 / 255),
+    "cut/1 of 1024": partial(alpha_cutoff, 1 / 1024),
+    "cut/1e-4": partial(alpha_cutoff, 1e-4),
+    "stop/after 1e-3": partial(early_stop, "after", 1e-3),
+    "stop/before 1e-3": partial(early_stop, "before", 1e-3),
+    "cap/0.99": alpha_cap,
+}
 CASES = (
-    Case("cut/1 of 255", _SHARE, 1, cut(1 / 255), full_only=True),
-    Case("cut/1 of 1024", _SHARE, 1, cut(1 / 1024), full_only=True),
-    Case("cut/1e-4", _SHARE, 1, cut(1e-4), full_only=True),
-    Case("stop/after 1e-3", _SHARE, 1, stop("after", 1e-3), full_only=True),
-    Case("stop/before 1e-3", _SHARE, 1, stop("before", 1e-3), full_only=True),
-    Case("cap/0.99", _SHARE, 1, cap, full_only=True),
-    Case("settings/of size", "numbers changed", 0, sizes_of_work, full_only=True),
+    *(
+        StressCase(name, "error, as a share of its bound", 1, measure, full_only=True)
+        for name, measure in _SHARES.items()
+    ),
+    StressCase(
+        "settings/of size", "numbers changed", 0, capacity_settings, full_only=True
+    ),
 )

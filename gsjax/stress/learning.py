@@ -1,4 +1,4 @@
-"""What training leans on: initial scales, optimiser, resets, structural similarity."""
+"""Cases about training: initial scales, optimiser, opacity resets, SSIM."""
 
 from pathlib import Path
 
@@ -14,33 +14,24 @@ from gsjax.densify.types import SlotEdit, apply_edit
 from gsjax.gaussians import Gaussians
 from gsjax.init.gaussians import init_gaussians
 from gsjax.math.numerics import logit
-from gsjax.stress.scenes import (
-    SLOTS,
-    camera_of,
-    changed,
-    not_finite,
-    oracle,
-    single,
-    unequal,
-    usual,
-    usual_gradients,
-)
-from gsjax.stress.types import Case, Measured, worse
+from gsjax.stress import scenes
+from gsjax.stress.scenes import SLOTS, camera_of
+from gsjax.stress.types import Measurement, StressCase
 from gsjax.train.metrics import ssim
 from gsjax.train.optimiser import Rates, gaussian_rates, make_optimiser
 
 
-def similarity(full: bool) -> Measured:
-    """Largest |1 − SSIM| of equal pictures, some of them smaller than the window."""
+def similarity(full: bool) -> Measurement:
+    """Measure |1 − SSIM| of equal images, some of them smaller than the window."""
     shapes = ((1, 1), (5, 7), (32, 32)) if full else ((1, 1), (32, 32))
     score, worst, count = jax.jit(ssim), 0.0, 0
     for height, width in shapes:
         drawn = np.random.default_rng(0).uniform(size=(height, width, 3))
         flat = [np.full((height, width, 3), v) for v in (0, 1e-3, 0.1, 0.5, 0.999, 1)]
-        for image in single([*flat, drawn, 1 - 1e-3 * drawn]):
+        for image in scenes.to_float32([*flat, drawn, 1 - 1e-3 * drawn]):
             count += 1
-            worst = worse(worst, abs(1 - float(score(image, image))))
-    return Measured(worst, f"{count} pictures")
+            worst = np.maximum(worst, abs(1 - float(score(image, image))))
+    return Measurement(worst, f"{count} pictures")
 
 
 _OPTIMISER = make_optimiser(gaussian_rates(Rates(), 1.0))
@@ -54,11 +45,18 @@ def _step(params, grads, moments):
     return optax.apply_updates(params, updates), moments
 
 
-def dead_slots(full: bool) -> Measured:
-    """Numbers of dead slots that Adam moves after they have had gradients."""
-    start = usual()
+@jax.jit
+def _first_step(params):
+    """Return parameters and moments after a step with gradients of 1."""
+    ones = jax.tree.map(jnp.ones_like, params)
+    return _step(params, ones, _OPTIMISER.init(params))
+
+
+def dead_slots(full: bool) -> Measurement:
+    """Count parameters of dead slots that Adam moves after they had gradients."""
+    start = scenes.default_scene()
     ones = jax.tree.map(jnp.ones_like, start.params)
-    params, moments = _step(start.params, ones, _OPTIMISER.init(start.params))
+    params, moments = _first_step(start.params)
     dead = jnp.arange(SLOTS) % 2 == 0
     edit = SlotEdit(
         params=params,
@@ -69,36 +67,34 @@ def dead_slots(full: bool) -> Measured:
     )
     edited, moments = apply_edit(edit, moments)
     params = edited.params
-    grads = jax.tree.map(
-        lambda g: jnp.where(dead.reshape(-1, *(1,) * (g.ndim - 1)), 0, g), ones
-    )
+    grads = scenes.where_slots(dead, jax.tree.map(jnp.zeros_like, ones), ones)
     for _ in range(100 if full else 10):
         params, moments = _step(params, grads, moments)
     rows = [jax.tree.map(lambda a: a[dead], p) for p in (params, edited.params)]
     live = [jax.tree.map(lambda a: a[~dead], p) for p in (params, edited.params)]
-    return Measured(
-        unequal(*rows) if unequal(*live) else np.nan, f"{int(dead.sum())} dead slots"
+    return Measurement(
+        scenes.count_unequal(*rows) if scenes.count_unequal(*live) else np.nan,
+        f"{int(dead.sum())} dead slots",
     )
 
 
-def reset_opacities(full: bool) -> Measured:
-    """Gaussians that a reset leaves without a gradient that they should have."""
-    del full
+def reset_opacities(_full: bool) -> Measurement:
+    """Count Gaussians without a gradient after a reset, and wrong moments."""
     low = float(logit(jnp.float32(AdaptiveSettings().reset_opacity)))
-    reset = changed(usual(), logit_opacities=np.full(SLOTS, low, np.float32))
-    _, slopes = usual_gradients(reset)
-    _, _, wanted = oracle(reset, camera_of())
+    logits = np.full(SLOTS, low, np.float32)
+    reset = scenes.with_params(scenes.default_scene(), logit_opacities=logits)
+    _, gradients = scenes.render_and_gradients(reset)
+    _, _, wanted = scenes.reference(reset, camera_of())
     live = np.abs(wanted.params.logit_opacities) > 1e-6
-    lost = live & (slopes.params.logit_opacities == 0)
+    lost = live & (gradients.params.logit_opacities == 0)
     seen = int(live.sum())
-    count = int(lost.sum()) + _kept_moments(reset)
-    return Measured(count if seen > SLOTS // 2 else np.nan, f"of {seen}")
+    count = int(lost.sum()) + _wrong_moments(reset)
+    return Measurement(count if seen > SLOTS // 2 else np.nan, f"of {seen}")
 
 
-def _kept_moments(reset: Gaussians) -> int:
-    """Moments of opacities that outlive a reset, or of anything else that do not."""
-    ones = jax.tree.map(jnp.ones_like, reset.params)
-    _, moments = _step(reset.params, ones, _OPTIMISER.init(reset.params))
+def _wrong_moments(reset: Gaussians) -> int:
+    """Count moments of opacities that outlive a reset, and others that do not."""
+    _, moments = _first_step(reset.params)
     edit = SlotEdit(
         params=reset.params,
         active=reset.active,
@@ -111,12 +107,11 @@ def _kept_moments(reset: Gaussians) -> int:
         moment.replace(logit_opacities=jnp.zeros(SLOTS))
         for moment in (moments[0].mu, moments[0].nu)
     ]
-    return unequal([after[0].mu, after[0].nu], wanted)
+    return scenes.count_unequal([after[0].mu, after[0].nu], wanted)
 
 
-def initial_scales(full: bool) -> Measured:
-    """Numbers not finite in Gaussians made of few, collinear or equal points."""
-    del full
+def initial_scales(_full: bool) -> Measurement:
+    """Count non-finite parameters of Gaussians at few, collinear or equal points."""
     K = np.array([[40.0, 0, 16], [0, 40, 16], [0, 0, 1]])
     views = tuple(
         View(str(x), Path("none"), look_at((x, -4, 1), (0, 0, 0)), K, 32, 32)
@@ -137,14 +132,15 @@ def initial_scales(full: bool) -> Measured:
     for points in clouds.values():
         for seen in (views, views[:1]):
             colors = np.zeros((len(points), 3), np.uint8)
-            scene = Dataset(Path("none"), "none", seen, points, colors)
-            count += not_finite(init_gaussians(scene, sh_degree=0).params)
-    return Measured(count, ", ".join(clouds))
+            dataset = Dataset(Path("none"), "none", seen, points, colors)
+            gaussians = init_gaussians(dataset, sh_degree=0)
+            count += scenes.count_nonfinite(gaussians.params)
+    return Measurement(count, ", ".join(clouds))
 
 
 CASES = (
-    Case("SSIM/equal pictures", "largest |1 − SSIM|", 1e-6, similarity),
-    Case("Adam/dead slots", "numbers changed", 0, dead_slots),
-    Case("opacity/reset", "no gradient, or old moments", 0, reset_opacities),
-    Case("points/initial scales", "numbers not finite", 0, initial_scales),
+    StressCase("SSIM/equal pictures", "largest |1 − SSIM|", 1e-6, similarity),
+    StressCase("Adam/dead slots", "numbers changed", 0, dead_slots),
+    StressCase("opacity/reset", "no gradient, or old moments", 0, reset_opacities),
+    StressCase("points/initial scales", "non-finite numbers", 0, initial_scales),
 )

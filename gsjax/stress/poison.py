@@ -1,15 +1,14 @@
-"""Poison in every number of the parameters, the camera and the background.
+"""Cases that put extreme values into parameters, camera and background.
 
-The law: images and gradients stay finite; what is not a number vanishes; and what is
-not seen leaves no trace, so that images and the gradients by each Gaussian and by the
-background are those, bit for bit, of the scene in which it does not exist. Gradients by
-the camera are sums over all Gaussians, whose order may change: those are held to the
-rounding of such sums.
+Images and gradients have to stay finite, and Gaussians with non-finite values are not
+drawn. A Gaussian that is not drawn has no effect: images and the gradients by other
+Gaussians and by the background equal, bit for bit, those of the scene without it. The
+gradient by the camera is a sum over all Gaussians, so only its rounding may differ.
 """
 
 from collections.abc import Iterator
 from functools import cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,20 +18,9 @@ from gsjax.cameras.camera import Camera
 from gsjax.cameras.lenses import ORTHOGRAPHIC
 from gsjax.gaussians import Gaussians
 from gsjax.raster.types import RasterConfig
-from gsjax.stress.scenes import (
-    BACKGROUND,
-    COMPAT,
-    FIELDS,
-    SLOTS,
-    camera_of,
-    changed,
-    host_fields,
-    not_finite,
-    unequal,
-    usual,
-    usual_gradients,
-)
-from gsjax.stress.types import Case, Measured
+from gsjax.stress import scenes
+from gsjax.stress.scenes import BACKGROUND, COMPAT, FIELDS, SLOTS, camera_of, images_of
+from gsjax.stress.types import Measurement, StressCase
 
 _F32 = np.finfo(np.float32)
 VALUES = (
@@ -43,67 +31,76 @@ VALUES = (
 )
 
 
+class Violations(NamedTuple):
+    """Violations of the rules of this module in one scene.
+
+    Attributes:
+      nonfinite: number of non-finite values in images and gradients.
+      drawn: poisoned slots that are drawn although their value is not finite.
+      changed: number of values that differ from those without the undrawn Gaussians.
+      in_view: number of Gaussians drawn.
+    """
+
+    nonfinite: int
+    drawn: list[int]
+    changed: int
+    in_view: int
+
+
 @cache
 def entries() -> tuple[tuple[str, tuple[int, ...]], ...]:
-    """Every single number of a Gaussian: (field, index)."""
-    fields = host_fields(usual())
+    """Return all scalars of a Gaussian as (field, index)."""
+    fields = scenes.numpy_fields(scenes.default_scene())
     return tuple((f, i) for f in FIELDS for i in np.ndindex(fields[f].shape[1:]))
 
 
 def poisoned(value: float, shift: int) -> tuple[Gaussians, dict[int, str]]:
-    """The usual scene, one slot spoilt in each number: which slot in which.
+    """Return the default scene with one slot poisoned in each scalar, and which where.
 
-    Over all `SLOTS` shifts every number of every slot has its turn.
+    Over `SLOTS` shifts every scalar of every slot is poisoned once.
     """
-    fields, slots = host_fields(usual()), {}
+    scene, slots = scenes.default_scene(), {}
+    fields = scenes.numpy_fields(scene)
     for place, (field, index) in enumerate(entries()):
         slot = (2 * place + shift) % SLOTS
         fields[field][slot, *index] = value
         slots[slot] = f"{field}{list(index)}"
-    return changed(usual(), **fields), slots
+    return scenes.with_params(scene, **fields), slots
 
 
-def traces(
-    scene: Gaussians, spoilt: list[int], value: float, setting: str = "usual"
-) -> dict[str, list[int]]:
-    """What is wrong with a scene of which ``spoilt`` slots hold ``value``.
+def find_violations(
+    scene: Gaussians, slots: list[int], value: float, setting: str = "usual"
+) -> Violations:
+    """Render a scene in which ``slots`` hold ``value``, and check the rules.
 
     Args:
-      setting: of `settings`.
-
-    Returns:
-      "not finite": how many numbers; "seen": spoilt slots that show although their
-      value is no finite number; "traces": how many numbers differ from those of the
-      scene without what is not seen.
+      setting: key of `settings`.
     """
-    seen_by = partial(usual_gradients, **settings()[setting])
-    out, slopes = seen_by(scene)
-    images = (out.rgb, out.alpha, out.depth, out.median_depth, out.radii)
-    unseen = out.radii == 0
-    clean = jax.tree.map(
-        lambda bad, good: jnp.where(
-            unseen.reshape(-1, *(1,) * (bad.ndim - 1)), good, bad
-        ),
-        scene.params,
-        usual().params,
+    draw = partial(scenes.render_and_gradients, **settings()[setting])
+    out, gradients = draw(scene)
+    images = (*images_of(out), out.median_depth)
+    undrawn = out.radii == 0
+    clean = scenes.where_slots(undrawn, scenes.default_scene().params, scene.params)
+    without = scene.replace(  # pyright: ignore
+        params=clean, active=scene.active & ~undrawn
     )
-    without = scene.replace(params=clean, active=scene.active & ~unseen)  # pyright: ignore
-    wanted, wanted_slopes = seen_by(without)
-    others = (wanted.rgb, wanted.alpha, wanted.depth, wanted.median_depth)
-    difference = unequal(images[:4], others)
-    difference += unequal(slopes.params, wanted_slopes.params)
-    difference += unequal(slopes.background, wanted_slopes.background)
-    difference += _beyond_rounding(slopes.camera, wanted_slopes.camera)
-    return {
-        "not finite": [not_finite(images), not_finite(slopes)],
-        "seen": [s for s in spoilt if not np.isfinite(value) and not unseen[s]],
-        "traces": [difference, int((~unseen).sum())],
-    }
+    wanted, others = draw(without)
+    changed = scenes.count_unequal(images, (*images_of(wanted), wanted.median_depth))
+    changed += scenes.count_unequal(gradients.params, others.params)
+    changed += scenes.count_unequal(gradients.background, others.background)
+    changed += _beyond_rounding(gradients.camera, others.camera)
+    return Violations(
+        scenes.count_nonfinite((images, out.radii, gradients)),
+        [slot for slot in slots if not np.isfinite(value) and not undrawn[slot]],
+        changed,
+        int((~undrawn).sum()),
+    )
 
 
 def _beyond_rounding(found: Camera, wanted: Camera) -> int:
-    """Slopes of a camera, sums over all that is seen, that differ by more than the
-    order of the terms of a sum can do; not finite ones are counted elsewhere.
+    """Return how many gradients differ by more than the order of a sum can cause.
+
+    Non-finite ones are counted elsewhere.
     """
     pairs = zip(jax.tree.leaves(found), jax.tree.leaves(wanted))
     return sum(
@@ -111,88 +108,82 @@ def _beyond_rounding(found: Camera, wanted: Camera) -> int:
     )
 
 
-def _sweep(full: bool) -> Iterator[tuple[float, int, dict, dict]]:
-    for value in VALUES:
-        for shift in range(SLOTS) if full else (0,):
-            scene, slots = poisoned(value, shift)
-            yield value, shift, slots, traces(scene, list(slots), value)
-
-
 @cache
 def settings() -> dict[str, dict[str, Any]]:
-    """Ways to render, as arguments of `usual_gradients`."""
-    outputs = (*COMPAT.outputs, "median_depth")
+    """Return ways to render, as arguments of `render_and_gradients`."""
     accurate = RasterConfig.accurate().replace(
         num_size_buckets=1,
         devices=1,
         pair_capacity=COMPAT.pair_capacity,
-        outputs=outputs,
+        outputs=(*COMPAT.outputs, "median_depth"),
     )
-    level = {"focal": 6.0, "lens": ORTHOGRAPHIC}
     return {
         "usual": {},
         "antialiased": {"config": COMPAT.replace(antialias=True)},
         "accurate": {"config": accurate},
-        "orthographic": {"camera": camera_of(**level)},
+        "occlusion culling": {"config": COMPAT.replace(occlusion=True)},
+        "orthographic": {"camera": camera_of(focal=6.0, lens=ORTHOGRAPHIC)},
     }
 
 
-def of_settings(full: bool) -> Measured:
-    """All that `traces` counts, over ways to render, values and numbers."""
-    del full
-    count, words, others = 0, [], [name for name in settings() if name != "usual"]
+def other_settings(_full: bool) -> Measurement:
+    """Count all violations over ways to render."""
+    count, words = 0, []
+    others = [setting for setting in settings() if setting != "usual"]
     for setting in others:
         for value in VALUES:
             scene, slots = poisoned(value, 0)
-            wrong = traces(scene, list(slots), value, setting)
-            changes, seen = wrong["traces"]
-            some = sum(wrong["not finite"]) + len(wrong["seen"]) + changes
-            some += seen < SLOTS // 4
+            found = find_violations(scene, list(slots), value, setting)
+            some = found.nonfinite + len(found.drawn) + found.changed
+            some += found.in_view < SLOTS // 4
             count += some
             if some:
-                words.append(f"{value:g}, {setting}: {wrong}")
+                words.append(f"{value:g}, {setting}: {found}")
     what = f"{', '.join(others)}: {len(VALUES)} values × {len(entries())} numbers"
-    return Measured(count, "; ".join([what, *words[:2]]), {"wrong": words})
+    return _counted(count, what, words)
+
+
+def _counted(count: int, what: str, words: list[str]) -> Measurement:
+    return Measurement(count, "; ".join([what, *words[:2]]), {"wrong": words})
 
 
 @cache
-def _found(full: bool) -> tuple[dict[str, int], list[str]]:
-    """Counts over the sweep, and some words on what was wrong."""
-    totals, words = {"not finite": 0, "seen": 0, "traces": 0}, []
-    for value, shift, slots, wrong in _sweep(full):
-        totals["not finite"] += sum(wrong["not finite"])
-        totals["seen"] += len(wrong["seen"])
-        totals["traces"] += wrong["traces"][0]
-        if wrong["traces"][1] < SLOTS // 4:
-            words.append(f"{value:g} at {shift}: hardly anything was in view")
-            totals["traces"] += 1
-        if sum(wrong["not finite"]):
-            words.append(f"{value:g} at shift {shift}: not finite")
-        words += [f"{value:g} in {slots[s]} seen" for s in wrong["seen"]]
+def _totals(full: bool) -> tuple[dict[str, int], list[str]]:
+    """Return the violations over all values and shifts, and descriptions of them."""
+    totals, words = {"nonfinite": 0, "drawn": 0, "changed": 0}, []
+    for value in VALUES:
+        for shift in range(SLOTS) if full else (0,):
+            scene, slots = poisoned(value, shift)
+            found = find_violations(scene, list(slots), value)
+            totals["nonfinite"] += found.nonfinite
+            totals["drawn"] += len(found.drawn)
+            totals["changed"] += found.changed
+            if found.in_view < SLOTS // 4:
+                words.append(f"{value:g} at {shift}: hardly anything was in view")
+                totals["changed"] += 1
+            if found.nonfinite:
+                words.append(f"{value:g} at shift {shift}: not finite")
+            words += [f"{value:g} in {slots[slot]} drawn" for slot in found.drawn]
     return totals, words
 
 
-def of_parameters(kind: str):
-    """Measures one of the counts of `traces` over all values, numbers and slots."""
-
-    def measure(full: bool) -> Measured:
-        totals, words = _found(full)
-        where = f"{len(VALUES)} values × {len(entries())} numbers"
-        where += f" × {SLOTS} slots" if full else ""
-        return Measured(totals[kind], "; ".join([where, *words[:2]]), {"wrong": words})
-
-    return measure
+def parameters(kind: str, full: bool) -> Measurement:
+    """Count one kind of violation over all values, scalars and slots."""
+    totals, words = _totals(full)
+    where = f"{len(VALUES)} values × {len(entries())} numbers"
+    where += f" × {SLOTS} slots" if full else ""
+    return _counted(totals[kind], where, words)
 
 
 def camera_entries() -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Every single number of a camera: (field, index)."""
+    """Yield all scalars of a camera as (field, index)."""
     for name in ("viewmat", "K", "near", "far"):
         for index in np.ndindex(getattr(camera_of(), name).shape):
             yield name, index
 
 
-def spoilt_camera(values: dict[tuple[str, tuple[int, ...]], float]) -> Camera:
-    """As it can arise under jit, where nothing can be refused."""
+def poisoned_camera(values: dict[tuple[str, tuple[int, ...]], float]) -> Camera:
+    """Return a camera with other scalars, unchecked, as it can arise under jit."""
     fields = vars(camera_of()).copy()
     for (name, index), value in values.items():
         array = np.array(fields[name])
@@ -201,45 +192,48 @@ def spoilt_camera(values: dict[tuple[str, tuple[int, ...]], float]) -> Camera:
     return Camera(**fields)
 
 
-def of_cameras(full: bool) -> Measured:
-    """Numbers that are not finite, in images and gradients, over spoilt cameras."""
-    del full
+def cameras(_full: bool) -> Measurement:
+    """Count non-finite values in images and gradients over poisoned cameras."""
     count, words, renders = 0, [], 0
     for entry in camera_entries():
         for value in VALUES:
             renders += 1
-            out, slopes = usual_gradients(usual(), spoilt_camera({entry: value}))
-            wrong = not_finite((out.rgb, out.alpha, out.depth, out.radii, slopes))
+            camera = poisoned_camera({entry: value})
+            out, gradients = scenes.render_and_gradients(scenes.default_scene(), camera)
+            wrong = scenes.count_nonfinite((images_of(out), out.radii, gradients))
             count += wrong
             if wrong:
                 words.append(f"{value:g} in {entry[0]}{list(entry[1])}")
-    return Measured(
-        count, "; ".join([f"{renders} cameras", *words[:2]]), {"wrong": words}
-    )
+    return _counted(count, f"{renders} cameras", words)
 
 
-def of_backgrounds(full: bool) -> Measured:
-    """Numbers that are not finite, in images and gradients, over backgrounds."""
-    del full
+def backgrounds(_full: bool) -> Measurement:
+    """Count non-finite values in images and gradients over poisoned backgrounds."""
     count, words = 0, []
     for index in range(3):
         for value in VALUES:
             background = BACKGROUND.copy()
             background[index] = value
-            out, slopes = usual_gradients(usual(), background=background)
-            wrong = not_finite((out.rgb, out.alpha, out.depth, slopes))
+            out, gradients = scenes.render_and_gradients(
+                scenes.default_scene(), background=background
+            )
+            wrong = scenes.count_nonfinite((images_of(out), gradients))
             count += wrong
             if wrong:
                 words.append(f"{value:g} in background[{index}]")
-    what = f"{len(VALUES)} values × 3"
-    return Measured(count, "; ".join([what, *words[:2]]), {"wrong": words})
+    return _counted(count, f"{len(VALUES)} values × 3", words)
 
 
+_NONFINITE = "non-finite images and gradients"
 CASES = (
-    Case("poison/not finite", "images and gradients", 0, of_parameters("not finite")),
-    Case("poison/seen", "Gaussians of NaN or inf seen", 0, of_parameters("seen")),
-    Case("poison/traces", "live numbers changed", 0, of_parameters("traces")),
-    Case("poison/settings", "any of these", 0, of_settings, full_only=True),
-    Case("poison/camera", "images and gradients not finite", 0, of_cameras),
-    Case("poison/background", "images and gradients not finite", 0, of_backgrounds),
+    StressCase("poison/not finite", _NONFINITE, 0, partial(parameters, "nonfinite")),
+    StressCase("poison/seen", "NaN or inf drawn", 0, partial(parameters, "drawn")),
+    StressCase(
+        "poison/traces", "live numbers changed", 0, partial(parameters, "changed")
+    ),
+    StressCase(
+        "poison/settings", "any of the above", 0, other_settings, full_only=True
+    ),
+    StressCase("poison/camera", _NONFINITE, 0, cameras),
+    StressCase("poison/background", _NONFINITE, 0, backgrounds),
 )

@@ -1,6 +1,6 @@
-"""float32 against float64: random scenes, far worlds; slopes against differences."""
+"""float32 against float64: random scenes, distant worlds, gradients, projections."""
 
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import jax
@@ -15,96 +15,84 @@ from gsjax.math.numerics import in_float64
 from gsjax.math.rotations import quaternion_to_matrix
 from gsjax.raster.primitives.ellipsoid import ELLIPSOID
 from gsjax.raster.types import Inputs
+from gsjax.stress import scenes
 from gsjax.stress.needles import projected
-from gsjax.stress.scenes import (
-    COMPAT,
-    FIELDS,
-    FOCAL,
-    SIZE,
-    SLOTS,
-    WIDE,
-    camera_of,
-    double,
-    fields_at,
-    frustum,
-    oracle,
-    pose,
-    scene_of,
-    single,
-    usual_gradients,
-    weights,
-)
-from gsjax.stress.types import Case, Measured, worse
+from gsjax.stress.scenes import COMPAT, FIELDS, FOCAL, SIZE, SLOTS, camera_of, scene_of
+from gsjax.stress.types import Measurement, StressCase
 
-SHORT, FULL = 50, 1000
-DIRECTIONS = 32
-_POINTS = ("50 %", "99 %", "99.9 %", "largest")
+_NUM_SCENES_SHORT, _NUM_SCENES_FULL = 50, 1000
+_DIRECTIONS = 32
+_QUANTILES = ("50 %", "99 %", "99.9 %", "largest")
 
 
 def random_scene(seed: int) -> tuple[Gaussians, Camera]:
-    """A scene and a view drawn from a wide family, by its seed alone."""
+    """Return a scene and a camera drawn from a wide family."""
     rng = np.random.default_rng([seed, 20])
-    viewmat = pose(int(rng.integers(2**31)))
+    viewmat = scenes.random_pose(int(rng.integers(2**31)))
     focal = float(np.exp(rng.uniform(np.log(12), np.log(200))))
     near = float(np.exp(rng.uniform(np.log(0.05), np.log(5))))
-    points = frustum(rng, near=near, far=near * rng.uniform(1.2, 20), spread=0.6)
+    far = near * rng.uniform(1.2, 20)
+    points = scenes.frustum_points(rng, near=near, far=far, spread=0.6)
     points[:, :2] *= FOCAL / focal
     unit = points[:, 2:] / focal
     size = np.exp(
         rng.uniform(-1, 3) + rng.uniform(0.1, 1.5) * rng.normal(size=(SLOTS, 3))
     )
     opacities = rng.beta(rng.uniform(0.3, 2), rng.uniform(0.3, 2), SLOTS)
-    fields = fields_at(points, size * unit, opacities.clip(0.005, 0.995), viewmat, seed)
-    live = rng.integers(8, WIDE + 1)
-    scene = scene_of(fields).replace(active=jnp.arange(SLOTS) < live)  # pyright: ignore
+    opacities = opacities.clip(0.005, 0.995)
+    fields = scenes.gaussian_fields(points, size * unit, opacities, viewmat, seed)
+    live = rng.integers(8, scenes.MAX_FULL + 1)
+    scene = scenes.with_active(scene_of(fields), np.arange(SLOTS) < live)
     centre = tuple(SIZE * rng.uniform(0.3, 0.7, 2))
     return scene, camera_of(viewmat, focal=focal, centre=centre)
 
 
 def scene_errors(seed: int) -> tuple[float, float, float]:
-    """Of a random scene: the largest error of a channel of alpha and colour away from
-    thresholds; the relative L2 error of the gradient by the worst kind of parameter;
-    the share of pixels away from thresholds.
+    """Return the errors of a random scene, over the pixels clear of thresholds.
+
+    Returns:
+      The largest error of α and colour; the relative L2 error of the gradient by the
+      worst kind of parameter; the share of pixels compared.
     """
     scene, camera = random_scene(seed)
-    channels, clear, wanted = oracle(scene, camera)
-    weigh = np.where(clear[..., None], weights(), 0)
-    out, found = usual_gradients(scene, camera, weigh=weigh)
+    channels, clear, wanted = scenes.reference(scene, camera)
+    weights = np.where(clear[..., None], scenes.loss_weights(), 0)
+    out, found = scenes.render_and_gradients(scene, camera, weights=weights)
     images = np.concatenate([out.rgb, out.alpha[..., None]], -1)
     image = np.abs(images - channels[..., :4])[clear].max(initial=0)
     worst = 0.0
     for field in FIELDS:
         a, b = getattr(found.params, field), getattr(wanted.params, field)
         norm = np.linalg.norm(b)
-        worst = worse(worst, float(np.linalg.norm(a - b) / norm) if norm > 0 else 0.0)
+        if norm > 0:
+            worst = float(np.maximum(worst, np.linalg.norm(a - b) / norm))
     return float(image), worst, float(clear.mean())
 
 
 @cache
-def _errors(full: bool) -> np.ndarray:
-    """[scenes, 3], see `scene_errors`."""
-    return np.array([scene_errors(seed) for seed in range(FULL if full else SHORT)])
+def _all_errors(full: bool) -> np.ndarray:
+    """Return [scenes, 3], see `scene_errors`."""
+    count = _NUM_SCENES_FULL if full else _NUM_SCENES_SHORT
+    return np.array([scene_errors(seed) for seed in range(count)])
 
 
-def of_scenes(column: int):
-    """99.9 % point over random scenes of the image (0) or gradient (1) errors."""
-
-    def measure(full: bool) -> Measured:
-        errors = _errors(full)[:, column]
-        points = np.quantile(errors, (0.5, 0.99, 0.999, 1))
-        worst = int(np.argmax(errors))
-        told = dict(zip(_POINTS, points.tolist()))
-        note = f"{len(errors)} scenes, median {points[0]:.1e}, "
-        note += f"largest {points[-1]:.1e} (scene {worst})"
-        clear = float(_errors(full)[:, 2].mean())
-        more = {**told, "worst seed": worst, "pixels compared": clear}
-        return Measured(float(points[2]), note, more)
-
-    return measure
+def random_scenes(column: int, full: bool) -> Measurement:
+    """Measure the 99.9 % quantile of image (0) or gradient (1) errors."""
+    errors = _all_errors(full)[:, column]
+    quantiles = np.quantile(errors, (0.5, 0.99, 0.999, 1))
+    worst = int(np.argmax(errors))
+    note = f"{len(errors)} scenes, median {quantiles[0]:.1e}, "
+    note += f"largest {quantiles[-1]:.1e} (scene {worst})"
+    more = {
+        **dict(zip(_QUANTILES, quantiles.tolist())),
+        "worst seed": worst,
+        "pixels compared": float(_all_errors(full)[:, 2].mean()),
+    }
+    return Measurement(float(quantiles[2]), note, more)
 
 
-def far_scene(offset: float) -> tuple[Dataset, np.ndarray]:
-    """Eight cameras around points, ``offset`` metres from the origin on each axis."""
+def distant_dataset(offset: float) -> Dataset:
+    """Return eight cameras around points, ``offset`` metres from the origin."""
     rng = np.random.default_rng(0)
     middle = offset * np.array([1, -0.7, 0.3])
     K = np.array([[FOCAL, 0, 16.6], [0, 1.07 * FOCAL, 15.1], [0, 0, 1]])
@@ -116,62 +104,51 @@ def far_scene(offset: float) -> tuple[Dataset, np.ndarray]:
         views.append(View(f"{turn:.2f}", Path("none"), viewmat, K, SIZE, SIZE))
     points = middle + rng.uniform(-1, 1, (SLOTS, 3))
     colors = np.zeros((SLOTS, 3), np.uint8)
-    return Dataset(Path("none"), "none", tuple(views), points, colors), points
+    return Dataset(Path("none"), "none", tuple(views), points, colors)
 
 
-def far_world(offset: float):
-    """px between float32 after rebasing, and float64 in the original coordinates."""
+def distant_world(offset: float, _full: bool) -> Measurement:
+    """Measure the px error of float32 after rebasing, against float64 without."""
 
-    def shown(scene: Dataset, view: View) -> np.ndarray:
-        fields = fields_at(np.zeros((SLOTS, 3)), 0.05, 0.5)
-        fields["means"] = scene.points.astype(np.float32)
+    def means(dataset: Dataset, view: View) -> np.ndarray:
+        fields = scenes.gaussian_fields(np.zeros((SLOTS, 3)), 0.05, 0.5)
+        fields["means"] = dataset.points.astype(np.float32)
         camera = camera_of(view.viewmat, centre=(view.K[0, 2], view.K[1, 2]))
-        return np.asarray(projected(scene_of(fields), camera)[0], np.float64)
+        return scenes.to_float64(projected(scene_of(fields), camera)[0])
 
-    def measure(full: bool) -> Measured:
-        del full
-        scene, points = far_scene(offset)
-        near, errors = rebase(scene), {"rebased": 0.0, "plain": 0.0}
-        for before, after in zip(scene.views, near.views):
-            rotation = before.viewmat[:3, :3]
-            x, y, z = rotation @ (points - before.centre).T
-            K = double(single(before.K))
-            wanted = np.stack([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]], 1)
-            for name, seen, view in (
-                ("rebased", near, after),
-                ("plain", scene, before),
-            ):
-                error = float(np.max(np.abs(shown(seen, view) - wanted)))
-                errors[name] = worse(errors[name], error)
-        return Measured(errors["rebased"], f"{errors['plain']:.2g} px without rebasing")
-
-    return measure
+    dataset = distant_dataset(offset)
+    near, rebased, plain = rebase(dataset), 0.0, 0.0
+    for before, after in zip(dataset.views, near.views):
+        rotation = before.viewmat[:3, :3]
+        x, y, z = rotation @ (dataset.points - before.centre).T
+        K = scenes.to_float64(scenes.to_float32(before.K))
+        wanted = np.stack([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]], 1)
+        rebased = np.maximum(rebased, np.abs(means(near, after) - wanted).max())
+        plain = np.maximum(plain, np.abs(means(dataset, before) - wanted).max())
+    return Measurement(rebased, f"{plain:.2g} px without rebasing")
 
 
-def _numbers(gaussians: Gaussians, camera: Camera, weigh) -> jax.Array:
-    """A smooth number that every output of the projection has a part in."""
+def _smooth_sum(gaussians: Gaussians, camera: Camera, weights) -> jax.Array:
+    """Return a smooth scalar that depends on every output of the projection."""
     order = jnp.arange(SLOTS)
     inputs, count = Inputs(gaussians, camera), num_active(gaussians)
     footprint, splat, channels = ELLIPSOID.project(inputs, COMPAT, order, count)
     inv_sx, slope, inv_sy, _ = splat.shape
     parts = (splat.u, splat.v, jnp.log(inv_sx), slope, jnp.log(inv_sy))
     rows = jnp.stack([*parts, jnp.log(footprint.var_y), *channels.colors])
-    return jnp.sum(weigh * rows)
+    return jnp.sum(weights * rows)
 
 
 @jax.jit
-def _slopes_and_differences(gaussians, camera, weigh, directions):
+def _derivatives_and_differences(gaussians, camera, weights, directions):
     def along(by_params, by_camera):
-        def moved(step):
+        def value(step):
             params = jax.tree.map(
                 lambda a, d: a + step * d, gaussians.params, by_params
             )
-            return gaussians.replace(params=params), Camera(
-                **{**vars(camera), "viewmat": camera.viewmat + step * by_camera}
-            )
-
-        def value(step):
-            return _numbers(*moved(step), weigh)
+            viewmat = camera.viewmat + step * by_camera
+            moved = Camera(**{**vars(camera), "viewmat": viewmat})
+            return _smooth_sum(gaussians.replace(params=params), moved, weights)
 
         size = 1e-5
         _, slope = jax.jvp(value, (0.0,), (1.0,))
@@ -180,55 +157,55 @@ def _slopes_and_differences(gaussians, camera, weigh, directions):
     return jax.vmap(along)(*directions)
 
 
-def off_axis(full: bool) -> Measured:
-    """Slopes against central differences in float64, beyond the limits of the lens.
+def projection_gradient(full: bool) -> Measurement:
+    """Measure derivatives of the projection against central differences in float64.
 
-    The principal point lies off the centre; a third of the Gaussians lies outside
-    what the projection is linearised within; colours are of degree 3.
+    The principal point is off centre, a third of the Gaussians lies beyond the limits
+    of the linearisation, and colours are of degree 3.
     """
     worst, camera = 0.0, camera_of(centre=(-6.0, 21.0))
     for seed in range(4 if full else 1):
         rng = np.random.default_rng(seed)
-        points = frustum(rng, spread=1.5)
-        scene = scene_of(fields_at(points, 0.2, 0.5, seed=seed))
+        points = scenes.frustum_points(rng, spread=1.5)
+        scene = scene_of(scenes.gaussian_fields(points, 0.2, 0.5, seed=seed))
         by_params = jax.tree.map(
-            lambda a, r=rng: r.normal(size=(DIRECTIONS, *a.shape)), scene.params
+            lambda a, r=rng: r.normal(size=(_DIRECTIONS, *a.shape)), scene.params
         )
-        by_camera = rng.normal(size=(DIRECTIONS, 4, 4))
+        by_camera = rng.normal(size=(_DIRECTIONS, 4, 4))
         with jax.enable_x64(True):
             given = in_float64((scene, camera, rng.normal(size=(9, SLOTS))))
             directions = jax.tree.map(jnp.asarray, (by_params, 0.01 * by_camera))
-            slopes, differences = _slopes_and_differences(*given, directions)
-            errors = np.abs(np.asarray(slopes) - np.asarray(differences))
-            size = np.sqrt(np.mean(np.square(np.asarray(differences))))
-        worst = worse(worst, float(errors.max() / size))
-    return Measured(worst, f"{DIRECTIONS} directions")
+            found, wanted = _derivatives_and_differences(*given, directions)
+            errors = np.abs(np.asarray(found) - np.asarray(wanted))
+            size = np.sqrt(np.mean(np.square(np.asarray(wanted))))
+        worst = np.maximum(worst, float(errors.max() / size))
+    return Measurement(worst, f"{_DIRECTIONS} directions")
 
 
 @jax.jit
 def _covariances(gaussians: Gaussians, camera: Camera) -> tuple[jax.Array, ...]:
-    """Of the slots: xx, xy, yy of the projection, and whether it is drawn."""
+    """Return xx, xy, yy of the projected covariances, and whether each is drawn."""
     inputs, count = Inputs(gaussians, camera), num_active(gaussians)
     out = ELLIPSOID.project(inputs, COMPAT, jnp.arange(SLOTS), count).footprint
     xx = 1 / jnp.square(out.inv_sx)
     return xx, xx * out.slope, out.var_y, out.reach > 0
 
 
-def limits(full: bool) -> Measured:
-    """Error of covariances, relative to their trace, beyond the sides of the image.
+def linearisation_limits(_full: bool) -> Measurement:
+    """Measure the error of covariances beyond the image, relative to their trace.
 
-    Against the formula in float64: J at x / z and y / z that are kept within 30 % of
-    half the image beyond *each* side. The principal point lies outside the image, where
-    limits that are alike on both sides would be far off.
+    The float64 formula clips x / z and y / z in J to 15 % beyond *each* side of the
+    image. The principal point is outside the image, where limits that are symmetric
+    about it would be far off.
     """
-    del full
     camera = camera_of(np.eye(4), centre=(-6.0, 21.0))
-    points = frustum(np.random.default_rng(0), spread=2.5)
-    scene = scene_of(fields_at(points, (0.3, 0.1, 0.05), 0.5, np.eye(4)))
+    points = scenes.frustum_points(np.random.default_rng(0), spread=2.5)
+    fields = scenes.gaussian_fields(points, (0.3, 0.1, 0.05), 0.5, np.eye(4))
+    scene = scene_of(fields)
     xx, xy, yy, drawn = (np.asarray(a) for a in _covariances(scene, camera))
-    means, scales = (double(a) for a in (scene.params.means, scene.params.log_scales))
-    rotations = double(quaternion_to_matrix(scene.params.quats))
-    K, z = double(camera.K), means[:, 2]
+    means, scales = (scenes.to_float64(fields[n]) for n in ("means", "log_scales"))
+    rotations = scenes.to_float64(quaternion_to_matrix(scene.params.quats))
+    K, z = scenes.to_float64(camera.K), means[:, 2]
     jacobian, beyond = np.zeros((SLOTS, 2, 3)), np.zeros(SLOTS, bool)
     for row in range(2):
         focal, centre, ratio = K[row, row], K[row, 2], means[:, row] / z
@@ -242,16 +219,33 @@ def limits(full: bool) -> Measured:
     errors = np.stack([xx, xy, yy], 1) - wanted[:, (0, 0, 1), (0, 1, 1)]
     error = float(np.max(np.abs(errors[drawn]) / trace[drawn, None]))
     count = int(np.sum(beyond & drawn))
-    return Measured(error if count > SLOTS // 4 else np.nan, f"{count} beyond a side")
+    return Measurement(
+        error if count > SLOTS // 4 else np.nan, f"{count} beyond a side"
+    )
 
 
+_IMAGE, _GRADIENT = partial(random_scenes, 0), partial(random_scenes, 1)
 CASES = (
-    Case("scenes/image", "error of α and colour, 99.9 %", 1e-4, of_scenes(0)),
-    Case("scenes/gradient", "relative L2 error, 99.9 %", 1e-3, of_scenes(1)),
+    StressCase("scenes/image", "error of α and colour, 99.9 %", 1e-4, _IMAGE),
+    StressCase("scenes/gradient", "relative L2 error, 99.9 %", 1e-3, _GRADIENT),
     *(
-        Case(f"far world/1e{n} m", "centres, rebased", 1e-3, far_world(10.0**n), "px")
+        StressCase(
+            f"far world/1e{n} m",
+            "centres, rebased",
+            1e-3,
+            partial(distant_world, 10.0**n),
+            "px",
+        )
         for n in (5, 6, 7)
     ),
-    Case("projection/beyond the sides", "error of a covariance", 1e-5, limits),
-    Case("projection/slopes", "against differences", 1e-3, off_axis, full_only=True),
+    StressCase(
+        "projection/beyond the sides", "covariance error", 1e-5, linearisation_limits
+    ),
+    StressCase(
+        "projection/slopes",
+        "against differences",
+        1e-3,
+        projection_gradient,
+        full_only=True,
+    ),
 )

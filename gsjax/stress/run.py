@@ -1,4 +1,4 @@
-"""All cases, one after another: the scoreboard as lines, as Markdown, as JSON."""
+"""Run the cases and write the scoreboard: lines, Markdown, JSON."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,9 +18,9 @@ from gsjax.stress import (
     poison,
     precision,
 )
-from gsjax.stress.types import Case, Result, run_case
+from gsjax.stress.types import CaseResult, StressCase, run_case
 
-CASES: tuple[Case, ...] = (
+CASES: tuple[StressCase, ...] = (
     *needles.CASES,
     *extremes.CASES,
     *poison.CASES,
@@ -32,21 +32,21 @@ CASES: tuple[Case, ...] = (
 _MARKS = ("<!-- gsjax stress -->", "<!-- /gsjax stress -->")
 
 
-def chosen(full: bool) -> tuple[Case, ...]:
-    """The cases of the full or the short form."""
+def select_cases(full: bool) -> tuple[StressCase, ...]:
+    """Return the cases of the full or the short form."""
     return tuple(c for c in CASES if full or not c.full_only)
 
 
-def run_cases(cases: tuple[Case, ...], full: bool) -> Iterator[Result]:
-    """Each case as it is measured, in float32 whatever the caller's setting."""
+def run_cases(cases: tuple[StressCase, ...], full: bool) -> Iterator[CaseResult]:
+    """Yield the result of each case, measured in float32 whatever the x64 setting."""
     for case in cases:
         with jax.enable_x64(False):
             result = run_case(case, full)
         yield result
 
 
-def margin(result: Result) -> float | None:
-    """How many times the measured value goes into the bound; None without a ratio."""
+def margin(result: CaseResult) -> float | None:
+    """Return bound / measured, or None if either is 0."""
     if result.bound == 0 or not result.measured > 0:
         return None
     return result.bound / result.measured
@@ -58,32 +58,32 @@ def _number(value: float) -> str:
     )
 
 
-def _cells(result: Result) -> tuple[str, str, str]:
-    """Measured, bound and margin, to read."""
+def _cells(result: CaseResult) -> tuple[str, str, str]:
+    """Return the measured value, the bound and the margin as text."""
     unit = f" {result.unit}" if result.unit else ""
-    room = margin(result)
-    ratio = "exact" if result.measured == 0 else "" if room is None else f"{room:.3g} ×"
+    times = margin(result)
+    ratio = "" if times is None else f"{times:.3g} ×"
+    ratio = "exact" if result.measured == 0 else ratio
     return f"{_number(result.measured)}{unit}", f"{_number(result.bound)}{unit}", ratio
 
 
-def line(result: Result) -> str:
-    """One line of the scoreboard: verdict, case, measured, bound, margin, over what."""
+def line(result: CaseResult) -> str:
+    """Return a line: verdict, case, measured value, bound, margin, note."""
     measured, bound, ratio = _cells(result)
     verdict = "ok " if result.good else "RED"
-    told = result.error or result.note
-    return (
-        f"{verdict} {result.name:<31}{measured:>11} of {bound:<11}{ratio:>10}  {told}"
-    ).rstrip()
+    note = result.error or result.note
+    cells = f"{result.name:<31}{measured:>11} of {bound:<11}{ratio:>10}"
+    return f"{verdict} {cells}  {note}".rstrip()
 
 
-def summary(results: list[Result]) -> str:
-    """How many are within their bounds, and in what time."""
+def summary(results: list[CaseResult]) -> str:
+    """Return the number of cases within their bounds and the total time."""
     good, seconds = sum(r.good for r in results), sum(r.seconds for r in results)
     return f"{good} of {len(results)} cases within their bounds, {seconds:.0f} s"
 
 
-def as_json(results: list[Result], full: bool) -> dict[str, Any]:
-    """Everything measured, and on what; a NaN is None."""
+def as_json(results: list[CaseResult], full: bool) -> dict[str, Any]:
+    """Return all results and the machine for a JSON file; NaN becomes None."""
     return {
         "machine": machine(),
         "form": "full" if full else "short",
@@ -99,9 +99,9 @@ def as_json(results: list[Result], full: bool) -> dict[str, Any]:
     }
 
 
-def markdown(told: dict[str, Any]) -> str:
-    """The scoreboard of `as_json` as a table, a row a case."""
-    rows = [_result(row) for row in told["rows"]]
+def markdown(report: dict[str, Any]) -> str:
+    """Return the table of the results of `as_json`."""
+    rows = [_result(row) for row in report["rows"]]
     lines = ["| case | what | measured | bound | margin |", "|---|---|---|---|---|"]
     for row in rows:
         measured, bound, ratio = _cells(row)
@@ -112,49 +112,48 @@ def markdown(told: dict[str, Any]) -> str:
     for row in rows:
         if not row.good:
             lines += ["", f"{row.name}: {row.error or row.note}."]
-    where = told["machine"]
+    where = report["machine"]
     good = sum(row.good for row in rows)
     lines += [
         "",
-        f"{good} of {len(rows)} within their bounds; {told['form']} form, "
+        f"{good} of {len(rows)} within their bounds; {report['form']} form, "
         f"jax {where['jax']}, {where['cpu']}, {where['devices']}, {where['date']}.",
     ]
     return "\n".join(lines)
 
 
-def _result(row: dict[str, Any]) -> Result:
-    """What a row of `as_json` was made of."""
-    fields = {name: row.get(name) for name in Result._fields}
+def _result(row: dict[str, Any]) -> CaseResult:
+    """Return the result of a row of `as_json`."""
+    fields = {name: row.get(name) for name in CaseResult._fields}
     measured = float("nan") if row["measured"] is None else row["measured"]
-    return Result(**{**fields, "measured": measured})
+    return CaseResult(**{**fields, "measured": measured})
 
 
 def around_marks(path: Path) -> tuple[str, str]:
-    """What stands in a Markdown file up to the first mark, and from the second on.
+    """Split a Markdown file before and after the text between the two marks.
 
     Raises:
-      InputError: if it has no such lines, each once and in order, or is not there.
+      InputError: if the file does not exist, is not UTF-8 or lacks the marks.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such file to put the table into")
+        raise InputError(f"{path}: no such file; create it with the marks of the table")
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{path}: byte {error.start} is not UTF-8; save it as that"
+            f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8"
         ) from error
     before, found, rest = text.partition(_MARKS[0])
     _, closed, after = rest.partition(_MARKS[1])
     if not found or not closed or _MARKS[0] in rest:
         raise InputError(
-            f"{path}: no place for the table; put the lines {_MARKS[0]} and "
-            f"{_MARKS[1]} where it is to go"
+            f"{path}: no marks for the table; add the lines {_MARKS[0]} and {_MARKS[1]}"
         )
     return before + found, closed + after
 
 
 def put_between_marks(path: Path, table: str) -> None:
-    """Replace what stands between the two marks in a Markdown file.
+    """Replace the text between the two marks of a Markdown file.
 
     Raises:
       InputError: as `around_marks`.

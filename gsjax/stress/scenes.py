@@ -1,7 +1,7 @@
 """Scenes and compiled functions that the cases share.
 
-Compiling takes most of the time, so there is one number of slots, one image size and
-one configuration; which Gaussians a case is about is a matter of the active mask.
+Compilation dominates the run time, so all cases have one number of slots, one image
+size and one configuration; the active mask selects the Gaussians of a case.
 
 Axis legend: N slots, H W image, C channels (colour, alpha, depth).
 """
@@ -22,70 +22,72 @@ from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig, Render
 
 Array = jax.Array
-SLOTS, SIZE, FOCAL, BASES = 128, 32, 40.0, 16
-# Room for 125 splats over all 16 tiles: enough for usual scenes, and not for any.
-WIDE = 125
-COMPAT = RasterConfig(num_size_buckets=1, devices=1, pair_capacity=WIDE * 16)
-# No threshold that an error of rounding could carry a whole Gaussian across.
-SMOOTH = COMPAT.replace(
+SLOTS, SIZE, FOCAL = 128, 32, 40.0
+# Number of splats over all 16 tiles that the pair capacity has room for.
+MAX_FULL = 125
+COMPAT = RasterConfig(
+    num_size_buckets=1, devices=1, pair_capacity=MAX_FULL * 16, occlusion=False
+)
+# Without thresholds at which rounding could add or remove a whole Gaussian.
+NO_CUTOFFS = COMPAT.replace(
     alpha_min=1e-6, alpha_max=1 - 1e-6, transmittance_min=0.0, outputs=("alpha",)
 )
 BACKGROUND = np.array([0.2, 0.5, 0.9], np.float32)
-# A pixel this near a threshold, relatively, may rightly differ by a whole Gaussian.
-BAND = 1e-3
+# Relative distance to a threshold at which a pixel may differ by a whole Gaussian.
+THRESHOLD_BAND = 1e-3
 FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
 class Gradients(NamedTuple):
-    """Of a weighted sum over colour, alpha and depth."""
+    """Gradients of a weighted sum over colour, alpha and depth."""
 
     params: GaussianParams
     camera: Camera
     background: Array
 
 
-def single(values) -> np.ndarray:
-    """An array of float32."""
+def to_float32(values) -> np.ndarray:
+    """Convert to an array of float32."""
     return np.asarray(values, np.float32)
 
 
-def double(values) -> np.ndarray:
-    """An array of float64."""
+def to_float64(values) -> np.ndarray:
+    """Convert to an array of float64."""
     return np.asarray(values, np.float64)
 
 
-def on_host(tree):
-    """The same pytree as numpy arrays."""
+def to_numpy(tree):
+    """Convert the leaves of a pytree to NumPy arrays."""
     return jax.tree.map(np.asarray, tree)
 
 
-def pose(seed: int = 0) -> np.ndarray:
-    """A general world → camera matrix, in values of float32."""
+def random_pose(seed: int = 0) -> np.ndarray:
+    """Return a general world → camera matrix, rounded to float32."""
     rng = np.random.default_rng(seed)
     eye, target, up = rng.normal(size=3), rng.normal(size=3) + 4, rng.normal(size=3)
     return look_at(eye, target, up).astype(np.float32)
 
 
 def camera_of(viewmat=None, focal=FOCAL, centre=(16.6, 15.1), **kwargs) -> Camera:
-    """A view with a general principal point; at `pose` by default."""
+    """Return a camera with a general principal point, by default at `random_pose`."""
     K = np.array([[focal, 0, centre[0]], [0, 1.07 * focal, centre[1]], [0, 0, 1]])
-    viewmat = pose() if viewmat is None else viewmat
+    viewmat = random_pose() if viewmat is None else viewmat
     size = {"width": SIZE, "height": SIZE}
-    return make_camera(viewmat=viewmat, K=single(K), **{**size, **kwargs})
+    return make_camera(viewmat=viewmat, K=to_float32(K), **{**size, **kwargs})
 
 
-def fields_at(
+def gaussian_fields(
     points, scales, opacities, viewmat=None, seed: int = 0, degree: int = 3
 ) -> dict:
-    """Arrays of `make_gaussians` for camera coordinates ``points`` [N, 3].
+    """Return arguments of `make_gaussians` for camera coordinates ``points`` [N, 3].
 
-    Values of float32, so that both precisions see the same numbers. Colours stay
+    Values are rounded to float32, so both precisions see the same numbers. Colours stay
     clear of the clip at 0.
     """
     rng = np.random.default_rng(seed)
     points = np.asarray(points, np.float64)
     count = len(points)
-    viewmat = np.asarray(pose() if viewmat is None else viewmat, np.float64)
+    viewmat = np.asarray(random_pose() if viewmat is None else viewmat, np.float64)
     opacities = np.broadcast_to(np.asarray(opacities, np.float64), count)
     sh = rng.uniform(-0.1, 0.1, (count, num_bases(degree), 3))
     sh[:, 0] = rng.uniform(0.2, 1.7, (count, 3))
@@ -101,41 +103,62 @@ def fields_at(
 
 
 def scene_of(fields: dict) -> Gaussians:
-    """Gaussians of arrays, in `SLOTS` slots."""
+    """Return Gaussians of `gaussian_fields` in `SLOTS` slots."""
     return make_gaussians(**fields, capacity=SLOTS)
 
 
-def frustum(rng, count: int = SLOTS, near=2.0, far=8.0, spread=0.5) -> np.ndarray:
-    """Camera coordinates over the view and a little beyond it."""
+def frustum_points(
+    rng, count: int = SLOTS, near=2.0, far=8.0, spread=0.5
+) -> np.ndarray:
+    """Return camera coordinates [count, 3] over the view and a little beyond it."""
     z = rng.uniform(near, far, count)
     xy = rng.uniform(-spread, spread, (count, 2)) * (SIZE / FOCAL)
     return np.column_stack([xy * z[:, None], z])
 
 
-def usual(seed: int = 1) -> Gaussians:
-    """An unremarkable scene."""
+def default_scene(seed: int = 1) -> Gaussians:
+    """Return a scene of ordinary Gaussians, all slots active."""
     rng = np.random.default_rng(seed)
     scales = np.exp(rng.normal(-2.3, 0.8, (SLOTS, 3)))
-    points, opacities = frustum(rng), rng.beta(0.8, 0.8, SLOTS).clip(0.02, 0.98)
-    return scene_of(fields_at(points, scales, opacities, seed=seed))
+    points, opacities = frustum_points(rng), rng.beta(0.8, 0.8, SLOTS).clip(0.02, 0.98)
+    return scene_of(gaussian_fields(points, scales, opacities, seed=seed))
 
 
-def weights(seed: int = 2) -> np.ndarray:
-    """[H, W, 5] of colour, alpha and depth in the loss."""
+def loss_weights(seed: int = 2) -> np.ndarray:
+    """Return weights [H, W, 5] of colour, alpha and depth in the loss."""
     drawn = np.random.default_rng(seed).normal(size=(SIZE, SIZE, 5))
     return drawn.astype(np.float32)
 
 
-def changed(gaussians: Gaussians, **fields) -> Gaussians:
-    """With some of the parameters replaced."""
+def with_active(gaussians: Gaussians, active) -> Gaussians:
+    """Return the Gaussians with another mask of active slots."""
+    return gaussians.replace(active=jnp.asarray(active))  # pyright: ignore
+
+
+def with_params(gaussians: Gaussians, **fields) -> Gaussians:
+    """Return the Gaussians with some parameters replaced."""
     held = {name: jnp.asarray(value) for name, value in fields.items()}
     params = gaussians.params.replace(**held)  # pyright: ignore
     return gaussians.replace(params=params)  # pyright: ignore
 
 
-def host_fields(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Writable copies of the parameters."""
+def where_slots(mask, chosen, others):
+    """Return slots of ``chosen`` where ``mask`` [N] is set, else of ``others``."""
+
+    def one(a, b):
+        return jnp.where(jnp.reshape(mask, (-1, *(1,) * (a.ndim - 1))), a, b)
+
+    return jax.tree.map(one, chosen, others)
+
+
+def numpy_fields(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Return writable copies of the parameters."""
     return {name: np.array(getattr(gaussians.params, name)) for name in FIELDS}
+
+
+def images_of(out):
+    """Return the images of a render that are compared."""
+    return out.rgb, out.alpha, out.depth
 
 
 def _channels(rgb, alpha, depth) -> Array:
@@ -143,54 +166,61 @@ def _channels(rgb, alpha, depth) -> Array:
 
 
 @partial(jax.jit, static_argnames="config")
-def gradients(
+def _render_and_gradients(
     gaussians: Gaussians,
     camera: Camera,
     background: Array,
-    weigh: Array,
+    weights: Array,
     config: RasterConfig = COMPAT,
 ) -> tuple[Render, Gradients]:
-    """A render, and the slopes of Σ weigh · channels."""
-
     def loss(params, camera, background):
         scene = gaussians.replace(params=params)  # pyright: ignore
         out = render(scene, camera, config, background)
-        return jnp.sum(weigh * _channels(out.rgb, out.alpha, out.depth)), out
+        return jnp.sum(weights * _channels(out.rgb, out.alpha, out.depth)), out
 
     given = gaussians.params, camera, background
     slopes, out = jax.grad(loss, (0, 1, 2), has_aux=True)(*given)
     return out, Gradients(*slopes)
 
 
-def usual_gradients(
+def render_and_gradients(
     gaussians: Gaussians,
     camera: Camera | None = None,
     background: np.ndarray = BACKGROUND,
-    weigh: np.ndarray | None = None,
+    weights: np.ndarray | None = None,
     config: RasterConfig = COMPAT,
 ) -> tuple[Any, Any]:
-    """`gradients` on the host; default the usual camera, background and weights."""
+    """Return a render and the gradients of Σ weights · channels, as NumPy arrays.
+
+    Args:
+      gaussians: in `SLOTS` slots.
+      camera: default `camera_of()`.
+      background: [3] RGB.
+      weights: [H, W, 5], default `loss_weights()`.
+      config: static settings.
+    """
     camera = camera_of() if camera is None else camera
-    weigh = weights() if weigh is None else weigh
-    # Always of one type: another would be compiled again.
-    given = single(background), single(weigh)
-    return on_host(gradients(gaussians, camera, *given, config=config))
+    weights = loss_weights() if weights is None else weights
+    given = to_float32(background), to_float32(weights)  # one dtype, one program
+    return to_numpy(_render_and_gradients(gaussians, camera, *given, config=config))
 
 
-def _only(params: GaussianParams, active: Array) -> Gaussians:
-    """What the oracle sees of slots that are not active: opacity 0."""
+def _hide_inactive(params: GaussianParams, active: Array) -> Gaussians:
+    """Give inactive slots opacity 0: the reference does not know the mask."""
     logits = jnp.where(active, params.logit_opacities, -jnp.inf)
     params = params.replace(logit_opacities=logits)  # pyright: ignore
     return Gaussians(params=params, active=np.ones(SLOTS, bool))  # pyright: ignore
 
 
 @jax.jit
-def _oracle(params, active, camera, background, weigh):
+def _reference(params, active, camera, background, weights):
     def loss(params, camera, background):
-        out = reference_render(_only(params, active), camera, COMPAT, background)
-        inside = out["margin"] > BAND
+        out = reference_render(
+            _hide_inactive(params, active), camera, COMPAT, background
+        )
+        inside = out["margin"] > THRESHOLD_BAND
         channels = _channels(out["rgb"], out["alpha"], out["depth"])
-        weighed = jnp.where(inside[..., None], weigh, 0) * channels
+        weighed = jnp.where(inside[..., None], weights, 0) * channels
         return jnp.sum(weighed), (channels, inside)
 
     given = params, camera, background
@@ -198,52 +228,53 @@ def _oracle(params, active, camera, background, weigh):
     return *images, Gradients(*slopes)
 
 
-def oracle(gaussians, camera, background=BACKGROUND, weigh=None):
-    """The dense float64 reference: images [H, W, 5], pixels clear of any threshold
-    [H, W], and the slopes of Σ weigh · images over those pixels.
+def reference(gaussians: Gaussians, camera: Camera):
+    """Render with the dense float64 reference.
+
+    Returns:
+      Images [H, W, 5]; [H, W] bool, which pixels are clear of all thresholds; the
+      gradients of Σ weights · images over those pixels.
     """
-    weigh = weights() if weigh is None else weigh
     with jax.enable_x64(True):
-        given = in_float64((gaussians.params, camera, background, weigh))
+        given = in_float64((gaussians.params, camera, BACKGROUND, loss_weights()))
         params, *rest = given
-        return on_host(_oracle(params, gaussians.active, *rest))
+        return to_numpy(_reference(params, gaussians.active, *rest))
 
 
 @jax.jit
-def each_alpha(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
-    """α [N, H, W] of each Gaussian on its own, without cut-offs, and radii [N]."""
+def alpha_per_gaussian(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
+    """Return α [N, H, W] of each Gaussian alone, without cut-offs, and radii [N]."""
 
     def one(slot):
         alone = select(gaussians, jnp.arange(SLOTS) == slot)
-        out = render(alone, camera, SMOOTH)
+        out = render(alone, camera, NO_CUTOFFS)
         return out.alpha, out.radii[slot]
 
     return jax.lax.map(one, jnp.arange(SLOTS))
 
 
-@partial(jax.jit, static_argnames="antialias")
-def _each_alpha_oracle(params, camera, antialias):
+@jax.jit
+def _reference_alpha(params, camera):
     def one(params):
         row = jax.tree.map(lambda a: a[None], params)
         alone = Gaussians(params=row, active=np.ones(1, bool))  # pyright: ignore
-        return reference_render(alone, camera, antialias=antialias)["alpha"]
+        return reference_render(alone, camera)["alpha"]
 
     return jax.lax.map(one, params)
 
 
-def each_alpha_oracle(gaussians: Gaussians, camera: Camera, antialias=False):
-    """`each_alpha` by the dense float64 reference."""
+def reference_alpha(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """Return α [N, H, W] of each Gaussian alone by the dense float64 reference."""
     with jax.enable_x64(True):
-        given = in_float64((gaussians.params, camera))
-        return np.asarray(_each_alpha_oracle(*given, antialias))
+        return np.asarray(_reference_alpha(*in_float64((gaussians.params, camera))))
 
 
-def not_finite(tree) -> int:
-    """How many numbers of a pytree are not finite."""
+def count_nonfinite(tree) -> int:
+    """Return how many numbers of a pytree are not finite."""
     return sum(int(np.sum(~np.isfinite(leaf))) for leaf in jax.tree.leaves(tree))
 
 
-def unequal(a, b) -> int:
-    """How many numbers of two pytrees differ in their values; NaN equals nothing."""
+def count_unequal(a, b) -> int:
+    """Return how many numbers of two pytrees differ; NaN differs from everything."""
     pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return sum(int(np.sum(np.asarray(x) != np.asarray(y))) for x, y in pairs)

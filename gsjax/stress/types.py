@@ -1,4 +1,4 @@
-"""What a stress case is, and what came out of it."""
+"""Types of a stress case and of its result."""
 
 import time
 import traceback
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 
-class Measured(NamedTuple):
-    """What a case found.
+class Measurement(NamedTuple):
+    """Outcome of the measurement of a case.
 
     Attributes:
-      value: to be compared with the bound; lower is better, NaN is outside of any.
-      note: what it was measured over, and what else is worth to know.
-      more: for the JSON alone.
+      value: compared with the bound; lower is better, NaN is out of bounds.
+      note: the inputs it was measured on, and other values of interest.
+      more: details for the JSON report.
     """
 
     value: float
@@ -22,32 +22,35 @@ class Measured(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Case:
-    """One claim with its bound.
+class StressCase:
+    """A claim with a bound.
 
     Attributes:
       name: topic/claim.
-      claim: what is measured, in a few words.
-      bound: the largest value that is well; 0 for what must not happen at all.
-      measure: ``full`` → `Measured`; over more where ``full`` is set.
-      unit: of the value.
-      full_only: left out of the short form, for its time.
+      claim: the measured quantity in a few words.
+      bound: largest acceptable value; 0 for events that must not occur.
+      measure: ``full`` → `Measurement`; ``full`` asks for more scenes and values.
+      unit: unit of the value.
+      full_only: whether the short form omits the case because of its duration.
     """
 
     name: str
     claim: str
     bound: float
-    measure: Callable[[bool], Measured]
+    measure: Callable[[bool], Measurement]
     unit: str = ""
     full_only: bool = False
 
 
-class Result(NamedTuple):
-    """A case as measured.
+class CaseResult(NamedTuple):
+    """A case with its measurement.
 
     Attributes:
+      name, claim, bound, unit: of the case.
+      measured, note, more: of the measurement.
       good: whether ``measured`` is within the bound.
-      error: the exception that ended it, or "".
+      seconds: duration.
+      error: the exception that ended the measurement, or "".
     """
 
     name: str
@@ -62,23 +65,18 @@ class Result(NamedTuple):
     more: dict[str, Any] | None
 
 
-def worse(a: float, b: float) -> float:
-    """The larger of two errors; a NaN is the worst of all, which `max` may forget."""
-    return b if b > a or b != b else a
-
-
-def run_case(case: Case, full: bool) -> Result:
-    """Measure; an exception is a case outside its bound, not the end of the others."""
+def run_case(case: StressCase, full: bool) -> CaseResult:
+    """Measure a case; an exception puts it out of bounds and is recorded."""
     start, error = time.perf_counter(), ""
     try:
         measured = case.measure(full)
     except Exception as caught:
         where = traceback.extract_tb(caught.__traceback__)[-1]
-        told = " ".join(str(caught).split())[:200]
-        error = f"{type(caught).__name__}: {told} ({where.name})"
-        measured = Measured(float("nan"))
+        message = " ".join(str(caught).split())[:200]
+        error = f"{type(caught).__name__}: {message} ({where.name})"
+        measured = Measurement(float("nan"))
     value = float(measured.value)
-    return Result(
+    return CaseResult(
         name=case.name,
         claim=case.claim,
         measured=value,
