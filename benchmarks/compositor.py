@@ -28,20 +28,15 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 import gsjax
 from gsjax.raster.compositing import fused, schedules
 from gsjax.raster.compositing.alpha import alphas, pixel_centres
-from gsjax.raster.compositing.blending import (
-    running_product,
-    splats_of,
-    tables_of,
-)
-from gsjax.raster.compositing.chunked import (
-    composite_chunks,
-    composite_steps,
-    take_rows,
-)
+from gsjax.raster.compositing.blending import running_product, splats_of, tables_of
+from gsjax.raster.compositing.chunked import CHUNKED, take_rows
 from gsjax.raster.compositing.compositor import composite
+from gsjax.raster.compositing.types import Task, Tiles
 from gsjax.raster.lists import binning
-from gsjax.raster.lists.depth_order import depth_order
-from gsjax.raster.primitives.ellipsoid import conics_of, project
+from gsjax.raster.primitives.ellipsoid import ELLIPSOID
+from gsjax.raster.render_camera import visible_order
+from gsjax.raster.types import Inputs, Projection
+from gsjax.runtime.devices import platform_name
 
 
 class Prepared(NamedTuple):
@@ -50,29 +45,26 @@ class Prepared(NamedTuple):
     Attributes:
       spread: (function, whether each argument is divided among devices) → a function of
         the arguments that calls ``function(device, *arguments)`` on every device.
-      grid, room: arguments of `composite`.
+      task: static description of compositing.
+      share: pair capacity of a device.
       project, bin: the stages.
-      projected, lists, schedule: their results.
+      projection, lists: their results.
     """
 
     spread: Callable[..., Callable[..., Any]]
-    grid: binning.Grid
-    room: int
+    task: Task
+    share: int
     project: Callable[..., Any]
     bin: Callable[..., Any]
-    projected: Any
+    projection: Projection
     lists: Any
-    schedule: Any
 
 
 def prepare(case: scenes.Case, config: gsjax.RasterConfig) -> Prepared:
     """Compile and run the stages before the compositor."""
-    gaussians, camera = case.gaussians, case.camera
-    devices = jax.local_device_count()
+    camera, devices = case.camera, jax.local_device_count()
     grid = binning.make_grid(camera.width, camera.height, config.tile_size, devices)
-    group = schedules.tiles_per_step(config, grid)
-    pairs, chunk = -(-config.pair_capacity // devices), config.chunk_size
-    steps = schedules.step_capacity(pairs, grid, group, chunk)
+    share = -(-config.pair_capacity // devices)
     mesh = Mesh(np.array(jax.local_devices()), ("tiles",))
     index = jnp.arange(devices, dtype=jnp.int32)
 
@@ -95,60 +87,54 @@ def prepare(case: scenes.Case, config: gsjax.RasterConfig) -> Prepared:
         )(index, *a)  # fmt: skip
 
     @jax.jit
-    def projected_of(gaussians, camera):
-        order, count = depth_order(gaussians, camera, config)
-        return project(gaussians, camera, config, order, count)
+    def project(gaussians, camera):
+        inputs = Inputs(gaussians, camera)
+        order, count = visible_order(ELLIPSOID, inputs, config)
+        return ELLIPSOID.project(inputs, config, order, count)
 
-    def bin_local(device, projected):
-        spans = binning.row_spans(projected, grid, device)
-        lists = binning.make_lists(projected, spans, grid, device, pairs)
-        return lists, schedules.make_schedule(lists, grid, group, chunk, steps)
+    def bin_local(device, footprint):
+        return binning.make_lists(footprint, grid, device, share)
 
     bin_all = jax.jit(spread(bin_local, False))
     # Replicated beforehand, as within one program.
-    projected = projected_of(gaussians, camera)
-    projected = jax.device_put(projected, NamedSharding(mesh, PartitionSpec()))
-    lists, schedule = bin_all(projected)
-    return Prepared(
-        spread, grid, steps, projected_of, bin_all, projected, lists, schedule
+    projection = project(case.gaussians, camera)
+    projection = jax.device_put(projection, NamedSharding(mesh, PartitionSpec()))
+    task = Task(
+        platform=platform_name(),
+        colors=projection.channels.colors.shape[0],
+        itemsize=projection.splat.u.dtype.itemsize,
+        grid=grid,
+        config=config,
     )
+    lists = bin_all(projection.footprint)
+    return Prepared(spread, task, share, project, bin_all, projection, lists)
 
 
-def stages(case: scenes.Case, config: gsjax.RasterConfig):
-    """Return compiled stages of one view by name, with their inputs bound."""
-    gaussians, camera = case.gaussians, case.camera
-    spread, grid, steps, projected_of, bin_all, *given = prepare(case, config)
-    projected, lists, schedule = given
-    group = schedule.tiles.shape[-1]
-    share = -(-config.pair_capacity // jax.local_device_count())
-
-    def composite_local(device, projected, lists, schedule):
-        return composite(projected, lists, schedule, device, grid, steps, config)
-
-    def chunks_local(device, projected, lists, schedule):
-        return composite_chunks(projected, lists, schedule, device, grid, config)
-
+def count_evaluations(made: Prepared) -> tuple[float, float]:
+    """Return evaluations (a Gaussian at a pixel), and those that change the image."""
+    task, config, grid = made.task, made.task.config, made.task.grid
+    group = schedules.tiles_per_step(config, grid)
     # Number of Gaussians of a tile, or of a block of tiles, between two checks for open
     # pixels.
-    singly = fused.suits(3, projected.u.dtype.itemsize, grid)
-    look, turn = (fused.LOOK, fused.TURN) if singly else (config.chunk_size,) * 2
-    looks = 2 * schedules.step_capacity(share, grid, group, look)
+    singly = fused.suits(task)
+    chunk, turn = (fused.BLOCK, fused.TURN) if singly else (config.chunk_size,) * 2
+    room = 2 * schedules.step_capacity(made.share, grid, group, chunk)
 
-    def count_local(device, projected, lists):
+    def count_local(device, projection, lists):
         """Return evaluations, those that change the image, and whether all fit.
 
         The first two are [steps].
         """
-        tables = tables_of(projected, config)
-        by_look = schedules.make_schedule(lists, grid, group, look, looks)
-        unrolled = schedules.make_steps(by_look, looks)
-        none = projected.u.shape[0]
-        work = schedules.make_work(lists, by_look, unrolled, look, none, looks)
-        pixels = pixel_centres(grid.tile, projected.u.dtype)
+        tables = tables_of(projection.splat, projection.channels, config)
+        schedule = schedules.make_schedule(lists, grid, group, chunk, room)
+        steps = schedules.make_steps(schedule, room)
+        none = projection.splat.u.shape[0]
+        work = schedules.make_work(lists, schedule, steps, chunk, none, room)
+        pixels = pixel_centres(grid.tile, tables.splats.dtype)
 
         def step(carried, inputs):
             first, live, block, ranks = inputs
-            corner = binning.corners(by_look.tiles[block], grid, device, pixels.dtype)
+            corner = binning.corners(schedule.tiles[block], grid, device, pixels.dtype)
             splats = take_rows(tables.splats, ranks)
             carried = jnp.where(first, 1, carried)
             go = live & jnp.any(carried > config.transmittance_min, 1, keepdims=True)
@@ -160,30 +146,49 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
                 reached = reached * (1 - alpha)
             blended = (alpha > 0) & (reached > config.transmittance_min)
             count = jnp.sum(ranks < none, 1, keepdims=True)
-            made = -(-count // turn) * turn if singly else turn
-            made = jnp.sum(go * made) * alpha.shape[2]
-            return carried * total, (made, jnp.sum(go[..., None] & blended))
+            evaluated = -(-count // turn) * turn if singly else turn
+            evaluated = jnp.sum(go * evaluated) * alpha.shape[2]
+            return carried * total, (evaluated, jnp.sum(go[..., None] & blended))
 
-        open_ = jnp.ones((group, pixels.shape[1]), projected.u.dtype)
+        open_ = jnp.ones((group, pixels.shape[1]), pixels.dtype)
         inputs = (work.first, work.live, work.block, work.ranks)
-        return *lax.scan(step, open_, inputs)[1], by_look.steps <= looks
+        return *lax.scan(step, open_, inputs)[1], schedule.steps <= room
 
-    counting = jax.jit(spread(count_local, False, True))
-    spread_composite = spread(composite_local, False, True, True)
-    compositing = jax.jit(spread_composite)
-    by_chunk = jax.jit(spread(chunks_local, False, True, True))
-    image = compositing(projected, lists, schedule)
+    counting = jax.jit(made.spread(count_local, False, True))
+    *counts, fits = counting(made.projection, made.lists)
+    if not np.all(fits):
+        raise SystemExit("compositor.py: too few steps to count all evaluations")
+    evaluations, contributions = (
+        float(np.sum(np.asarray(number), dtype=np.float64)) for number in counts
+    )
+    return evaluations, contributions
+
+
+def stages(case: scenes.Case, config: gsjax.RasterConfig):
+    """Return compiled stages of one view by name, with their inputs bound."""
+    gaussians, camera = case.gaussians, case.camera
+    made = prepare(case, config)
+    task, projection, lists = made.task, made.projection, made.lists
+
+    def on_all(kernel):
+        def local(device, projection, lists):
+            tiles = Tiles(projection.splat, projection.channels, lists, device)
+            return kernel(tiles)
+
+        return made.spread(local, False, True)
+
+    chosen = on_all(lambda tiles: composite(tiles, task)[0])
+    compositing = jax.jit(chosen)
+    by_chunk = jax.jit(on_all(partial(CHUNKED.forward, task=task)))
+    image = compositing(projection, lists)
     cotangent = jax.random.normal(jax.random.key(0), image["sums"].shape)
 
-    def steps_local(device, projected, lists, schedule):
-        return composite_steps(projected, lists, schedule, device, grid, steps, config)
-
-    def loss(projected, lists, schedule, cotangent, way=spread_composite):
-        return jnp.sum(way(projected, lists, schedule)["sums"] * cotangent)
+    def loss(projection, lists, cotangent, kernel=chosen):
+        return jnp.sum(kernel(projection, lists)["sums"] * cotangent)
 
     gradient = jax.jit(jax.value_and_grad(loss))
-    spread_steps = spread(steps_local, False, True, True)
-    by_step = jax.jit(jax.value_and_grad(partial(loss, way=spread_steps)))
+    by_step = on_all(partial(CHUNKED.differentiable, task=task))
+    by_step = jax.jit(jax.value_and_grad(partial(loss, kernel=by_step)))
     render = jax.jit(gsjax.render, static_argnames="config")
 
     def render_loss(params, camera, weight):
@@ -192,34 +197,36 @@ def stages(case: scenes.Case, config: gsjax.RasterConfig):
 
     weight = jax.random.normal(jax.random.key(1), (camera.height, camera.width, 3))
     training = jax.jit(jax.value_and_grad(render_loss))
-    *counts, fits = counting(projected, lists)
-    if not np.all(fits):
-        raise SystemExit(f"{case.name}: too few steps to count all evaluations")
-    evaluations, contributions = (
-        float(np.sum(np.asarray(number), dtype=np.float64)) for number in counts
-    )
     functions = {
-        "project": lambda: projected_of(gaussians, camera),
-        "bin": lambda: bin_all(projected),
-        "composite": lambda: compositing(projected, lists, schedule),
-        "composite by chunks": lambda: by_chunk(projected, lists, schedule),
-        "composite v+g": lambda: gradient(projected, lists, schedule, cotangent),
-        "v+g by chunks": lambda: by_step(projected, lists, schedule, cotangent),
+        "project": lambda: made.project(gaussians, camera),
+        "bin": lambda: made.bin(projection.footprint),
+        "composite": lambda: compositing(projection, lists),
+        "composite by chunks": lambda: by_chunk(projection, lists),
+        "composite v+g": lambda: gradient(projection, lists, cotangent),
+        "v+g by chunks": lambda: by_step(projection, lists, cotangent),
         "render": lambda: render(gaussians, camera, config=config),
         "render v+g": lambda: training(gaussians.params, camera, weight),
     }
-    return functions, projected, evaluations, contributions
+    return functions, projection, *count_evaluations(made)
 
 
-def reference(case: scenes.Case, projected, config: gsjax.RasterConfig):
+def conics_of(splat) -> np.ndarray:
+    """Return the entries (a, b, c) of the inverse 2D covariances [R, 3]."""
+    inv_sx, slope, inv_sy, _ = (np.asarray(number) for number in splat.shape)
+    b = -slope * inv_sy**2
+    return np.stack([inv_sx**2 - slope * b, b, inv_sy**2], axis=-1)
+
+
+def reference(case: scenes.Case, projection, config: gsjax.RasterConfig):
     """Return calls of the C++ compositor over the standard lists, by name."""
     width, height = case.camera.width, case.camera.height
-    seen = np.asarray(projected.reach) > 0
-    means2d = np.stack([projected.u, projected.v], -1)[seen]
-    conics = np.asarray(conics_of(projected))[seen]
-    opacity = np.asarray(projected.opacity)[seen]
-    colors = np.asarray(projected.colors.T)[seen]
-    depth = np.asarray(projected.depth)[seen]
+    seen = np.asarray(projection.footprint.reach) > 0
+    splat, channels = projection.splat, projection.channels
+    means2d = np.stack([splat.u, splat.v], -1)[seen]
+    conics = conics_of(splat)[seen]
+    opacity = np.asarray(splat.shape[-1])[seen]
+    colors = np.asarray(channels.colors.T)[seen]
+    depth = np.asarray(channels.depth)[seen]
     ranges, ids = yardstick.exact_lists(
         means2d, conics, opacity, depth, width, height, 16, config.alpha_min
     )
@@ -246,8 +253,8 @@ def main() -> None:
     rows = []
     for case in scenes.real_cases(arg for arg in sys.argv[1:] if arg != "--queued"):
         config = gsjax.exact_config(case.gaussians, case.camera)
-        ours, projected, evaluations, contributions = stages(case, config)
-        theirs, their_evaluations = reference(case, projected, config)
+        ours, projection, evaluations, contributions = stages(case, config)
+        theirs, their_evaluations = reference(case, projection, config)
         ms = measure.interleaved({**ours, **theirs})
         rows.append(
             {

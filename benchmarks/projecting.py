@@ -34,11 +34,11 @@ def unchanged(values, *_, **__):
     return values
 
 
-def order_in_parts(gaussians, *given):
+def order_in_parts(z, *given):
     """Return `depth_order` divided among devices."""
-    order, count = depth_order(gaussians, *given)
+    order, count = depth_order(z, *given)
     devices = jax.local_device_count()
-    return shard_rows(order, devices, fill=gaussians.capacity), count
+    return shard_rows(order, devices, fill=z.shape[0]), count
 
 
 # Replacements: (module, name, value).
