@@ -61,7 +61,9 @@ class BenchCommand(HeavyCommand):
             )
             for line in planned.lines():
                 note(line)
-        rows = measure_points(scene, make_points(scene.gaussians, planned), self.repeats)
+        rows = measure_points(
+            scene, make_points(scene.gaussians, planned), self.repeats
+        )
         parts = time_stages(scene, self.repeats)
         where = machine()
         facts = ", ".join(f"{name} {value}" for name, value in where.items())

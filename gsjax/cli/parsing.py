@@ -72,15 +72,14 @@ def parse(argv: Sequence[str]) -> Command:
 def explanation(box: str) -> str:
     """Return the box that tyro prints about an error as one line."""
     box = re.sub(r"\x1b\[[0-9;]*m", "", box)
-    lines = [re.sub(r"^[│|] ?|\s*[│|]$", "", line) for line in box.splitlines()]
     sections: list[list[str]] = [[]]
-    for line in lines:
-        if re.match(r"\s*([╭╰+]|─{3}|-{6})", line):  # a rule between sections
+    for line in box.splitlines():
+        if re.match(r"[\s│|]*([╭╰+]|─{3}|-{6})", line):  # a rule between sections
             sections.append([])
         else:
-            sections[-1].append(line)
+            sections[-1].append(line[2:].rstrip(" │|"))
     parts = []
-    for section in sections:
+    for section in sections[1:]:  # the first is the title, if any
         # Help texts of options are indented by 8, remarks follow an empty line.
         shown = [line.strip() for line in section if not line.startswith(" " * 8)]
         text = one_line("\n".join(shown).partition("\n\n")[0])

@@ -38,9 +38,9 @@ class StressCommand(Command):
             if self.only:
                 raise UsageError("--markdown and --only exclude each other")
             stress.around_marks(self.markdown)  # checked before minutes of work
-        cases = [c for c in stress.chosen(self.full) if self.only in c.name]
+        cases = [c for c in stress.select_cases(self.full) if self.only in c.name]
         if not cases:
-            names = [c.name for c in stress.chosen(True)]
+            names = [c.name for c in stress.select_cases(True)]
             found = ", ".join(name for name in names if self.only in name)
             hint = f"pass --full for {found}" if found else suggestion(self.only, names)
             raise UsageError(f"--only {self.only!r}: no such case; {hint}")

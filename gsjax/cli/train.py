@@ -282,13 +282,11 @@ class TrainCommand(HeavyCommand):
             refine_intrinsics=self.refine_intrinsics,
             exposure=self.exposure,
             prune_invisible=not self.keep_unseen,
-            raster=config.raster.replace(antialias=self.antialias),
         )
+        if self.antialias:  # after refine_poses, which chooses the default
+            config = config.replace(raster=config.raster.replace(antialias=True))
         if self.max_gaussians is not None:
-            config = config.replace(
-                adaptive=replace(config.adaptive, max_gaussians=self.max_gaussians),
-                mcmc=replace(config.mcmc, max_gaussians=self.max_gaussians),
-            )
+            config = config.replace(max_gaussians=self.max_gaussians)
         if self.absgrad:
             if config.strategy != "adaptive":
                 raise UsageError("--absgrad goes with --strategy adaptive")

@@ -46,7 +46,7 @@ def free_view_config(trained: RasterConfig) -> RasterConfig:
     Training leaves it off, see `TrainConfig`; a free view may be filled by Gaussians
     right before the camera, where it pays.
     """
-    return trained.replace(occlusion=RasterConfig.occlusion)
+    return trained.replace(occlusion=True)
 
 
 def is_run(path: Path) -> bool:

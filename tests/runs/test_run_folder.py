@@ -42,7 +42,7 @@ from gsjax.train.initialisation import initial_state
 pytestmark = pytest.mark.usefixtures("float32", "shared_programs")
 
 CONFIG = TrainConfig(
-    steps=3,
+    steps=4,
     sh_degree=0,
     strategy="mcmc",
     mcmc=McmcSettings(start=0, stop=0, max_gaussians=60),
@@ -120,7 +120,6 @@ def test_a_run_is_replaced_only_when_the_next_can_start(made, tmp_path, monkeypa
         (run / name).symlink_to(tmp_path / name)
     shutil.rmtree(tmp_path / "renders")
     kept = contents(tmp_path / "checkpoints")
-    # Of two views, three steps see others than those of seed 0.
     other = RunSettings(made / "data", CONFIG.replace(seed=3))
     assert start_run(other, run, overwrite=True).finished
     assert load_settings(run).config.seed == 3
@@ -178,7 +177,7 @@ def killed(whole, tmp_path_factory) -> Path:
 
         return look
 
-    config = CONFIG.replace(steps=4, every_eval=1, every_checkpoint=2)
+    config = CONFIG.replace(every_eval=1, every_checkpoint=2)
     with pytest.raises(RuntimeError, match="after a copy"):
         start_run(RunSettings(data, config), run, watch=watch)
     return folder
@@ -272,7 +271,7 @@ def test_initial_gaussians_are_kept_bit_by_bit(whole, degree):
 def test_a_run_starts_from_a_scene(made, capsys):
     """And starts from it again if a kill came before the first checkpoint."""
     splat, run = made / "run" / "splat.ply", made / "next"
-    settings = RunSettings(made / "data", continuation_config(CONFIG), start=splat)
+    settings = RunSettings(made / "data", CONFIG, start=splat)
     assert start_run(settings, run).finished
     notes = capsys.readouterr().err
     assert f"starting from the scene of {splat}\n" in notes
@@ -309,7 +308,7 @@ def test_a_scene_of_another_dataset_is_rejected(made, tmp_path, monkeypatch, cap
     args = ["train", str(made / "data"), "-o", str(tmp_path / "new"), "--initial"]
     few = ["--max-gaussians", str(count - 1)]
     for options, message in (
-        ([str(tmp_path / "far.ply")], "is in the view"),
+        ([str(tmp_path / "far.ply")], "in any of 2 views"),
         ([str(made / "run"), *few], f"1 to {count - 1}"),
         (
             [str(tmp_path / "bands.ply"), *few, "--sh-degree", "1"],
@@ -504,11 +503,11 @@ def test_invalid_options_of_train(options, code, message, whole, tmp_path, capsy
 
 def test_evaluating_an_unfinished_run_is_reported(made, capsys):
     config = json.loads((made / "run" / "config.json").read_text())
-    for steps in (3, 8):
+    for steps in (4, 8):
         train = {**config["train"], "steps": steps}
         change(made / "run" / "config.json", train=train)
         assert main(["eval", str(made / "run"), "--views", "train"]) == 0
-        unfinished = "unfinished: step 3 of 8" in capsys.readouterr().err
+        unfinished = "unfinished: step 4 of 8" in capsys.readouterr().err
         assert unfinished == (steps == 8)
 
 

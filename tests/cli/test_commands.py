@@ -1,0 +1,345 @@
+"""The README's commands one after another, and further commands on its demo.
+
+Options that make them quick are appended to the README's commands, nothing else.
+"""
+
+import contextlib
+import io
+import json
+import re
+import shutil
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+from captures import to_opengl
+from corner_room import make_room
+from snippets import ROOT, blocks, commands
+
+import gsjax
+from gsjax.cli import common
+from gsjax.cli.main import main
+from gsjax.gaussians import activate
+
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.usefixtures("float32", "shared_programs"),
+]
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+WIDTH, HEIGHT, PHOTOS, STEPS = 64, 48, 9, 20
+HELD_OUT = ["photo_000", "photo_008"]
+# Options appended to the README's commands.
+SMALLER = {
+    "demo": ["--photos", str(PHOTOS), "--size", f"{WIDTH}x{HEIGHT}"]
+    + ["--steps", str(STEPS)],
+    "render": ["--frames", "3"],
+    "train": ["--steps", "4", "--max-size", "80"],
+}
+
+
+class Printed(NamedTuple):
+    """The output of a command."""
+
+    out: str
+    err: str
+
+
+def run(*words) -> Printed:
+    """Run a command, which must succeed."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main([str(word) for word in words])
+    assert code == 0, err.getvalue()
+    return Printed(out.getvalue(), err.getvalue())
+
+
+@pytest.fixture(scope="module")
+def printed(tmp_path_factory) -> dict[str, Printed]:
+    """Return the output of each of the README's commands, run in a new folder."""
+    pytest.importorskip("pycolmap", reason="pycolmap is absent")
+    pytest.importorskip("viser", reason="needs gsjax[viewer]")
+    folder, found = tmp_path_factory.mktemp("readme"), {}
+    (folder / "photos").mkdir()
+    make_room(folder / "photos")
+    with contextlib.chdir(folder):
+        for words in commands(README):
+            found[words[0]] = run(*words, *SMALLER.get(words[0], ()))
+    found["folder"] = Printed(str(folder), "")
+    return found
+
+
+@pytest.fixture(scope="module")
+def demo(printed) -> Path:
+    """Return the folder of the demo, whose settings are made to compile quickly."""
+    folder = Path(printed["folder"].out) / "gsjax-demo"
+    path = folder / "run" / "config.json"
+    config = json.loads(path.read_text())
+    config["train"]["raster"] |= {"num_size_buckets": 1, "devices": 1}
+    path.write_text(json.dumps(config))
+    return folder
+
+
+def read_image(path: Path) -> np.ndarray:
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    return image[..., ::-1] if image.ndim == 3 else image
+
+
+def read_movie(path: Path) -> np.ndarray:
+    """Return [F, H, W, 3] RGB."""
+    done, movie = cv2.imreadanimation(str(path))
+    assert done
+    return np.stack([frame[..., 2::-1] for frame in movie.frames])
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+# --- README ---
+
+
+def test_readme_commands_write_the_paths_in_their_comments(printed):
+    folder = Path(printed["folder"].out)
+    outputs = [words[i + 1] for words in commands(README) for i, word in
+               enumerate(words) if word in ("-o", "--html")]  # fmt: skip
+    comments = re.findall(r" # (.*)", "".join(code for _, code in blocks(README, "sh")))
+    paths = re.findall(r"[\w.-]+/[\w./-]*", " ".join(comments))
+    assert {"run/splat.ply", "gsjax-demo/"} <= set(paths)
+    assert [path for path in (*paths, *outputs) if not (folder / path).exists()] == []
+    assert all(text.out.strip() for text in printed.values())
+
+
+def test_readme_installs_extras_of_the_package():
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = set(re.findall(r"pip install[^`\n]*\[(\w+)\]", README))
+    assert {"test", "viewer"} <= extras <= set(project["optional-dependencies"])
+
+
+# --- demo ---
+
+
+def test_demo_learns_and_its_outputs_exist(printed, demo):
+    *paths, result = printed["demo"].out.splitlines()
+    folder = Path(printed["folder"].out)
+    splat, preview, curves, turntable = (folder / path for path in paths)
+    assert all(path.exists() for path in (splat, preview, curves))
+    assert "2 held-out views: PSNR " in result
+    quality = json.loads((demo / "run" / "eval.json").read_text())
+    lines = (demo / "run" / "metrics.jsonl").read_text().splitlines()
+    losses = [json.loads(line)["loss"] for line in lines]
+    assert len(losses) == STEPS
+    assert np.mean(losses[-5:]) < 0.85 * np.mean(losses[:5])
+    assert quality["psnr"] > 17
+    movie = read_movie(turntable)
+    assert movie.shape == (48, HEIGHT, WIDTH, 3)
+    assert movie.std() > 20, "not empty"
+    assert np.abs(movie[0].astype(int) - movie[24]).mean() > 2, "it turns"
+
+
+def test_commands_that_demo_suggests_work(printed, demo, monkeypatch):
+    lines = [s.split()[2:] for s in printed["demo"].err.splitlines() if "  gsjax " in s]
+    expected = ["view", "info", "render", "export", "sfm", "train"]
+    assert [line[0] for line in lines] == expected
+    with contextlib.chdir(demo.parent):
+        for line in lines[1:4]:
+            run(*line)
+    for name in HELD_OUT:
+        wanted = read_image(demo / "run" / "renders" / "images" / f"{name}.png")
+        found = read_image(demo / "views" / f"{name}.png")
+        assert found.std() > 20
+        assert np.abs(found.astype(int) - wanted).max() <= 1
+    monkeypatch.setattr(common, "find_spec", lambda _: None)
+    needs = "gsjax view 'a b'  # needs pip install 'gsjax[viewer]'"
+    assert common.view_hint(Path("a b")) == needs
+
+
+# --- render ---
+
+
+def test_render_a_path_to_movies(demo, tmp_path):
+    """The default path is an orbit; depth has one range of colours for all frames."""
+    args = ["render", demo / "run", "--frames", "3", "--fps", "2"]
+    for kind in ("rgb", "depth"):
+        path = tmp_path / "new" / f"{kind}.webp"
+        text = run(*args, "-o", path, "--what", kind)
+        assert text.out.splitlines() == [str(path)]
+        assert "3 frames, a movie of 1.5 s" in text.err
+        assert read_movie(path).shape == (3, HEIGHT, WIDTH, 3)
+    depth = read_movie(path).astype(int)
+    seen = (depth.max(-1) - depth.min(-1)) > 100
+    assert 0.05 < seen.mean() < 0.95
+
+
+def test_render_a_path_to_images(demo, tmp_path):
+    more = ["--path", "interpolate", "--frames", "2", "--size", "32x24", "--npy"]
+    more += ["--what", "rgb,alpha", "--background", "1,1,1"]
+    run("render", demo / "run", "-o", tmp_path, *more)
+    stems = [f"frame_000{n}{kind}" for n in (1, 2) for kind in ("", ".alpha")]
+    assert names(tmp_path) == sorted(f"{s}{x}" for s in stems for x in (".npy", ".png"))
+    rgb = np.load(tmp_path / "frame_0001.npy")
+    alpha = np.load(tmp_path / "frame_0001.alpha.npy")
+    assert rgb.shape == (24, 32, 3)
+    assert 0.05 < (alpha > 0.5).mean() < 0.95
+    assert (rgb[alpha == 0] == 1).all()
+
+
+def test_a_file_renders_like_its_run(demo, tmp_path):
+    """With the cameras of the dataset, whose photographs need not exist."""
+    dataset = shutil.copytree(demo / "dataset", tmp_path / "dataset")
+    shutil.rmtree(dataset / "images")
+    of_file = ["render", demo / "run" / "splat.ply", "--preset", "compat"]
+    of_run = ["render", demo / "run", "--preset", "compat"]
+    spiral = ["--path", "spiral", "--frames", "2"]
+    cameras = ["--cameras", demo / "dataset" / "transforms.json"]
+    for folder, args in {
+        "a": [*of_file, "--cameras", demo / "dataset"],
+        "b": [*of_file, "--cameras", dataset],
+        "c": [*of_run, *cameras],
+        "path a": [*of_file, "--cameras", demo / "dataset", *spiral],
+        "path b": [*of_run, *spiral],
+    }.items():
+        run(*args, "-o", tmp_path / folder)
+    assert names(tmp_path / "a") == [f"photo_00{n}.png" for n in range(PHOTOS)]
+    for first, *others in (("a", "b", "c"), ("path a", "path b")):
+        for name in names(tmp_path / first):
+            image = read_image(tmp_path / first / name)
+            assert image.std() > 20
+            for other in others:
+                found = read_image(tmp_path / other / name)
+                np.testing.assert_array_equal(found, image)
+
+
+def test_render_the_test_views_that_a_dataset_declares(demo, tmp_path):
+    dataset = tmp_path / "dataset"
+    dataset.mkdir()
+    lens = {"w": WIDTH, "h": HEIGHT, "fl_x": 60.0, "cx": WIDTH / 2, "cy": HEIGHT / 2}
+    for split, seen in (("train", "abc"), ("test", "de")):
+        frames = [
+            {
+                "file_path": f"{name}.png",
+                "transform_matrix": to_opengl(
+                    gsjax.look_at((3, ord(name) - 99, 1), (0, 0, 0))
+                ).tolist(),
+            }
+            for name in seen
+        ]
+        content = json.dumps({**lens, "frames": frames})
+        (dataset / f"transforms_{split}.json").write_text(content)
+    args = ["render", demo / "run" / "splat.ply", "--preset", "compat"]
+    args += ["--cameras", dataset, "-o", tmp_path / "views", "--path"]
+    run(*args, "test")
+    assert names(tmp_path / "views") == ["d.png", "e.png"]
+    run(*args, "train", "--overwrite")
+    assert names(tmp_path / "views") == [f"{name}.png" for name in "abcde"]
+
+
+# --- eval, export, info ---
+
+
+def test_evaluating_training_views_keeps_other_files(demo, tmp_path):
+    folder = shutil.copytree(demo / "run", tmp_path / "run")
+    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    text = run("eval", folder, "--views", "train")
+    assert text.out.splitlines()[-1] == str(folder / "preview_train.png")
+    assert {path: path.read_bytes() for path in before} == before
+    report = json.loads((folder / "eval_train.json").read_text())
+    assert (report["which"], report["views"]) == ("train", PHOTOS - len(HELD_OUT))
+    expected = [f"{Path(view['name']).stem}.png" for view in report["each"]]
+    assert names(folder / "renders_train" / "images") == expected
+
+
+def test_export(demo, tmp_path, capsys):
+    source, out = demo / "run", tmp_path / "new" / "a.ply"
+    whole = gsjax.load(source / "splat.ply")
+    opacities = np.asarray(activate(whole.params)["opacities"])
+    least = float(np.median(opacities))
+    args = ["export", source, out, "--sh-degree", "0"]
+    text = run(*args, "--min-opacity", repr(least))
+    kept = opacities >= least
+    expected = f"{out}  {kept.sum():,} of {len(kept):,} Gaussians"
+    assert text.out.startswith(expected)
+    found = gsjax.load(out)
+    assert found.sh_degree == 0
+    np.testing.assert_array_equal(found.params.means, whole.params.means[kept])
+    np.testing.assert_array_equal(found.params.sh, whole.params.sh[kept, :1])
+    run(*args, "--overwrite", "--sh-degree", "3")
+    assert gsjax.load(out).sh_degree == 3
+    run("export", out, tmp_path / "b.ply")
+    assert (tmp_path / "b.ply").read_bytes() == out.read_bytes()
+    few = ["export", str(source), str(tmp_path / "c.ply"), "--min-opacity", "0.9999"]
+    assert main(few) == 3
+    assert "the greatest is 0." in capsys.readouterr().err
+    assert not (tmp_path / "c.ply").exists()
+
+
+def test_info_of_a_run(demo, tmp_path):
+    facts = json.loads(run("info", demo / "run", "--json").out)
+    report, gaussians = facts["run"], gsjax.load(demo / "run" / "splat.ply")
+    assert facts["count"] == gaussians.capacity
+    assert Path(report["dataset"]) == (demo / "dataset").resolve()
+    assert (report["steps_done"], report["steps"]) == (STEPS, STEPS)
+    assert report["evaluation"]["views"] == 2
+    text = run("info", demo / "run", "--plot", tmp_path / "a.png").out
+    assert f"steps             {STEPS} of {STEPS}" in text
+    assert f"PSNR {report['evaluation']['psnr']:.2f} dB" in text
+    assert f"Gaussians         {facts['count']:,}" in text
+    assert read_image(tmp_path / "a.png").std() > 10
+    # A run without Gaussians yet is described, too.
+    young = tmp_path / "young"
+    young.mkdir()
+    shutil.copy(demo / "run" / "config.json", young)
+    assert f"steps             0 of {STEPS}" in run("info", young).out
+
+
+# --- errors ---
+
+# Words DEMO and TMP are replaced by folders. TMP is an unfinished run.
+ERRORS = [
+    (3, "info DEMO", "is not a run, but "),
+    (3, "train DEMO/dataset -o DEMO/run/splat.ply", "is a file; pass a folder with -o"),
+    (3, "train DEMO/dataset -o DEMO/dataset", "is the dataset's own folder"),
+    (2, "train a -o b --viewer-port 9000", "--viewer-port goes with --viewer"),
+    (2, "sfm DEMO -o TMP/o --frames 9", "--frames goes with a video"),
+    (3, "info TMP/none", "none: does not exist; pass a folder made by `gsjax train"),
+    (3, "info DEMO/dataset", "dataset: is a dataset; train on it first (gsjax train "),
+    (3, "eval DEMO/run/splat.ply", "expected the folder of a run, got a file"),
+    (3, "render DEMO/dataset/images -o TMP/o", "is not a run"),
+    (3, "export TMP TMP/a.ply", "--resume"),
+    (3, "info TMP", "eval.json: "),
+    (3, "render TMP -o TMP/o", "gone: "),
+    (3, "demo -o DEMO", "exists; pass --overwrite, or another folder with -o"),
+    (3, "render DEMO/run --path test -o DEMO/views", "exists; pass --overwrite"),
+    (3, "render DEMO/run -o TMP/a.gif", "a.gif: exists"),
+    (3, "export DEMO/run DEMO/scene.ply", "exists; pass --overwrite"),
+    (2, "render DEMO/run --path test --cameras a -o o", "exclude each other"),
+    (2, "render DEMO/run --path train --frames 5 -o o", "--frames goes with orbit"),
+    (2, "render DEMO/run/splat.ply --cameras DEMO/dataset --path test -o o", "no test"),
+    (2, "render DEMO/run -o a.mp4", "or a movie: .gif, .webp, .webm"),
+    (2, "render DEMO/run -o o.png", "expected a folder for images"),
+    (2, "render DEMO/run -o a.gif --what rgb,depth", "one kind of --what"),
+    (2, "render DEMO/run -o a.gif --npy", "without --npy"),
+    (2, "render DEMO/run -o o --fps 5", "--fps goes with a movie"),
+    (2, "render DEMO/run -o o --budget 1/255 --preset fast", "exclude each other"),
+    (2, "train a -o b --test-images", "--test-images: expected the name of at least"),
+]
+
+
+@pytest.mark.parametrize(("code", "line", "message"), ERRORS, ids=lambda v: str(v))
+def test_an_error_is_one_line_and_a_code(code, line, message, demo, tmp_path, capsys):
+    config = json.loads((demo / "run" / "config.json").read_text())
+    config["dataset"] = str(tmp_path / "gone")
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    (tmp_path / "eval.json").write_text("[]")
+    (tmp_path / "a.gif").write_text("mine")
+    line = line.replace("DEMO", str(demo)).replace("TMP", str(tmp_path))
+    assert main(line.split()) == code
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("gsjax: error: ")
+    assert message in lines[0]
+    assert not (tmp_path / "o").exists()
