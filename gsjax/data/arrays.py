@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 from gsjax.cameras.camera import Camera
 from gsjax.cameras.lenses import PINHOLE
 from gsjax.data.dataset import finish_dataset
-from gsjax.data.types import Dataset, Photo, View
-from gsjax.errors import InputError
+from gsjax.data.types import Dataset, Photo, View, unexpected
 
 
 def make_dataset(
@@ -52,17 +51,14 @@ def make_dataset(
     counts = {"cameras": len(singles), "names": len(names), "valid": len(masks)}
     for what, count in counts.items():
         if count != len(images):
-            raise InputError(
-                f"{what}: expected {len(images)}, one per image, got {count}; pass as "
-                "many"
-            )
+            expected = f"{len(images)}, one per image"
+            raise unexpected(what, expected, count, "pass as many")
     views, photos = [], {}
     for name, image, camera, mask in zip(names, images, singles, masks):
-        photo = _photo(name, np.asarray(image), camera, mask)
+        photo = photos[name] = _photo(name, np.asarray(image), camera, mask)
         pose = np.asarray(camera.viewmat, np.float64)
         size = camera.width, camera.height
         views.append(View(name, Path(name), pose, photo.K, *size))
-        photos[name] = photo
     xyz, rgb = _points(points, colors)
     dataset = Dataset(Path("arrays"), "arrays", tuple(views), xyz, rgb)
     dataset = finish_dataset(dataset)
@@ -70,45 +66,34 @@ def make_dataset(
 
 
 def _single_cameras(cameras: Camera | Sequence[Camera]) -> list[Camera]:
-    if not isinstance(cameras, Camera):
-        singles = list(cameras)
-    elif cameras.batched:
-        K = np.broadcast_to(cameras.K, (len(cameras.viewmat), 3, 3))
-        pairs = zip(cameras.viewmat, K)
-        singles = [cameras.replace(viewmat=pose, K=k) for pose, k in pairs]
-    else:
-        singles = [cameras]
-    for index, camera in enumerate(singles):
+    if isinstance(cameras, Camera):
+        poses = np.reshape(cameras.viewmat, (-1, 4, 4))
+        K = np.broadcast_to(cameras.K, (len(poses), 3, 3))
+        cameras = [cameras.replace(viewmat=p, K=k) for p, k in zip(poses, K)]
+    for index, camera in enumerate(cameras):
+        where = f"cameras[{index}]"
         if not isinstance(camera, Camera) or camera.batched:
-            raise InputError(
-                f"cameras[{index}]: expected a single Camera, got {camera!r}; use "
-                "make_camera"
-            )
+            raise unexpected(where, "a single Camera", repr(camera), "use make_camera")
         if camera.lens is not PINHOLE:
-            raise InputError(
-                f"cameras[{index}]: expected a pinhole, got {camera.lens.name}; "
-                "undistort the images first"
-            )
-    return singles
+            remedy = "undistort the images first"
+            raise unexpected(where, "a pinhole", camera.lens.name, remedy)
+    return list(cameras)
 
 
 def _photo(name: str, image: np.ndarray, camera: Camera, mask) -> Photo:
-    height, width = camera.height, camera.width
-    if image.shape not in ((height, width, 3), (height, width, 4)):
-        raise InputError(
-            f"image {name!r}: expected shape [{height}, {width}, 3 or 4] as its camera "
-            f"has, got {image.shape}; resize the image or the camera"
-        )
-    pixels = _to_uint8(f"image {name!r}", image)
-    alpha = pixels[..., 3] if pixels.shape[2] == 4 else None
-    K = np.asarray(camera.K, np.float64)
+    where, size = f"image {name!r}", (camera.height, camera.width)
+    if image.ndim != 3 or image.shape[:2] != size or image.shape[2] not in (3, 4):
+        shape = f"shape [{size[0]}, {size[1]}, 3 or 4] as its camera has"
+        raise unexpected(where, shape, image.shape, "resize the image or the camera")
+    pixels = _to_uint8(where, image)
+    opaque = pixels.shape[2] == 3 or (pixels[..., 3] == 255).all()
     photo = Photo(
         pixels=np.ascontiguousarray(pixels[..., :3]),
-        alpha=None if alpha is None or (alpha == 255).all() else alpha.copy(),
+        alpha=None if opaque else pixels[..., 3].copy(),
         valid=None if mask is None else np.asarray(mask),
-        K=K,
+        K=np.asarray(camera.K, np.float64),
     )
-    photo.require(f"image {name!r}")
+    photo.require(where)
     return photo
 
 
@@ -116,33 +101,25 @@ def _points(
     points: ArrayLike | None, colors: ArrayLike | None
 ) -> tuple[np.ndarray, np.ndarray]:
     xyz = np.zeros((0, 3)) if points is None else np.asarray(points)
+    remedy = "pass one row per point"
     if xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.kind not in "fiu":
-        raise InputError(
-            f"points: expected numbers of shape [M, 3], got {xyz.dtype} of shape "
-            f"{xyz.shape}; pass one row per point"
-        )
+        got = f"{xyz.dtype} of shape {xyz.shape}"
+        raise unexpected("points", "numbers of shape [M, 3]", got, remedy)
     grey = np.full(xyz.shape, 128, np.uint8)
     rgb = _to_uint8("colors", grey if colors is None else np.asarray(colors))
     if rgb.shape != xyz.shape:
-        raise InputError(
-            f"colors: expected shape {xyz.shape} as the points have, got {rgb.shape}; "
-            "pass one row per point"
-        )
+        raise unexpected("colors", f"shape {xyz.shape}", rgb.shape, remedy)
     return xyz.astype(np.float64), rgb
 
 
-def _to_uint8(what: str, values: np.ndarray) -> np.ndarray:
+def _to_uint8(where: str, values: np.ndarray) -> np.ndarray:
     """Return uint8 colours as they are, and floats in [0, 1] rounded."""
     if values.dtype == np.uint8:
         return values
+    expected = "uint8 or floats in [0, 1]"
     if values.dtype.kind != "f":
-        raise InputError(
-            f"{what}: expected uint8 or floats in [0, 1], got {values.dtype}; cast it"
-        )
-    if not ((values >= 0) & (values <= 1)).all():
-        low, high = float(np.min(values)), float(np.max(values))
-        raise InputError(
-            f"{what}: expected floats in [0, 1], got {low:g} to {high:g}; divide by "
-            "the largest value, or pass uint8"
-        )
+        raise unexpected(where, expected, values.dtype, "convert it")
+    low, high = np.min(values, initial=0), np.max(values, initial=1)
+    if not (low >= 0 and high <= 1):  # also if NaN
+        raise unexpected(where, expected, f"{low:g} to {high:g}", "scale it")
     return np.rint(np.asarray(values, np.float64) * 255).astype(np.uint8)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.cameras.camera import look_at
-from gsjax.data.types import View
+from gsjax.data.types import View, unexpected
 from gsjax.errors import InputError
 
 # Minimum of the least eigenvalue, the mean squared sine between the optical axes and
@@ -237,9 +237,7 @@ def interpolate(
 
 def _check_frames(frames: int) -> None:
     if frames < 1:
-        raise InputError(
-            f"frames: expected at least 1, got {frames}; pass 60, for instance"
-        )
+        raise unexpected("frames", "at least 1", frames, "pass 60, for instance")
 
 
 def _centres_and_axes(viewmats) -> tuple[np.ndarray, np.ndarray]:

@@ -9,10 +9,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
-import numpy as np
-
 from gsjax.data import colmap_binary, colmap_text
 from gsjax.data.colmap_model import (
+    NO_POINTS,
     ColmapCamera,
     ColmapImage,
     ColmapPoints,
@@ -80,7 +79,7 @@ def read_colmap(folder: Path) -> ColmapModel:
         path, parser = _file(folder, "points3D")
     except InputError as error:
         warnings.warn(f"{error}; the dataset has no points", UserWarning, stacklevel=2)
-        return ColmapModel(cameras, images, _no_points())
+        return ColmapModel(cameras, images, NO_POINTS)
     return ColmapModel(cameras, images, parser.read_points(path))
 
 
@@ -92,16 +91,6 @@ def _file(folder: Path, name: str) -> tuple[Path, ModuleType]:
     raise InputError(
         f"{folder}: expected {name}.bin or {name}.txt, got neither; a COLMAP model has "
         "cameras, images and points3D"
-    )
-
-
-def _no_points() -> ColmapPoints:
-    return ColmapPoints(
-        ids=np.zeros(0, np.uint64),
-        xyz=np.zeros((0, 3)),
-        colors=np.zeros((0, 3), np.uint8),
-        errors=np.zeros(0),
-        track_lengths=np.zeros(0, np.int64),
     )
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.cameras.distortion import Distortion
-from gsjax.data.types import intrinsic_matrix
+from gsjax.data.types import intrinsic_matrix, unexpected
 from gsjax.errors import InputError
 
 MAX_NAME_BYTES = 1024
@@ -102,6 +102,12 @@ class ColmapPoints(NamedTuple):
     track_lengths: np.ndarray
 
 
+NO_POINTS = ColmapPoints(
+    *(np.zeros(0, np.uint64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8)),
+    *(np.zeros(0), np.zeros(0, np.int64)),
+)
+
+
 def kind_of(where: str, key: int | str) -> CameraKind:
     """Return the camera model of a number or name, supported or not."""
     kind = KIND_OF_NUMBER.get(key) if isinstance(key, int) else KIND_OF_NAME.get(key)
@@ -129,9 +135,8 @@ def make_colmap_camera(
             f"{size[0]} × {size[1]}; the file is damaged: export or copy it again"
         )
     if not all(math.isfinite(p) and abs(p) < MAX_COORDINATE for p in params):
-        raise InputError(
-            f"{where}: expected finite parameters, got {params}; estimate the camera "
-            "again"
+        raise unexpected(
+            where, "finite parameters", params, "estimate the camera again"
         )
     cx, cy = params[kind.focals : kind.focals + 2]
     K = intrinsic_matrix(where, (params[0], params[kind.focals - 1]), (cx, cy))

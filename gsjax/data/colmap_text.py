@@ -19,6 +19,7 @@ from gsjax.data.colmap_model import (
     sorted_points,
 )
 from gsjax.data.text_file import blocks, lines, read_text, too_long
+from gsjax.data.types import unexpected
 from gsjax.errors import InputError
 from gsjax.io.numerals import (
     find_words,
@@ -61,9 +62,8 @@ def _records(
 def _whole(where: str, what: str, text: str, most: int) -> int:
     if re.fullmatch("[0-9]{1,20}", text) and int(text) <= most:
         return int(text)
-    raise InputError(
-        f"{where}: expected a whole number from 0 to {most} as {what}, got "
-        f"{text[:40]!r}; export or copy the file again"
+    raise unexpected(
+        where, f"a whole number from 0 to {most} as {what}", f"{text[:40]!r}"
     )
 
 
@@ -80,9 +80,7 @@ def _floats(where: str, texts: list[str]) -> tuple[float, ...]:
 def _words(where: str, line: str, least: int, expected: str, split: int = -1):
     words = line.split(maxsplit=split)
     if len(words) < least:
-        raise InputError(
-            f"{where}: expected {expected}, got {len(words)} values; {_REMEDY}"
-        )
+        raise unexpected(where, expected, f"{len(words)} values")
     return words
 
 
@@ -110,10 +108,7 @@ def _camera(where: str, line: str) -> tuple[int, ColmapCamera]:
     )
     params = _floats(where, words[4:])
     if len(params) != kind.size:
-        raise InputError(
-            f"{where}: expected {kind.size} parameters of {kind.name}, got "
-            f"{len(params)}; {_REMEDY}"
-        )
+        raise unexpected(where, f"{kind.size} parameters of {kind.name}", len(params))
     return identity, make_colmap_camera(where, kind, size, params)
 
 
@@ -267,10 +262,7 @@ def _bad_block(path: Path, number: int, block: bytes) -> InputError:
         error = _bad_point(f"{path}: line {row}", words) if words else None
         if error is not None:
             return error
-    return InputError(
-        f"{path}: after line {number}: expected numbers, got other characters; the "
-        "file is damaged: export or copy it again"
-    )
+    return unexpected(f"{path}: after line {number}", "numbers", "other characters")
 
 
 def _bad_point(where: str, words: list[str]) -> InputError | None:
@@ -288,16 +280,12 @@ def _bad_point(where: str, words: list[str]) -> InputError | None:
     except InputError as error:
         return error
     if len(words) % 2:
-        return InputError(
-            f"{where}: expected a track of pairs IMAGE_ID POINT2D_IDX, got "
-            f"{len(words) - 8} values; {_REMEDY}"
+        return unexpected(
+            where, "a track of pairs IMAGE_ID POINT2D_IDX", f"{len(words) - 8} values"
         )
     colors = values[3:6]
     if not all(0 <= color <= 255 and color % 1 == 0 for color in colors):
-        return InputError(
-            f"{where}: expected a colour of whole numbers from 0 to 255, got "
-            f"{[*colors]}; export or copy the file again"
-        )
+        return unexpected(where, "a colour of whole numbers from 0 to 255", [*colors])
     return None
 
 

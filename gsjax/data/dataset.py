@@ -11,7 +11,7 @@ import numpy as np
 from gsjax.data.extent import cameras_coincide, least_extent, near_plane
 from gsjax.data.readers import READERS
 from gsjax.data.rebase import rebase
-from gsjax.data.types import Dataset, Reader, ReadOptions
+from gsjax.data.types import Dataset, Reader, ReadOptions, unexpected
 from gsjax.errors import InputError
 
 # A camera is an outlier if its distance from the median position exceeds this multiple
@@ -110,9 +110,7 @@ def finish_dataset(dataset: Dataset) -> Dataset:
     """
     views = sorted(dataset.views, key=lambda view: view.name)
     if not views:
-        raise InputError(
-            f"{dataset.source}: expected at least 1 view, got none; add photographs"
-        )
+        raise unexpected(dataset.source, "at least 1 view", "none", "add photographs")
     for before, after in pairwise(views):
         if before.name == after.name:
             raise InputError(

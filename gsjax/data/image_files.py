@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path, PurePosixPath
 
-from gsjax.data.types import ReadOptions
+from gsjax.data.types import ReadOptions, unexpected
 from gsjax.errors import InputError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
@@ -72,9 +72,7 @@ def _factors(original: Path) -> list[int]:
 def check_factor(factor: int | None) -> None:
     """Raise unless ``factor`` is None or a whole number of at least 1."""
     if factor is not None and not (isinstance(factor, int) and factor >= 1):
-        raise InputError(
-            f"factor: expected a whole number ≥ 1, got {factor!r}; pass 2, 4 or 8"
-        )
+        raise unexpected("factor", "a whole number ≥ 1", repr(factor), "pass 2, 4 or 8")
 
 
 def inside(where: str, name: str, remedy: str = "") -> PurePosixPath:

@@ -18,6 +18,7 @@ from gsjax.data.types import (
     ReadOptions,
     View,
     intrinsic_matrix,
+    unexpected,
 )
 from gsjax.errors import InputError
 from gsjax.io.npy import read_npy
@@ -57,9 +58,8 @@ def load_llff(path: Path, options: ReadOptions | None = None) -> Dataset:
 
 def _view(where: str, row: np.ndarray, file: Path) -> View:
     if not (np.abs(row) < MAX_COORDINATE).all():
-        raise InputError(
-            f"{where}: expected finite numbers, got {row.tolist()}; remove the row and "
-            "its photograph"
+        raise unexpected(
+            where, "finite numbers", row.tolist(), "remove the row and its photograph"
         )
     matrix = row[:15].reshape(3, 5)
     height, width, focal = matrix[:, 4].tolist()

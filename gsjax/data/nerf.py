@@ -40,6 +40,7 @@ from gsjax.data.types import (
     ReadOptions,
     View,
     intrinsic_matrix,
+    unexpected,
 )
 from gsjax.errors import InputError
 from gsjax.io.point_cloud import read_point_cloud
@@ -77,9 +78,7 @@ def load_nerf(path: Path, options: ReadOptions | None = None) -> Dataset:
     check_factor(options.factor)
     paths = find_transforms(path) if path.is_dir() else [path]
     if not paths:
-        raise InputError(
-            f"{path}: expected a transforms.json, got none; pass its folder"
-        )
+        raise unexpected(path, "a transforms.json", "none", "pass its folder")
     folder = root = paths[0].parent
     elsewhere = options.images is not None or (options.factor or 1) > 1
     if elsewhere:  # nerfstudio stores smaller copies in a folder of their own, images_4
@@ -121,10 +120,7 @@ def _file_path(frame: Frame, moved: bool) -> str:
     """
     name = text_of(frame, "file_path")
     if not name:
-        raise InputError(
-            f"{frame.where}: file_path: expected text, got {shown(name)}; export the "
-            "file again"
-        )
+        raise unexpected(f"{frame.where}: file_path", "text", shown(name))
     if moved:
         return str(inside(frame.where, last_parts(name) or name))
     offer = ", or pass images=, the folder that it is in (--images)"
@@ -175,10 +171,7 @@ def _listed(path: Path, frames: list[Frame], split: str) -> set[str]:
     """Return the names in a list of nerfstudio; each must be that of a frame."""
     names = frames[0].sources[1].get(f"{split}_filenames")
     if names is not None and not isinstance(names, list):
-        raise InputError(
-            f"{path}: {split}_filenames: expected a list, got {shown(names)}; export "
-            "the file again"
-        )
+        raise unexpected(f"{path}: {split}_filenames", "a list", shown(names))
     found = {_spelt(str(name)) for name in names or ()}
     strange = found - {_spelt(str(text_of(frame, "file_path"))) for frame in frames}
     if strange:
@@ -319,10 +312,7 @@ def _points(frame: Frame, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     if path is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not isinstance(path, str):
-        raise InputError(
-            f"{frame.where}: ply_file_path: expected text, got {shown(path)}; export "
-            "the file again"
-        )
+        raise unexpected(f"{frame.where}: ply_file_path", "text", shown(path))
     cloud = folder / inside(f"{folder}: ply_file_path", path)
     if not cloud.is_file():
         raise InputError(

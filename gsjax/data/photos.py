@@ -17,7 +17,7 @@ import numpy as np
 from gsjax.cameras.distortion import Distortion, undistortion_maps
 from gsjax.data.decode import decode, warn_of_damage
 from gsjax.data.image_header import image_size
-from gsjax.data.types import Photo, View
+from gsjax.data.types import Photo, View, unexpected
 from gsjax.errors import InputError
 from gsjax.io.images import opencv
 from gsjax.runtime.machine import all_of, usable_cores
@@ -63,9 +63,8 @@ def _files(views: Sequence[View]) -> list[Path]:
 
 def _load(view: View, max_size: int | None) -> Photo:
     if max_size is not None and max_size < 1:
-        raise InputError(
-            f"max_size: expected at least 1 px, got {max_size}; pass None to keep "
-            "the size"
+        raise unexpected(
+            "max_size", "at least 1 px", max_size, "pass None to keep the size"
         )
     as_stored = opencv().IMREAD_UNCHANGED  # does not rotate
     stored = decode(view.image, as_stored, partial(_ratio, view))

@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Sequence
 from pathlib import PurePosixPath
 
-from gsjax.data.types import View
+from gsjax.data.types import View, unexpected
 from gsjax.errors import InputError
 from gsjax.runtime.settings import whole
 
@@ -37,9 +37,7 @@ def split_views(
         )
     every = None if every is None else whole("every", every)
     if every is not None and every < 0:
-        raise InputError(
-            f"every: expected 0 (no test views) or more, got {every}; pass 8"
-        )
+        raise unexpected("every", "0 (no test views) or more", every, "pass 8")
     if test_names:
         test_names = [test_names] if isinstance(test_names, str) else test_names
         test = {_index_of(views, name) for name in test_names}

@@ -28,6 +28,7 @@ from gsjax.data.transforms_fields import (
     text_of,
     warn_of_scaled,
 )
+from gsjax.data.types import unexpected
 from gsjax.errors import InputError
 
 # `camera_model` of the file → lens of `make_camera`; distortion is not rendered.
@@ -92,9 +93,7 @@ def _load(
     if size is not None and not (
         len(size) == 2 and all(isinstance(v, int | np.integer) and v >= 1 for v in size)
     ):
-        raise InputError(
-            f"size: expected whole (width, height) ≥ 1, got {size}; pass (800, 600)"
-        )
+        raise unexpected("size", "whole (width, height) ≥ 1", size, "pass (800, 600)")
     frames = read_frames(path)
     poses = [pose_of(frame) for frame in frames]
     centres = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose, _ in poses])

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsjax.data.colmap_model import MAX_COORDINATE, MAX_SIDE
+from gsjax.data.types import unexpected
 from gsjax.errors import InputError
 from gsjax.runtime import files
 
@@ -43,10 +44,7 @@ def read_frames(path: Path) -> list[Frame]:
         )
     for index, content in enumerate(frames):
         if not isinstance(content, dict):
-            raise InputError(
-                f"{path}: frames[{index}]: expected an object, got {shown(content)}; "
-                "export the file again"
-            )
+            raise unexpected(f"{path}: frames[{index}]", "an object", shown(content))
     return [Frame(f"{path}: frames[{i}]", (f, data)) for i, f in enumerate(frames)]
 
 
@@ -82,10 +80,7 @@ def text_of(frame: Frame, key: str) -> str | None:
 
 
 def _unexpected(frame: Frame, key: str, expected: str, value) -> InputError:
-    return InputError(
-        f"{frame.where}: {key}: expected {expected}, got {shown(value)}; export the "
-        "file again"
-    )
+    return unexpected(f"{frame.where}: {key}", expected, shown(value))
 
 
 def model_of(frame: Frame) -> str:
@@ -159,10 +154,7 @@ def _matrix(frame: Frame) -> np.ndarray:
     rows = value if isinstance(value, list) else []
     shape = [len(row) for row in rows if isinstance(row, list)]
     if len(shape) != len(rows) or shape not in ([4] * 4, [4] * 3):
-        raise InputError(
-            f"{where}: expected 4 rows of 4 numbers, got {shown(value)}; export the "
-            "file again"
-        )
+        raise unexpected(where, "4 rows of 4 numbers", shown(value))
     matrix = np.full((len(rows), 4), np.nan)
     try:
         if all(_is_number(v) for row in rows for v in row):
@@ -170,13 +162,10 @@ def _matrix(frame: Frame) -> np.ndarray:
     except OverflowError:  # an integer beyond float64
         pass
     if not (np.abs(matrix) < MAX_COORDINATE).all():
-        raise InputError(
-            f"{where}: expected finite numbers, got {shown(rows)}; remove the frame"
-        )
+        raise unexpected(where, "finite numbers", shown(rows), "remove the frame")
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise InputError(
-            f"{where}: expected the last row 0 0 0 1, got {matrix[3].tolist()}; "
-            "transpose the matrix"
+        raise unexpected(
+            where, "the last row 0 0 0 1", matrix[3].tolist(), "transpose the matrix"
         )
     return matrix
 
@@ -227,15 +216,9 @@ def focal_lengths(
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     if fx is None or fy is None:
         angles = "" if model != "pinhole" else ", camera_angle_x or x_fov"
-        raise InputError(
-            f"{frame.where}: expected a focal length, fl_x{angles}, got none; export "
-            "the file again"
-        )
+        raise unexpected(frame.where, f"a focal length, fl_x{angles}", "none")
     if fx <= 0 or fy <= 0:
-        raise InputError(
-            f"{frame.where}: expected focal lengths above 0, got {fx:g}, {fy:g}; "
-            "export the file again"
-        )
+        raise unexpected(frame.where, "focal lengths above 0", f"{fx:g}, {fy:g}")
     return fx, fy
 
 

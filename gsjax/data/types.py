@@ -19,6 +19,16 @@ from gsjax.errors import InputError
 _MIN_LENGTH, _MAX_LENGTH = LENS_RANGE[0] * 1e6, LENS_RANGE[1] / 1e6
 
 
+def unexpected(
+    where: object,
+    expected: str,
+    got: object,
+    remedy: str = "the file may be damaged: export or copy it again",
+) -> InputError:
+    """Return the error "where: expected …, got …; remedy"."""
+    return InputError(f"{where}: expected {expected}, got {got}; {remedy}")
+
+
 def intrinsic_matrix(
     where: str, focals: tuple[float, float], centre: tuple[float, float]
 ) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 
 from gsjax.data.decode import captured_stderr
 from gsjax.data.image_files import SUFFIXES
+from gsjax.data.types import unexpected
 from gsjax.errors import InputError
 from gsjax.io.images import opencv, shrink
 
@@ -49,9 +50,8 @@ def sharpest_frames(path: Path, windows: int, max_size: int = 0) -> Iterator[Fra
     """
     total = _count(path)
     if total < 2:
-        raise InputError(
-            f"{path}: expected a video of at least 2 frames, got {total}; "
-            "pass a longer one"
+        raise unexpected(
+            path, "a video of at least 2 frames", total, "pass a longer one"
         )
     return _sharpest(path, min(windows, total), total, max_size)
 
