@@ -15,6 +15,7 @@ from gsjax.raster.argument_checks import batched_inputs, check_types
 from gsjax.raster.lists.counting import total_count
 from gsjax.raster.render_camera import finish, mark_overflow, render_camera
 from gsjax.raster.types import Array, Demand, Inputs, RasterConfig, Render
+from gsjax.runtime.devices import platform_name
 
 DEFAULT_CONFIG = RasterConfig()
 
@@ -72,10 +73,13 @@ def render(
         None if value is None else jnp.asarray(value) for value in values
     )
     inputs = Inputs(gaussians, camera, features, probe, mask, alpha_min)
-    return _render_compiled(inputs, background, config)
+    return _render_compiled(inputs, background, config, platform_name())
 
 
-def _render(inputs: Inputs, background: Array | None, config: RasterConfig) -> Render:
+def _render(
+    inputs: Inputs, background: Array | None, config: RasterConfig, platform: str
+) -> Render:
+    del platform  # part of the key of the compiled program: stages depend on it
     single = not inputs.camera.batched
     inputs = batched_inputs(inputs)
     by_camera = (inputs.camera, inputs.probe, inputs.mask)
@@ -116,4 +120,4 @@ def _render(inputs: Inputs, background: Array | None, config: RasterConfig) -> R
 
 
 # Inlined into the program of a caller that is traced.
-_render_compiled = jax.jit(_render, static_argnames="config", inline=True)
+_render_compiled = jax.jit(_render, static_argnums=(2, 3), inline=True)

@@ -78,7 +78,8 @@ def test_a_picture_in_the_corner(report):
     def seen(params, camera, size):
         def loss(params):
             some = gaussians.replace(params=params)
-            out = gsjax.render(some, camera, WHOLE, BACKGROUND, size=size)
+            seen = camera.replace(visible_size=size)
+            out = gsjax.render(some, seen, WHOLE, BACKGROUND)
             return jnp.sum(out.rgb[corner] * weight), out
 
         return jax.grad(loss, has_aux=True)(params)
@@ -127,7 +128,9 @@ def test_a_mapped_camera_that_sees_nothing(report):
 
 
 @pytest.mark.parametrize(("dtype", "bar"), [(jnp.float32, 1e-6), (jnp.float64, 4e-15)])
-@pytest.mark.parametrize("config", [WHOLE, WHOLE.replace(chunk_size=3, stop=0.3)])
+@pytest.mark.parametrize(
+    "config", [WHOLE, WHOLE.replace(chunk_size=3, transmittance_min=0.3)]
+)
 def test_a_derivative_changes_no_image(config, dtype, bar, report):
     """With one the lists are gone through in another way; see `composite`."""
     gaussians, camera = cast(scene_of("random"), dtype)
@@ -146,7 +149,7 @@ def test_a_derivative_changes_no_image(config, dtype, bar, report):
     plain, derived = both(gaussians.params)
     np.testing.assert_array_equal(derived.median_depth, plain.median_depth)
     error = largest_difference(derived, plain)
-    report(f"stop {config.stop}, {dtype.__name__}", error, bar)
+    report(f"stop {config.transmittance_min}, {dtype.__name__}", error, bar)
     assert error <= bar
     assert np.abs(plain.rgb).max() > 0.1
 

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import camera_of, gaussians_at, on_cpu
+from stages import order_of
 
 import gsjax
 from gsjax.raster.lists.blocks import BLOCK, by_blocks, over_blocks
-from gsjax.raster.lists.depth_order import depth_order
 
 
 def square_and_count(needed, inputs):
@@ -73,7 +73,7 @@ def test_order_does_not_depend_on_what_is_dead():
     )
     active = jnp.zeros(size, bool).at[live].set(True)
     many = gsjax.Gaussians(params=params, active=active)
-    order = jax.jit(depth_order, static_argnums=2)
+    order = jax.jit(order_of, static_argnums=2)
     config = gsjax.RasterConfig(num_size_buckets=1)
     wanted, count = order(few, camera_of(), config)
     found, same = order(many, camera_of(), config)

@@ -20,8 +20,8 @@ from pictures import assert_same, images, largest_difference
 
 import gsjax
 from gsjax.errors import CapacityError, InputError
+from gsjax.raster.exact import _for_active
 from gsjax.raster.lists.counting import total_count
-from gsjax.raster.render import _for_active
 
 
 @pytest.mark.new_emitters

@@ -28,7 +28,7 @@ def flat_camera(width, height):
         K=np.eye(3),
         width=width,
         height=height,
-        model="orthographic",
+        lens="orthographic",
     )
 
 

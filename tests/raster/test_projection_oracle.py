@@ -8,16 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import COMPAT, oracle_data
+from stages import conics_of, order_of, project
 
 import gsjax
 from gsjax.math.rotations import covariance
 from gsjax.math.sh import eval_sh, sh_basis
-from gsjax.raster.lists.depth_order import depth_order
-from gsjax.raster.primitives.ellipsoid import conics_of, project
 
 VALUE, DERIVATIVE = 1e-9, 1e-8
 # Nothing is culled by its opacity; antialiasing fills in the compensation.
-CONFIG = COMPAT.replace(alpha_min=1e-300, alpha_max=1.0)
+CONFIG = COMPAT.replace(alpha_min=1e-300, alpha_max=1.0, antialias=True)
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +30,9 @@ def project_all(params, camera):
     count = params.means.shape[0]
     gaussians = gsjax.Gaussians(params=params, active=jnp.ones(count, bool))
     out = project(gaussians, camera, CONFIG, jnp.arange(count), jnp.int32(count))
-    means2d = jnp.stack([out.u, out.v], -1)
-    return means2d, out.depth, conics_of(out), out.compensation
+    means2d = jnp.stack([out.splat.u, out.splat.v], -1)
+    compensation = out.splat.shape[3] / jax.nn.sigmoid(params.logit_opacities)
+    return means2d, out.channels.depth, conics_of(out), compensation
 
 
 def inputs(data, view):
@@ -147,8 +147,9 @@ def test_colours_of_many_gaussians(degree):
 
     @jax.jit
     def colours(scene, camera):
-        order, seen = depth_order(scene, camera, config)
-        return order, seen, project(scene, camera, config, order, seen).colors
+        order, seen = order_of(scene, camera, config)
+        out = project(scene, camera, config, order, seen)
+        return order, seen, out.channels.colors
 
     order, seen, found = colours(scene, camera)
     seen = int(seen)

@@ -159,7 +159,7 @@ def test_a_gaussian_that_is_not_drawn_changes_nothing(at):
 def test_no_gaussian_is_the_background():
     gaussians, camera = scene_of("random")
     none = gaussians.replace(active=jnp.zeros(COUNT, bool))
-    for config in (None, WHOLE, WHOLE.replace(stop=0.0)):
+    for config in (None, WHOLE, WHOLE.replace(transmittance_min=0.0)):
         found = gsjax.reference_render(none, camera, config, BACKGROUND)
         assert (found["rgb"] == BACKGROUND).all()
         assert np.isinf(found["margin"]).all()
@@ -167,7 +167,7 @@ def test_no_gaussian_is_the_background():
 
 def test_orthographic(report):
     gaussians, _ = scene_of("random")
-    camera = camera_of(model="orthographic", focal=(8.0, 7.0))
+    camera = camera_of(lens="orthographic", focal=(8.0, 7.0))
     errors, _ = compare(gaussians, camera, WHOLE, jnp.float64)
     for name, error in errors.items():
         report(f"orthographic, {name}", error, BAR[jnp.float64])
@@ -256,16 +256,14 @@ def well_conditioned_render(gaussians, camera, config, background):
     points = p.means @ viewmat[:3, :3].T + viewmat[:3, 3]
 
     def jacobian(point):
-        at = camera.model.linearise(camera.K, camera.width, camera.height, tuple(point))
-        return jax.jacfwd(
-            lambda q: jnp.stack(camera.model.project(camera.K, tuple(q)))
-        )(jnp.stack(at))
+        at = camera.linearise(tuple(point))
+        return jax.jacfwd(lambda q: jnp.stack(camera.project(tuple(q))))(jnp.stack(at))
 
     half = jax.vmap(jacobian)(points) @ viewmat[:3, :3]
     half = half @ quaternion_to_matrix(p.quats) * jnp.exp(p.log_scales)[:, None]
     dilate = np.broadcast_to(np.sqrt(config.dilation) * np.eye(2), (COUNT, 2, 2))
     factor = np.linalg.qr(np.concatenate([half, dilate], -1).swapaxes(1, 2))[1]
-    centres = np.stack(camera.model.project(camera.K, tuple(points.T)), -1)
+    centres = np.stack(camera.project(tuple(points.T)), -1)
     colors = np.asarray(reference_colors(gaussians, camera))
     opacities = np.asarray(jax.nn.sigmoid(p.logit_opacities))
     depth = np.asarray(points[:, 2])
@@ -283,9 +281,9 @@ def well_conditioned_render(gaussians, camera, config, background):
         raw = opacities[i] * np.exp(-q / 2)
         alpha = np.where(raw < config.alpha_min, 0, np.minimum(raw, config.alpha_max))
         after = passed * (1 - alpha)
-        weight = np.where(after > config.stop, alpha * passed, 0)
+        weight = np.where(after > config.transmittance_min, alpha * passed, 0)
         margin = np.minimum(margin, np.abs(raw / config.alpha_min - 1))
-        margin = np.minimum(margin, np.abs(after / config.stop - 1))
+        margin = np.minimum(margin, np.abs(after / config.transmittance_min - 1))
         median += np.where((passed > 0.5) & (after <= 0.5), depth[i], 0)
         rgb += weight[..., None] * colors[i]
         total, expected = total + weight, expected + weight * depth[i]

@@ -77,7 +77,8 @@ def _composite_jvp(task, primals, tangents):
     (tiles,) = primals
     leaves, tree = jax.tree.flatten(tiles)
     slopes = tree.flatten_up_to(tangents[0])
-    own = choose_for_gradient(task) is choose(task)
+    chosen = choose(task)
+    own = chosen.reverse is not None and chosen.reverse.suits(task)
     automatic = _automatic(task._replace(room_for_all=own))
 
     def stepped(*leaves):

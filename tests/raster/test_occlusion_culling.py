@@ -18,8 +18,8 @@ from conftest import (
     gaussians_at,
     render,
 )
+from stages import order_of, project
 
-from gsjax.raster.lists.depth_order import depth_order
 from gsjax.raster.lists.occlusion_culling import (
     ALPHA_MARGIN,
     SQUARE,
@@ -27,7 +27,7 @@ from gsjax.raster.lists.occlusion_culling import (
     _halve,
     closed_from,
 )
-from gsjax.raster.primitives.ellipsoid import project
+from gsjax.raster.types import Splat
 
 
 def scene_behind(layers: int, across: float = 1.0):
@@ -50,8 +50,8 @@ def scene_behind(layers: int, across: float = 1.0):
 def front_to_back(gaussians, camera, config):
     """The order with and without what is hidden, and what was projected of it all."""
     whole = config.replace(occlusion=False)
-    order, count = depth_order(gaussians, camera, whole)
-    left, _ = depth_order(gaussians, camera, config)
+    order, count = order_of(gaussians, camera, whole)
+    left, _ = order_of(gaussians, camera, config)
     return order, left, project(gaussians, camera, whole, order, count)
 
 
@@ -90,11 +90,11 @@ def test_what_is_not_drawn_hides_nothing(kind, value):
     else:
         features[:8, 1] = value
     given = jnp.asarray(features) if kind == "features" else None
-    whole, count = depth_order(gaussians, camera, config.replace(occlusion=False))
-    order, left = depth_order(gaussians, camera, config, given)
+    whole, count = order_of(gaussians, camera, config.replace(occlusion=False))
+    order, left = order_of(gaussians, camera, config, given)
     assert left == count
     np.testing.assert_array_equal(order, whole)
-    good, _ = depth_order(scene_behind(8), camera, config, jnp.ones((COUNT, 2)))
+    good, _ = order_of(scene_behind(8), camera, config, jnp.ones((COUNT, 2)))
     assert (np.asarray(good) < COUNT).sum() < 0.9 * count
 
 
@@ -104,19 +104,20 @@ def test_what_is_hidden_was_never_blended(preset):
     config, camera = PRESETS[preset], camera_of()
     order, left, p = front_to_back(scene_behind(40, 0.5), camera, config)
     behind = ~np.isin(order, left)
-    assert 10 < behind[np.asarray(p.reach) > 0].sum() < COUNT
+    assert 10 < behind[np.asarray(p.footprint.reach) > 0].sum() < COUNT
     ys, xs = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    column = [np.asarray(a)[:, None, None] for a in (p.u, p.v, p.inv_sx, p.inv_sy)]
-    dx, dy = xs - column[0], ys - column[1]
-    y2 = column[3] * (dy - np.asarray(p.slope)[:, None, None] * dx)
-    alpha = np.asarray(p.opacity)[:, None, None] * np.exp(
-        -0.5 * ((column[2] * dx) ** 2 + y2**2)
+    columns = p.splat.u, p.splat.v, *p.splat.shape
+    u, v, inv_sx, slope, inv_sy, opacity = (
+        np.asarray(a)[:, None, None] for a in columns
     )
+    dx, dy = xs - u, ys - v
+    y2 = inv_sy * (dy - slope * dx)
+    alpha = opacity * np.exp(-0.5 * ((inv_sx * dx) ** 2 + y2**2))
     alpha = np.minimum(alpha, config.alpha_max) * (alpha >= config.alpha_min)
     after = np.cumprod(1 - alpha, axis=0)
     before = np.concatenate([np.ones_like(after[:1]), after[:-1]])
     tested = after if config.stop_rule == "before" else before
-    blended = (alpha > 0) & (tested > config.stop)
+    blended = (alpha > 0) & (tested > config.transmittance_min)
     assert not blended[behind].any()
     assert blended[~behind].any()
 
@@ -144,10 +145,10 @@ def test_gradients_agree():
 def test_a_square_stays_open_without_candidates():
     config, camera = PRESETS["compat"], camera_of()
     *_, p = front_to_back(scene_behind(40, 0.5), camera, config)
-    search = jax.jit(closed_from, static_argnums=(3, 4, 5))
-    splats = p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity
+    search = jax.jit(closed_from, static_argnums=(3, 4))
     for count, some in ((0, False), (40, True)):
-        closed = search(splats, p.depth, np.int32(count), WIDTH, HEIGHT, config)
+        args = p.splat, p.channels.depth, np.int32(count), (WIDTH, HEIGHT), config
+        closed = search(*args)
         assert (np.asarray(closed) < np.inf).any() == some
 
 
@@ -156,11 +157,12 @@ def test_squares_close_where_the_corners_are_opaque(count):
     """Against a loop over Gaussians, of which a step takes 16, and the last fewer."""
     config, camera = PRESETS["compat"], camera_of()
     *_, p = front_to_back(scene_behind(40, 0.5), camera, config)
-    splats = [p.u, p.v, p.inv_sx, p.slope, p.inv_sy, p.opacity]
-    splats, depth = [np.asarray(a)[:40] for a in splats], np.asarray(p.depth)[:40]
+    splats = [np.asarray(a)[:40] for a in (p.splat.u, p.splat.v, *p.splat.shape)]
+    depth = np.asarray(p.channels.depth)[:40]
     splats[-1] = np.where(np.arange(40) < count, splats[-1], 0)
-    search = jax.jit(closed_from, static_argnums=(3, 4, 5))
-    closed = search(tuple(splats), depth, np.int32(count), WIDTH, HEIGHT, config)
+    search = jax.jit(closed_from, static_argnums=(3, 4))
+    front = Splat(*splats[:2], tuple(splats[2:]))
+    closed = search(front, depth, np.int32(count), (WIDTH, HEIGHT), config)
     rows, cols = closed.shape
     x, y = np.meshgrid(np.arange(cols + 1) * SQUARE, np.arange(rows + 1) * SQUARE)
     through, wanted = np.ones((rows, cols)), np.full((rows, cols), np.inf)
@@ -170,7 +172,7 @@ def test_squares_close_where_the_corners_are_opaque(count):
         alpha = np.where(alpha > config.alpha_min, alpha, 0).clip(max=config.alpha_max)
         four = alpha[:-1, :-1], alpha[:-1, 1:], alpha[1:, :-1], alpha[1:, 1:]
         through *= 1 - np.min(four, axis=0)
-        shut = (through <= config.stop * STOP_MARGIN) & (wanted == np.inf)
+        shut = (through <= config.transmittance_min * STOP_MARGIN) & (wanted == np.inf)
         wanted[shut] = far
     assert (wanted < np.inf).any() == (count > 7)
     assert (wanted == np.inf).any()

@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import COUNT, HEIGHT, SCENES, WIDTH, scene_of
+from stages import visible_projection
 
 from gsjax import RasterConfig
 from gsjax.raster.compositing import schedules
 from gsjax.raster.lists import binning, blocks
-from gsjax.raster.lists.depth_order import depth_order
-from gsjax.raster.primitives.ellipsoid import project
 
 CAPACITY = 16384
 CONFIG = RasterConfig(num_size_buckets=1, devices=1)
@@ -22,16 +21,14 @@ CONFIG = RasterConfig(num_size_buckets=1, devices=1)
 
 @jax.jit
 def projected_of(gaussians, camera):
-    order, count = depth_order(gaussians, camera, CONFIG)
-    return project(gaussians, camera, CONFIG, order, count)
+    return visible_projection(gaussians, camera, CONFIG)
 
 
 @partial(jax.jit, static_argnames=("grid", "capacity", "block", "platform"))
 def make_lists(projected, device, grid, capacity, block, platform):
     with mock.patch.object(blocks, "BLOCK", block):
-        spans = binning.row_spans(projected, grid, device)
         return binning.make_lists(
-            projected, spans, grid, device, capacity, platform=platform
+            projected.footprint, grid, device, capacity, platform=platform
         )
 
 
@@ -55,15 +52,16 @@ def test_radii_are_of_what_a_pixel_may_show(kind):
     """Positive exactly where the box around Q ≤ reach holds the centre of a pixel."""
     grid, projected, _ = lists_of(kind, 8)
     radii = np.asarray(
-        binning.radii(jax.tree.map(jnp.asarray, projected), WIDTH, HEIGHT)
+        binning.radii(jax.tree.map(jnp.asarray, projected.footprint), WIDTH, HEIGHT)
     )
-    extent = np.sqrt(projected.reach[:, None] * np.stack(
-        [projected.inv_sx**-2.0, projected.var_y], -1))  # fmt: skip
-    centre = np.stack([projected.u, projected.v], -1)
+    seen = projected.footprint
+    extent = np.sqrt(seen.reach[:, None] * np.stack(
+        [seen.inv_sx**-2.0, seen.var_y], -1))  # fmt: skip
+    centre = np.stack([seen.u, seen.v], -1)
     size = np.array([WIDTH, HEIGHT])
     first = np.clip(np.ceil(centre - extent - 0.5), 0, size)
     last = np.clip(np.floor(centre + extent - 0.5), -1, size - 1)
-    holds = (projected.reach > 0) & (first <= last).all(-1)
+    holds = (seen.reach > 0) & (first <= last).all(-1)
     np.testing.assert_allclose(radii[holds], extent.max(-1)[holds], rtol=1e-5)
     # Room for rounding: a hundredth of a pixel.
     clear = np.abs(np.stack([centre - extent, centre + extent]) % 1 - 0.5) > 0.02
@@ -80,9 +78,8 @@ def test_a_view_that_scales_loses_nothing():
     @jax.jit
     def count(gaussians, viewmat):
         seen = dataclasses.replace(far, viewmat=viewmat)
-        order, front = depth_order(gaussians, seen, CONFIG)
-        projected = project(gaussians, seen, CONFIG, order, front)
-        return jnp.sum(binning.radii(projected, WIDTH, HEIGHT) > 0)
+        footprint = visible_projection(gaussians, seen, CONFIG).footprint
+        return jnp.sum(binning.radii(footprint, WIDTH, HEIGHT) > 0)
 
     wanted = count(gaussians, camera.viewmat)
     assert 10 < wanted < COUNT
@@ -105,16 +102,9 @@ def listed_pairs(grid, lists) -> np.ndarray:
 def touched_pairs(grid, projected, device: int = 0) -> np.ndarray:
     """[T, R] bool, by evaluating Q at every pixel."""
     ys, xs = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    u, v, sx, slope, sy, reach = (
-        a[:, None, None]
-        for a in (
-            projected.u,
-            projected.v,
-            projected.inv_sx,
-            projected.slope,
-            projected.inv_sy,
-            projected.reach,
-        )
+    splat, reach = projected.splat, projected.footprint.reach
+    u, v, sx, slope, sy, _, reach = (
+        a[:, None, None] for a in (splat.u, splat.v, *splat.shape, reach)
     )
     dx, dy = xs - u, ys - v
     inside = (sx * dx) ** 2 + (sy * (dy - slope * dx)) ** 2 <= reach

@@ -1,8 +1,7 @@
-"""What accelerators run, run here: they sort pairs, and composite the chunks of all
-tiles side by side. It is chosen by `jax.default_backend`, which these tests answer for.
+"""Parallel compositing, which accelerators run, run here on a CPU.
 
-The pictures are those of the dense reference, and the derivatives those of the CPU's
-way. What a device makes of it is not tested here.
+The kernel is chosen by `jax.default_backend`, which these tests answer for. Images are
+compared with the dense reference, and derivatives with those of the CPU's kernels.
 """
 
 import jax
@@ -27,7 +26,10 @@ from conftest import (
 from pictures import errors_of
 
 import gsjax
-from gsjax.raster import tile_render
+from gsjax.raster.compositing.compositor import choose, choose_for_gradient
+from gsjax.raster.compositing.parallel import PARALLEL
+from gsjax.raster.compositing.types import Task
+from gsjax.raster.lists.binning import make_grid
 
 # Batches of fewer entries than there are, and a chunk that most lists are longer than.
 SMALL = gsjax.RasterConfig.fast(
@@ -38,16 +40,15 @@ CONFIGS = {"compat": COMPAT, "accurate": ACCURATE, "fast": FAST, "small": SMALL}
 
 @pytest.fixture(autouse=True)
 def elsewhere(monkeypatch):
-    """Everything that is traced within a test is traced for an accelerator."""
-
-    def refuse(*_):
-        raise AssertionError("this is the way of a CPU")
-
+    """Trace everything within a test for an accelerator."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(tile_render, "composite", refuse)
 
 
-# Functions of their own: of others JAX may know what was traced for a CPU.
+def test_the_kernel_is_chosen():
+    task = Task("gpu", 3, 4, make_grid(64, 48, 8, 1), COMPAT)
+    assert choose(task) is choose_for_gradient(task) is PARALLEL
+
+
 def _renders(gaussians, camera, background, config):
     return gsjax.render(gaussians, camera, config, background)
 
@@ -109,7 +110,7 @@ def _rich(gaussians, camera, features, probe, mask):
 
     def loss(params, features, probe):
         scene = gaussians.replace(params=params)
-        more = {"features": features, "abs_probe": probe, "mask": mask}
+        more = {"features": features, "probe": probe, "mask": mask}
         out = gsjax.render(scene, camera, RICH, **more)
         total = jnp.sum(jnp.where(mask, jnp.sum(out.rgb, -1) * weight, 0))
         total += jnp.sum(jnp.where(mask, out.median_depth * weight, 0))
@@ -123,7 +124,7 @@ def _rich(gaussians, camera, features, probe, mask):
 RICH = gsjax.RasterConfig(
     **{**LIGHT, "num_size_buckets": 4},
     alpha_max=1.0,
-    stop=0.0,
+    transmittance_min=0.0,
     absgrad=True,
     outputs=ALL,
     chunk_size=4,

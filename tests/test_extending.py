@@ -1,0 +1,374 @@
+"""Extensions from outside the package; `docs/extending.md` shows their code.
+
+Each section between two markers is an extension. Gradients are compared with finite
+differences; models, strategies and loss terms train.
+"""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import training
+from conftest import assert_not_empty, camera_of, gaussians_at
+
+import gsjax
+
+# --8<-- [start:lens]
+from gsjax.cameras.lenses import Lens, linearise_in_place
+
+
+def _stereographic(K, c, point):
+    """Project by r = 2 tan(θ / 2), then by the radial term 1 + c r²."""
+    x, y, z = point
+    scale = 2 / (jnp.sqrt(x * x + y * y + z * z) + z)
+    a, b = x * scale, y * scale
+    radial = 1 + c[0] * (a * a + b * b)
+    return K[0, 0] * a * radial + K[0, 2], K[1, 1] * b * radial + K[1, 2]
+
+
+def _ray(K, c, pixel):
+    """Invert the radial term by Newton's method, then the projection."""
+    a, b = (pixel[0] - K[0, 2]) / K[0, 0], (pixel[1] - K[1, 2]) / K[1, 1]
+    far = jnp.sqrt(a * a + b * b)
+    r = far
+    for _ in range(8):
+        r = r - (r * (1 + c[0] * r * r) - far) / (1 + 3 * c[0] * r * r)
+    scale = jnp.where(far > 0, r / jnp.where(far > 0, far, 1), 1)
+    a, b = a * scale, b * scale
+    return a, b, 1 - (a * a + b * b) / 4
+
+
+def _range(point):
+    return jnp.sqrt(sum(p * p for p in point))
+
+
+STEREOGRAPHIC = Lens(
+    name="stereographic",
+    counts=(1,),
+    project=_stereographic,
+    unproject=_ray,
+    valid=lambda _K, _c, point: point[2] > -0.8 * _range(point),
+    depth=_range,
+    linearise=linearise_in_place,
+)
+# gsjax.make_camera(..., lens=STEREOGRAPHIC, coefficients=[0.05])
+# --8<-- [end:lens]
+
+# --8<-- [start:primitive]
+from gsjax.raster.primitives.ellipsoid import ELLIPSOID
+
+_EDGE = 8.0  # Q at which a bump ends
+
+
+def _bump_bounds(active, values, camera, config, alpha_min=None):
+    """Bound Q ≤ 8: a small α limit makes the bounds of an ellipsoid wide enough."""
+    del alpha_min
+    return ELLIPSOID.bounds(active, values, camera, config, jnp.asarray(1e-6))
+
+
+def _bump_project(inputs, config, order, count):
+    out = ELLIPSOID.project(inputs, config, order, count)
+    reach = jnp.where(out.footprint.reach > 0, _EDGE, 0)
+    return out._replace(footprint=out.footprint._replace(reach=reach))
+
+
+def _bump_alpha(shape, dx, dy):
+    """Return opacity · (1 − Q / 8)², which ends smoothly at the edge."""
+    inv_sx, slope, inv_sy, opacity = shape
+    y1, y2 = inv_sx * dx, inv_sy * (dy - slope * dx)
+    inside = jnp.maximum(1 - (y1 * y1 + y2 * y2) / _EDGE, 0)
+    return opacity * inside * inside
+
+
+BUMP = ELLIPSOID._replace(
+    name="bump",
+    bounds=_bump_bounds,
+    project=_bump_project,
+    occluders=None,
+    alpha=_bump_alpha,
+)
+# gsjax.RasterConfig(primitive=BUMP)
+# --8<-- [end:primitive]
+
+# --8<-- [start:model]
+from gsjax.train.models import Model, ModelParams
+
+
+def _moved(params, view):
+    """Move the scene by time · shift and turn it by time · turn about z."""
+    motion, gaussians = params.model.shared, params.gaussians
+    half = 0.5 * view.time * motion["turn"]
+    w, z = jnp.cos(half), jnp.sin(half)
+    x, y, height = gaussians.params.means.T
+    cos, sin = w * w - z * z, 2 * w * z
+    means = jnp.stack([cos * x - sin * y, sin * x + cos * y, height], -1)
+    qw, qx, qy, qz = gaussians.params.quats.T
+    quats = (w * qw - z * qz, w * qx - z * qy, w * qy + z * qx, w * qz + z * qw)
+    moved = gaussians.params.replace(
+        means=means + view.time * motion["shift"], quats=jnp.stack(quats, -1)
+    )
+    return gaussians.replace(params=moved)
+
+
+RIGID = Model(
+    init=lambda _: ModelParams(shared={"turn": jnp.zeros(()), "shift": jnp.zeros(3)}),
+    apply=_moved,
+    rates={"turn": 0.02, "shift": 0.02},
+)
+# gsjax.fit(dataset, photos, config, model=RIGID)
+# --8<-- [end:model]
+
+# --8<-- [start:strategy]
+from gsjax.densify.types import SlotEdit, Strategy
+
+
+def remove_faint(every: int, limit: float) -> Strategy:
+    """Return a strategy that removes Gaussians with an opacity below ``limit``."""
+
+    def plan(key, step, gaussians, stats):
+        del key, step
+        keep = jax.nn.sigmoid(gaussians.params.logit_opacities) >= limit
+        active = gaussians.active & keep
+        edit = SlotEdit(
+            params=gaussians.params,
+            active=active,
+            cleared=gaussians.active & ~keep,
+            opacities_reset=jnp.asarray(False),
+            wanted=jnp.sum(active, dtype=jnp.int32),
+        )
+        return edit, stats
+
+    return Strategy(
+        init=lambda gaussians: jnp.zeros(gaussians.capacity),
+        observe=lambda stats, seen: jnp.maximum(stats, seen.radii.max(0)),
+        due=lambda step: step % every == 0,
+        plan=plan,
+    )
+
+
+# gsjax.fit(dataset, photos, config, strategy=remove_faint(10, 0.01))
+# --8<-- [end:strategy]
+
+# --8<-- [start:loss_term]
+from gsjax.train.losses import LossTerm
+
+
+def _transparency(render, batch, params):
+    """Return the mean transmittance: the scene becomes opaque."""
+    del batch, params
+    return jnp.mean(1 - render.alpha)
+
+
+OPAQUE = LossTerm("opaque", _transparency, weight=0.5, start=2, outputs=("alpha",))
+# gsjax.fit(dataset, photos, config, loss_terms=(OPAQUE,))
+# --8<-- [end:loss_term]
+
+# --8<-- [start:reader]
+from gsjax.data.readers import READERS
+from gsjax.data.types import Dataset, Reader, View
+
+
+def _load_list(path, options):
+    """Read lines of: name, focal length, width, height, 12 numbers of the pose."""
+    del options
+    views = []
+    for line in (path / "poses.txt").read_text().splitlines():
+        name, *numbers = line.split()
+        focal, width, height, *pose = map(float, numbers)
+        viewmat = np.vstack([np.reshape(pose, (3, 4)), [0, 0, 0, 1]])
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        size = int(width), int(height)
+        views.append(View(name, path / name, viewmat, K, *size))
+    return Dataset(path, "list", tuple(views))
+
+
+LIST = Reader("list", lambda path: (path / "poses.txt").exists(), _load_list)
+# gsjax.load_dataset(path, readers=(*READERS, LIST))
+# --8<-- [end:reader]
+
+# --8<-- [start:format]
+from gsjax.io.common import Format
+from gsjax.io.formats import FORMATS
+
+
+def _load_npz(path):
+    with np.load(path, allow_pickle=False) as file:
+        return gsjax.make_gaussians(**file)
+
+
+def _save_npz(path, gaussians, *, overwrite):
+    with open(path, "wb" if overwrite else "xb") as file:
+        packed = gsjax.compact(gaussians, int(gsjax.num_active(gaussians)))
+        np.savez(file, **vars(packed.params))
+
+
+NPZ = Format("npz", (".npz",), _load_npz, _save_npz)
+# gsjax.load(path, formats=(*FORMATS, NPZ))
+# --8<-- [end:format]
+
+CONFIG = gsjax.RasterConfig(
+    alpha_min=1e-14, alpha_max=1 - 1e-9, transmittance_min=0.0, stop_rule="after",
+    devices=1, pair_capacity=4096,
+)  # fmt: skip
+
+
+def scene():
+    rng = np.random.default_rng(0)
+    z = rng.permutation(np.linspace(2, 6, 12))
+    xy = rng.uniform(-0.4, 0.4, (12, 2)) * z[:, None]
+    scales = np.exp(rng.normal(-1, 0.3, (12, 3)))
+    return gaussians_at(np.column_stack([xy, z]), scales, rng.uniform(0.2, 0.9, 12))
+
+
+def assert_gradient(loss, point):
+    """Compare a directional derivative with central differences."""
+    value_and_grad, step = jax.jit(jax.value_and_grad(loss)), 1e-6
+    rng = np.random.default_rng(1)
+    direction = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), point)
+    _, grads = value_and_grad(point)
+    for leaf in jax.tree.leaves(grads):
+        assert np.linalg.norm(leaf) > 0
+    products = jax.tree.map(lambda a, b: jnp.sum(a * b), grads, direction)
+    found = sum(jax.tree.leaves(products))
+    ahead, behind = (
+        value_and_grad(jax.tree.map(lambda x, d, h=h: x + h * d, point, direction))[0]
+        for h in (step, -step)
+    )
+    wanted = (ahead - behind) / (2 * step)
+    assert abs(found - wanted) <= 1e-5 * abs(wanted)
+
+
+def test_lens():
+    gaussians = scene()
+    pinhole = camera_of(19, 13, focal=(12.0, 13.0))
+    camera = gsjax.make_camera(
+        viewmat=pinhole.viewmat, K=pinhole.K, width=19, height=13,
+        lens=STEREOGRAPHIC, coefficients=[0.05],
+    )  # fmt: skip
+    pixels = np.random.default_rng(2).uniform(0, 13, (2, 40))
+    again = camera.project(
+        STEREOGRAPHIC.unproject(camera.K, jnp.asarray([0.05]), pixels)
+    )
+    np.testing.assert_allclose(again, pixels, atol=1e-9)
+    weight = np.random.default_rng(3).normal(size=(13, 19, 3))
+
+    def loss(point):
+        coefficients, K, means = point
+        seen = camera.replace(coefficients=coefficients, K=K)
+        moved = gaussians.replace(params=gaussians.params.replace(means=means))
+        return jnp.sum(gsjax.render(moved, seen, CONFIG).rgb * weight)
+
+    assert_not_empty(gsjax.render(gaussians, camera, CONFIG).alpha)
+    focal = jnp.asarray([[1.0, 0, 1], [0, 1, 1], [0, 0, 0]])
+    point = camera.coefficients, camera.K, gaussians.params.means
+
+    def loss_of_used(point):  # skew and the last row of K are not used
+        return loss((point[0], camera.K + (point[1] - camera.K) * focal, point[2]))
+
+    assert_gradient(loss_of_used, point)
+
+
+def test_primitive():
+    gaussians, camera = scene(), camera_of(19, 13, focal=(20.0, 21.0))
+    config = CONFIG.replace(primitive=BUMP)
+    bumps = gsjax.render(gaussians, camera, config)
+    ellipsoids = gsjax.render(gaussians, camera, CONFIG)
+    assert not bumps.overflowed
+    assert_not_empty(bumps.alpha)
+    assert np.abs(bumps.alpha - ellipsoids.alpha).max() > 0.05
+    weight = np.random.default_rng(3).normal(size=(13, 19, 3))
+
+    def loss(params):
+        image = gsjax.render(gaussians.replace(params=params), camera, config).rgb
+        return jnp.sum(image * weight)
+
+    assert_gradient(loss, gaussians.params)
+
+
+STEPS = 30
+
+
+def config_of(**changes):
+    return gsjax.TrainConfig(
+        steps=STEPS, sh_degree=0, raster=training.RASTER.replace(pair_capacity=None),
+        prune_invisible=False, **changes,
+    )  # fmt: skip
+
+
+def test_model():
+    """A scene that moves to the side is followed by the model."""
+    shift = np.array([0.15, -0.1, 0.05])
+    still = training.true_gaussians()
+    views, photos = [], []
+    for index, view in enumerate(training.dataset().views):
+        time = float(index % 2)
+        moved = still.params.replace(means=still.params.means + time * shift)
+        photos.append(training.photo_of(still.replace(params=moved), view))
+        views.append(replace(view, time=time))
+    dataset = replace(training.dataset(), views=tuple(views))
+    fixed = gsjax.TrainConfig().rates._replace(means=(1e-5, 1e-5))
+    config = config_of(rates=fixed)
+    with jax.enable_x64(False):
+        result = gsjax.fit(dataset, photos, config, model=RIGID)
+    found = np.asarray(result.state.model.shared["shift"])
+    assert np.linalg.norm(found - shift) < 0.6 * np.linalg.norm(shift)
+
+
+def test_strategy():
+    with jax.enable_x64(False):
+        start = training.rough_start(0, 64)
+        logits = start.params.logit_opacities.at[:20].set(-9.0)
+        start = start.replace(params=start.params.replace(logit_opacities=logits))
+        config, strategy = config_of(), remove_faint(every=10, limit=0.01)
+        state = gsjax.init_state(
+            start, config, training.EXTENT, training.VIEWS, strategy=strategy
+        )
+        result = gsjax.fit(
+            training.dataset(), training.photos(), config,
+            state=state, strategy=strategy,
+        )  # fmt: skip
+    assert gsjax.num_active(start) == training.POINTS
+    assert gsjax.num_active(result.gaussians) == training.POINTS - 20
+
+
+def test_loss_term():
+    alphas = []
+    for terms in ((), (OPAQUE,)):
+        with jax.enable_x64(False):
+            result = gsjax.fit(
+                training.dataset(), training.photos(), config_of(), loss_terms=terms
+            )
+            view = training.dataset().views[0]
+            camera = gsjax.make_camera(
+                viewmat=view.viewmat, K=view.K, width=view.width, height=view.height
+            )
+            alphas.append(gsjax.render_exact(result.gaussians, camera).alpha.mean())
+    assert alphas[1] > alphas[0] + 0.01
+
+
+def test_reader(tmp_path):
+    lines = []
+    for view in training.dataset().views:
+        pose = " ".join(map(repr, map(float, view.viewmat[:3].ravel())))
+        lines.append(f"{view.name} 30.0 32 24 {pose}")
+        (tmp_path / view.name).write_bytes(b"")
+    (tmp_path / "poses.txt").write_text("\n".join(lines))
+    readers = (*READERS, LIST)
+    dataset = gsjax.load_dataset(tmp_path, readers=readers)
+    assert dataset.format == "list"
+    for view, wanted in zip(dataset.views, training.dataset().views, strict=True):
+        np.testing.assert_array_equal(view.viewmat, wanted.viewmat)
+    with pytest.raises(gsjax.InputError):
+        gsjax.load_dataset(tmp_path)
+
+
+def test_format(tmp_path):
+    formats = (*FORMATS, NPZ)
+    gaussians, path = scene(), tmp_path / "scene.npz"
+    gsjax.save(path, gaussians, formats=formats)
+    found = gsjax.load(path, formats=formats)
+    jax.tree.map(np.testing.assert_array_equal, found, gaussians)
+    with pytest.raises(gsjax.InputError):
+        gsjax.load(path)
