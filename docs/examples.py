@@ -1,7 +1,7 @@
 """Include examples of tests/test_extending.py in docs/extending.md; a hook of mkdocs.
 
-``<!-- snippet: NAME -->`` is replaced with the lines between ``# snippet: NAME`` and
-``# end snippet`` of the test file.
+``<!-- snippet: NAME -->`` is replaced with the lines between the markers
+``# --8<-- [start:NAME]`` and ``# --8<-- [end:NAME]`` of the test file.
 """
 
 import re
@@ -11,14 +11,13 @@ from pathlib import Path
 SOURCE = Path(__file__).parents[1] / "tests" / "test_extending.py"
 _MARK = re.compile(r"<!-- snippet: (\w+) -->")
 _SNIPPET = re.compile(
-    r"^ *# snippet: (\w+)\n(.*?)^ *# end snippet$", re.MULTILINE | re.DOTALL
+    r"^ *# --8<-- \[start:(\w+)\]\n(.*?)^ *# --8<-- \[end:\1\]$",
+    re.MULTILINE | re.DOTALL,
 )
 
 
 def snippets() -> dict[str, str]:
     """Return the examples of the test file by name."""
-    if not SOURCE.exists():
-        return {}
     found = _SNIPPET.findall(SOURCE.read_text(encoding="utf-8"))
     return {name: textwrap.dedent(code).strip("\n") for name, code in found}
 

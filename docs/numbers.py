@@ -1,7 +1,7 @@
 """Generate the benchmark tables of README.md and docs/benchmarks/index.md.
 
-``python docs/numbers.py`` rewrites every block between ``<!-- benchmarks: NAME -->`` and
-``<!-- /benchmarks: NAME -->`` from the JSON files in benchmarks/results. With
+``python docs/numbers.py`` rewrites every block between ``<!-- benchmarks: NAME -->``
+and ``<!-- /benchmarks: NAME -->`` from the JSON files in benchmarks/results. With
 ``--check`` it changes nothing and exits with status 1 if a block is out of date.
 """
 

@@ -55,6 +55,8 @@ if typing.TYPE_CHECKING:  # the same names as in `_PUBLIC`
     from gsjax.train.loop import fit as fit
     from gsjax.train.loop import subset as subset
     from gsjax.train.state import init_state as init_state
+    from gsjax.train.state import load_state as load_state
+    from gsjax.train.state import save_state as save_state
     from gsjax.train.step import make_train_step as make_train_step
     from gsjax.viewer import notebook as notebook
     from gsjax.viewer.notebook import save_png as save_png
@@ -81,7 +83,7 @@ _PUBLIC = {
     "train.config": "TrainConfig",
     "train.evaluation": "evaluate summarise",
     "train.loop": "Hooks fit subset",
-    "train.state": "init_state",
+    "train.state": "init_state load_state save_state",
     "train.step": "make_train_step",
     "viewer": "notebook",
     "viewer.notebook": "save_png",

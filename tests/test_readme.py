@@ -1,4 +1,4 @@
-"""The README: short, its Python runs, its links resolve, its preset table is current."""
+"""The README is short and its Python runs; tables and links are current."""
 
 import re
 from pathlib import Path
