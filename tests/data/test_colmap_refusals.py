@@ -101,13 +101,9 @@ def test_text_written_by_hand(tmp_path):
 @pytest.mark.parametrize(
     ("file", "text", "expected"),
     [
-        ("cameras", "1 PINHOLE 640 480 500", r"cameras\.txt: line 1: .* got 1; the"),
         ("cameras", "1 PINHOLE 640", "line 1: expected CAMERA_ID .* got 3 values"),
         ("cameras", "-1 PINHOLE 640 480 1 1 1 1", "whole .* camera id, got '-1'"),
-        ("cameras", "x PINHOLE 640 480 1 1 1 1", "the camera id, got 'x'"),
-        ("cameras", "1 PINHOLE 640 0 500 500 1 1", "got 640 × 0"),
         ("cameras", "1 PINHOLE 99999999 9 9 9 9 9", "got 99999999 × 9"),
-        ("cameras", "1 PINHOLE 640 480 0 500 1 1", "focal lengths .* got 0, 500"),
         ("cameras", "1 PINHOLE 640 480 1e-300 5 1 1", "got 1e-300, 5"),
         ("cameras", "1 PINHOLE 640 480 5 1e29 1 1", "got 5, 1e[+]29"),
         ("cameras", "1 PINHOLE 640 480 5 5 1 -1e29", "principal .* got 1, -1e[+]29"),
@@ -117,49 +113,17 @@ def test_text_written_by_hand(tmp_path):
         ("cameras", "", "refers to camera 1, which is not among the 0 cameras"),
         ("images", "", "the model has no image"),
         ("images", IMAGE.replace("1 a", "2 a"), "'a.png' refers to camera 2, which"),
-        ("images", "1 1 0 0 0 0 0 3 1", "line 1: expected IMAGE_ID .* got 9 values"),
-        ("images", "1 0 0 0 0 0 0 3 1 a.png", "quaternion of 'a.png' is zero"),
-        ("images", "1 1 0 0 0 0 inf 3 1 a.png", "pose of finite numbers"),
-        ("images", "1 1 0 0 0 0 1e300 3 1 a.png", "pose of finite numbers"),
         ("images", f"{IMAGE}\n\n{IMAGE}\n", "line 3: the id 1 is that of another im"),
         ("images", IMAGE + "x" * 1100, "expected a name of at most 1024 bytes"),
         ("points", "7 1 2 3 255 0 9", "line 1: expected POINT3D_ID .* got 7 values"),
-        ("points", "7 1 2 3 1.5 0 9 0.5", "expected a colour .* got .1.5, 0"),
         ("points", "7 1 2 3 nan 0 9 0.5", "expected a colour"),
         ("points", "7 1 2 nan 0 0 9 0.5", "1 of 1 points have .*: point \\[7\\]"),
-        ("points", f"{POINT} 3", "expected a track of pairs .* got 5 values"),
         ("points", f"{POINT}\n{POINT}", r"1 points have the id .*: \[7\]"),
     ],
 )
 def test_bad_text(tmp_path, file, text, expected):
     with pytest.raises(InputError, match=expected):
         read_colmap(write_text(tmp_path, **{file: text}))
-
-
-IMAGE_BYTES = 4 + 7 * 8 + 4 + len("view_00.png") + 1 + 8
-
-
-@pytest.mark.parametrize(
-    ("name", "at", "value", "expected"),
-    [
-        ("cameras", 12, struct.pack("<i", 7), "FOV is not supported"),
-        ("cameras", 32, struct.pack("<d", np.nan), "expected finite parameters"),
-        ("images", 68, struct.pack("<I", 9), "refers to camera 9, which is not among"),
-        ("images", 8 + IMAGE_BYTES, struct.pack("<I", 1), "image 1 .*the id 1 is that"),
-        ("images", 72, b"\xff\xfe", r"the name b'\\xff\\xfe.* is not UTF-8"),
-        ("images", 84, b"\xff" * 8, "truncated or damaged"),
-        ("points3D", 51, b"\xff" * 8, "truncated or damaged"),
-        ("points3D", -8, b"\xff" * 8, "truncated or damaged"),
-    ],
-)
-def test_bad_values_in_binary(written, tmp_path, name, at, value, expected):
-    shutil.copytree(written, tmp_path, dirs_exist_ok=True)
-    data = bytearray((written / f"{name}.bin").read_bytes())
-    at %= len(data)
-    data[at : at + len(value)] = value
-    (tmp_path / f"{name}.bin").write_bytes(data)
-    with pytest.raises(InputError, match=expected):
-        read_colmap(tmp_path)
 
 
 @pytest.mark.parametrize(
