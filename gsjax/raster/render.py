@@ -119,5 +119,6 @@ def _render(
     )
 
 
-# Inlined into the program of a caller that is traced.
-_render_compiled = jax.jit(_render, static_argnums=(2, 3), inline=True)
+# XLA inlines it into the program of a caller that is traced. (With ``inline=True`` an
+# eager gradient would compile each operation by itself.)
+_render_compiled = jax.jit(_render, static_argnums=(2, 3))

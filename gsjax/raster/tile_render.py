@@ -20,17 +20,15 @@ from gsjax.raster.lists.counting import COUNT_LIMIT
 from gsjax.raster.types import Array, Demand, Projection, RasterConfig
 from gsjax.runtime.devices import local_device_count, map_over_devices, platform_name
 
-# Gaussians over the whole image that the default pair capacity has room for.
-_LAYERS = 32
+# Pairs that cost little room, and that few, large Gaussians may need.
+_FEW_PAIRS = 2**18
 
 
 def default_pair_capacity(ranks: int, grid: binning.Grid) -> int:
-    """Return room for eight tiles a Gaussian, or some layers over all tiles.
-
-    The latter serves scenes of few, large Gaussians. The result is a bucket.
-    """
+    """Return room for eight tiles a Gaussian, or for few, large ones; a bucket."""
     tiles = grid.tiles * grid.stride
-    return capacity_bucket(max(8 * ranks + 2 * tiles, min(ranks, _LAYERS) * tiles))
+    usual, most = 8 * ranks + 2 * tiles, ranks * tiles
+    return capacity_bucket(max(usual, min(most, _FEW_PAIRS)))
 
 
 def render_tiles(
