@@ -4,6 +4,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -35,7 +36,6 @@ _LONGEST, _LONGEST_POINT = 1 << 14, 1 << 20
 _EXPECTED = "a file of COLMAP"
 # Bytes of a point without a track: "1 0 0 0 0 0 0 0" and the line end.
 _LEAST_POINT = 16
-_REMEDY = "the file is truncated or damaged: export or copy it again"
 _SPACE = np.uint8(32)
 _COMMENT = re.compile(rb"(?m)^[ \t]*(#.*)$")
 _FIELDS = {"ids": ("<u8",), "xyz": ("<f8", 3), "colors": ("u1", 3)}
@@ -184,7 +184,7 @@ def read_points(path: Path) -> ColmapPoints:
             block = _COMMENT.sub(b"", block)
         rows = _points(block)
         if rows is None:
-            raise _bad_block(path, number, block)
+            _raise_bad_block(path, number, block)
         size = len(rows["ids"])
         for name, field in fields.items():
             field[count : count + size] = rows[name]
@@ -255,38 +255,27 @@ def _identities(
     return ids
 
 
-def _bad_block(path: Path, number: int, block: bytes) -> InputError:
-    """Return the error of the first malformed line after ``number``."""
+def _raise_bad_block(path: Path, number: int, block: bytes) -> NoReturn:
+    """Raise the error of the first malformed line after ``number``."""
     for row, line in enumerate(block.decode().split("\n"), number + 1):
-        words = line.split()
-        error = _bad_point(f"{path}: line {row}", words) if words else None
-        if error is not None:
-            return error
-    return unexpected(f"{path}: after line {number}", "numbers", "other characters")
+        if words := line.split():
+            _check_point(f"{path}: line {row}", words)
+    raise unexpected(f"{path}: after line {number}", "numbers", "other characters")
 
 
-def _bad_point(where: str, words: list[str]) -> InputError | None:
-    """Return the error of a line of points3D.txt, if it is malformed."""
-    try:
-        if len(words) < 8:
-            expected = "expected POINT3D_ID X Y Z R G B ERROR TRACK"
-            return InputError(
-                f"{where}: {expected}, got {len(words)} values; {_REMEDY}"
-            )
-        _whole(where, "the point id", words[0], _UINT64)
-        values = _floats(where, words[1:8])
-        for word in words[8:]:
-            _whole(where, "a value of the track", word, 10**20)
-    except InputError as error:
-        return error
+def _check_point(where: str, words: list[str]) -> None:
+    """Raise if a line of points3D.txt is malformed."""
+    count = f"{len(words)} values"
+    if len(words) < 8:
+        raise unexpected(where, "POINT3D_ID X Y Z R G B ERROR TRACK", count)
+    _whole(where, "the point id", words[0], _UINT64)
+    colors = _floats(where, words[1:8])[3:6]
+    for word in words[8:]:
+        _whole(where, "a value of the track", word, 10**20)
     if len(words) % 2:
-        return unexpected(
-            where, "a track of pairs IMAGE_ID POINT2D_IDX", f"{len(words) - 8} values"
-        )
-    colors = values[3:6]
+        raise unexpected(where, "a track of pairs IMAGE_ID POINT2D_IDX", count)
     if not all(0 <= color <= 255 and color % 1 == 0 for color in colors):
-        return unexpected(where, "a colour of whole numbers from 0 to 255", [*colors])
-    return None
+        raise unexpected(where, "a colour of whole numbers from 0 to 255", [*colors])
 
 
 def _declared(line: str, records: str) -> list[int]:

@@ -25,7 +25,7 @@ from gsjax.data.image_header import image_size
 from gsjax.data.transforms_fields import (
     Frame,
     first_number,
-    focal_lengths,
+    intrinsics_of,
     model_of,
     pose_of,
     read_frames,
@@ -194,9 +194,7 @@ def _view(
     lens = _distortion(frame)
     width, height = size
     model = "fisheye" if lens is not None and lens.model == "fisheye" else "pinhole"
-    fx, fy = focal_lengths(frame, width, height, model)
-    cx, cy = first_number(frame, "cx"), first_number(frame, "cy")
-    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
+    fx, fy, cx, cy = intrinsics_of(frame, width, height, model)
     return View(
         name=name,
         image=file,

@@ -19,7 +19,7 @@ from gsjax.data.rebase import far_origin, shifted
 from gsjax.data.transforms_fields import (
     Frame,
     first_number,
-    focal_lengths,
+    intrinsics_of,
     model_of,
     pose_of,
     read_frames,
@@ -126,13 +126,10 @@ def _camera(
 ) -> Camera:
     model = _model(frame)
     width, height = _size(frame, size)
-    fx, fy = focal_lengths(frame, width, height, model)
-    cx, cy = first_number(frame, "cx"), first_number(frame, "cy")
+    fx, fy, cx, cy = intrinsics_of(frame, width, height, model)
     out_width, out_height = (width, height) if size is None else size
     sx, sy = out_width / width, out_height / height
-    K = np.eye(3)
-    K[0, 0], K[0, 2] = sx * fx, sx * (width / 2 if cx is None else cx)
-    K[1, 1], K[1, 2] = sy * fy, sy * (height / 2 if cy is None else cy)
+    K = np.asarray([[sx * fx, 0, sx * cx], [0, sy * fy, sy * cy], [0, 0, 1]])
     try:
         with np.errstate(over="ignore"):
             return make_camera(

@@ -194,18 +194,18 @@ def rigid(where: str, block: np.ndarray) -> tuple[np.ndarray, float]:
     return rotation, scale
 
 
-# --- focal lengths ---
+# --- intrinsics ---
 
 
-def focal_lengths(
+def intrinsics_of(
     frame: Frame, width: int, height: int, model: str
-) -> tuple[float, float]:
-    """Return the focal lengths in px; those of the frame precede the top level's.
+) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy in px; those of the frame precede the top level's.
 
-    A single one holds for both axes.
+    A single focal length holds for both axes; cx and cy default to the image centre.
 
     Raises:
-      InputError: if there is none, or one is out of range.
+      InputError: if there is no focal length, or one is out of range.
     """
     fx = fy = None
     for source in frame.sources:
@@ -219,7 +219,8 @@ def focal_lengths(
         raise unexpected(frame.where, f"a focal length, fl_x{angles}", "none")
     if fx <= 0 or fy <= 0:
         raise unexpected(frame.where, "focal lengths above 0", f"{fx:g}, {fy:g}")
-    return fx, fy
+    cx, cy = first_number(frame, "cx"), first_number(frame, "cy")
+    return fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy
 
 
 def _focal(

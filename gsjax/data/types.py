@@ -117,16 +117,7 @@ class Dataset:
 
 
 class ReadOptions(NamedTuple):
-    """Options of `load_dataset` that every reader receives.
-
-    Attributes:
-      images: folder of the photographs: a name in the dataset or a path; None for the
-        reader's default.
-      factor: read the smaller copies in ``images_2``, ``images_4``, …
-      skip_missing: omit listed photographs that do not exist, with a warning.
-      poses_only: read cameras and points only: photographs need not exist, masks are
-        ignored.
-    """
+    """Options of `load_dataset`, which documents them, for every reader."""
 
     images: str | PathLike[str] | None = None
     factor: int | None = None
