@@ -5,6 +5,7 @@ They are tyro constructors; a `ValueError` becomes a one-line error.
 
 import re
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from difflib import get_close_matches
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
@@ -95,7 +96,10 @@ def _choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
             raise ValueError(f"unknown value {text!r} ({suggestion(text, values)})")
         return values[text]
 
-    return option(f"{{{','.join(values)}}}", parse)
+    spec = option(f"{{{','.join(values)}}}", parse)
+    if any(value.startswith("-") for value in values):  # not a flag
+        spec = replace(spec, choices=tuple(values))
+    return spec
 
 
 def parse_size(text: str) -> tuple[int, int]:
