@@ -221,7 +221,8 @@ def test_live_updates_one_display(monkeypatch):
 
 
 def test_display_methods_are_attached_in_a_notebook():
-    code = "import ipykernel, gsjax; print(gsjax.Gaussians._repr_png_.__name__)"
+    code = "import sys, gsjax; sys.modules['ipykernel'] = sys; "
+    code += "print(gsjax.Gaussians._repr_png_.__name__)"
     args = [sys.executable, "-c", code]
     done = subprocess.run(args, capture_output=True, text=True)
     assert done.stdout, done.stderr

@@ -3,7 +3,7 @@
 import contextlib
 import logging
 import socket
-import sys
+import threading
 import time
 
 import jax
@@ -13,9 +13,12 @@ import training
 from viewing import COUNT, Browser, scene, wait_for
 
 import gsjax
+from gsjax.cli.main import main
 from gsjax.data.types import Photo
 from gsjax.errors import InputError
 from gsjax.math.rotations import quaternion_to_matrix
+from gsjax.runs.folder import run_files
+from gsjax.runs.run import RunResult
 from gsjax.train.config import TrainConfig
 from gsjax.train.initialisation import initial_state
 from gsjax.train.loop import Progress
@@ -254,52 +257,59 @@ def test_the_next_free_port_is_used_and_silent_clients_are_not_logged(
     assert caplog.records == []
 
 
-def test_without_viser_the_error_names_the_package(monkeypatch):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(gsjax.GsjaxError, match="install it: pip install viser"):
-        LiveViewer()
-
-
-def test_a_training_is_shown_by_copies():
+def test_a_training_is_shown_by_copies(tmp_path, monkeypatch, capsys):
+    """`gsjax train --viewer`, which ends when the last browser has gone."""
     config = TrainConfig(steps=9, sh_degree=0, raster=training.RASTER)
-    dataset, viewer = training.dataset(), LiveViewer(port=8290)
+    dataset, viewers, made = training.dataset(), [], LiveViewer.__init__
     blank = np.zeros((training.HEIGHT, training.WIDTH, 3), np.uint8)
     photos = [Photo(blank, None, None, view.K) for view in dataset.views]
-    hook = viewer.begin(dataset, photos, config)
     state = initial_state(dataset, config)
 
-    def after(step):
-        """Call the hook, and then delete its state as the next step does."""
-        gaussians = jax.tree.map(jax.numpy.copy, state.gaussians)
-        means = gaussians.params.means + step
-        gaussians = gaussians.replace(params=gaussians.params.replace(means=means))
-        kept = np.array(means)
-        metrics = Metrics(*[0] * len(Metrics._fields))._replace(step=step)
-        hook(state.replace(gaussians=gaussians), Progress(metrics, 0, 0, 0, 1, 64))
-        np.testing.assert_array_equal(means, kept)
-        jax.tree.map(lambda a: a.delete(), gaussians)
-        return kept
-
     def shown():
-        return np.asarray(viewer.server.content.gaussians.params.means)
+        return np.asarray(viewers[0].server.content.gaussians.params.means)
 
-    first = after(1)
-    after(2)  # too early for a copy
-    np.testing.assert_array_equal(shown(), first)
-    viewer.due = 0.0
-    second = after(2)
-    np.testing.assert_array_equal(shown(), second)
-    browser = Browser(viewer.server.url)
-    wait_for(lambda: viewer.server.has_browsers)
-    viewer.due = time.monotonic() + 60
-    after(3)
-    np.testing.assert_array_equal(shown(), second)
-    last = after(9)  # the last step is always shown
-    np.testing.assert_array_equal(shown(), last)
-    assert viewer.due > time.monotonic()
-    session = session_of(viewer.server)
-    wait_for(lambda: "step 9 of 9" in session.counts.content)
-    browser.close()
-    wait_for(lambda: not viewer.server.has_browsers)
-    viewer.wait_for_browsers()  # returns, as none is connected
-    viewer.close()
+    def run(*_, watch, **__):
+        hook, viewer = watch(dataset, photos, config), viewers[0]
+
+        def after(step):
+            """Call the hook, and then delete its state as the next step does."""
+            gaussians = jax.tree.map(jax.numpy.copy, state.gaussians)
+            means = gaussians.params.means + step
+            gaussians = gaussians.replace(params=gaussians.params.replace(means=means))
+            kept = np.array(means)
+            metrics = Metrics(*[0] * len(Metrics._fields))._replace(step=step)
+            hook(state.replace(gaussians=gaussians), Progress(metrics, 0, 0, 0, 1, 64))
+            np.testing.assert_array_equal(means, kept)
+            jax.tree.map(lambda a: a.delete(), gaussians)
+            return kept
+
+        first = after(1)
+        after(2)  # too early for a copy
+        np.testing.assert_array_equal(shown(), first)
+        viewer.due = 0.0
+        second = after(2)
+        np.testing.assert_array_equal(shown(), second)
+        browser = Browser(viewer.server.url)
+        wait_for(lambda: viewer.server.has_browsers)
+        viewer.due = time.monotonic() + 60
+        after(3)
+        np.testing.assert_array_equal(shown(), second)
+        last = after(9)  # the last step is always shown
+        np.testing.assert_array_equal(shown(), last)
+        assert viewer.due > time.monotonic()
+        session = session_of(viewer.server)
+        wait_for(lambda: "step 9 of 9" in session.counts.content)
+        threading.Timer(0.3, browser.close).start()
+        return RunResult(run_files(tmp_path), True, 9, 1.0, training.POINTS, None)
+
+    def note_viewer(viewer, **options):
+        made(viewer, **options)
+        viewers.append(viewer)
+
+    monkeypatch.setattr(LiveViewer, "__init__", note_viewer)
+    monkeypatch.setattr("gsjax.runs.run.start_run", run)
+    args = ["train", str(tmp_path), "-o", str(tmp_path / "run"), "--viewer"]
+    assert main([*args, "--viewer-port", "8290"]) == 0
+    err = capsys.readouterr().err
+    assert f"viewer: {viewers[0].server.url} stays until its last page" in err
+    assert not viewers[0].server.has_browsers
