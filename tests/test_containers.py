@@ -128,7 +128,7 @@ def test_stacked_cameras_have_a_leading_axis():
     assert batch.viewmat.shape == (3, 4, 4)
     np.testing.assert_array_equal(batch.viewmat[1], cameras[1].viewmat)
     assert batch.lens is PINHOLE
-    with pytest.raises(InputError, match="one image size"):
+    with pytest.raises(InputError, match="one size and lens"):
         gsjax.stack_cameras([cameras[0], camera_of(width=9)])
 
 

@@ -37,9 +37,11 @@ class Level:
         settle(self)
 
 
-# Compiles faster: a run grows its capacities itself, so one size suffices; and few
-# Gaussians are hidden in views of photographs, so occlusion culling does not pay.
-_RASTER = {"num_size_buckets": 1, "occlusion": False}
+# Compile faster: a run grows its capacities itself, so one size suffices; and few
+# Gaussians are hidden in views of photographs, so occlusion culling does not pay. A
+# config holds these very objects unless the user passes one.
+_RASTER = RasterConfig(num_size_buckets=1, occlusion=False)
+_ACCURATE = RasterConfig.accurate(num_size_buckets=1, occlusion=False)
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ class TrainConfig:
     prune_invisible: bool = True
     every_eval: int = 0
     every_checkpoint: int = 1000
-    raster: RasterConfig = field(default_factory=lambda: RasterConfig(**_RASTER))
+    raster: RasterConfig = _RASTER
 
     def __post_init__(self):
         settle(self)
@@ -126,9 +128,9 @@ class TrainConfig:
                     f"TrainConfig.{name}: expected one of {', '.join(known)}, got "
                     f"{getattr(self, name)!r}"
                 )
-        if self.refine_poses and self.raster == RasterConfig(**_RASTER):
-            accurate = RasterConfig.accurate(**_RASTER)
-            object.__setattr__(self, "raster", accurate)
+        if self.raster is _RASTER or self.raster is _ACCURATE:
+            default = _ACCURATE if self.refine_poses else _RASTER
+            object.__setattr__(self, "raster", default)
         rates = _as_floats(self.rates)
         object.__setattr__(self, "rates", rates)
         first, last = rates.means

@@ -294,7 +294,8 @@ def _edit(setup: Setup):
             gaussians=gaussians, model=model, moments=moments, stats=stats
         )
         count = num_active(gaussians)
-        return state, metrics._replace(gaussians=count, wanted=plan.wanted)
+        wanted = jnp.asarray(plan.wanted, jnp.int32)
+        return state, metrics._replace(gaussians=count, wanted=wanted)
 
     return edit
 

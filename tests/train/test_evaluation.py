@@ -1,11 +1,11 @@
-"""Scores of held-out views: of what, over what, and their means."""
+"""Laws of the evaluation of held-out views."""
 
 from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from captures import scene_of_views
+from captures import dataset_of_views
 from conftest import LIGHT, assert_not_empty
 
 import gsjax
@@ -22,7 +22,7 @@ BEHIND = (0.2, 0.6, 0.4)
 
 @pytest.fixture(scope="module")
 def scene():
-    return scene_of_views(count=2, points=60)
+    return dataset_of_views(count=2, points=60)
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +57,7 @@ def renders(gaussians, scene):
     return [np.rint(r.render * 255).astype(np.uint8) for r in results]
 
 
-def test_a_photograph_of_the_scene_itself(gaussians, scene, renders):
-    """8 bits are left: errors even within ± half a level."""
+def test_a_photograph_of_the_scene_scores_its_rounding(gaussians, scene, renders):
     photos = [photo_of(v, r) for v, r in zip(scene.views, renders)]
     results = scored(gaussians, scene, photos)
     for result in results:
@@ -89,7 +88,7 @@ def test_only_valid_pixels_count(gaussians, scene, renders):
     np.testing.assert_array_equal(result.valid, valid)
 
 
-def test_what_is_masked_altogether_does_not_count(gaussians, scene, renders):
+def test_fully_masked_views_are_left_out(gaussians, scene, renders):
     masked = photo_of(scene.views[0], renders[0], valid=np.zeros((24, 32), bool))
     photos = [masked, photo_of(scene.views[1], renders[1])]
     first, second = scored(gaussians, scene, photos)
@@ -99,7 +98,7 @@ def test_what_is_masked_altogether_does_not_count(gaussians, scene, renders):
     assert summarise([first]).views == 0
 
 
-def test_transparent_photographs_lie_over_the_background(gaussians, scene, renders):
+def test_transparent_photographs_are_over_the_background(gaussians, scene, renders):
     alpha = np.zeros((24, 32), np.uint8)
     alpha[:, ::2], alpha[:, 1::4] = 255, 51
     photo = photo_of(scene.views[0], renders[0], alpha)
@@ -109,8 +108,7 @@ def test_transparent_photographs_lie_over_the_background(gaussians, scene, rende
     np.testing.assert_allclose(result.truth, wanted, atol=1e-6)
 
 
-def test_photographs_of_unequal_sizes(gaussians, scene, renders, monkeypatch):
-    """As each by itself, by one program."""
+def test_photographs_of_unequal_sizes_score_as_alone(gaussians, scene, renders):
     rng = np.random.default_rng(0)
     sizes = [(24, 20), (15, 32)]
     seen = rng.uniform(size=sizes[1]) > 0.3
@@ -118,15 +116,7 @@ def test_photographs_of_unequal_sizes(gaussians, scene, renders, monkeypatch):
         Photo(r[:h, :w], None, valid, v.K)
         for r, (h, w), valid, v in zip(renders, sizes, (None, seen), scene.views)
     ]
-    rendered = []
-
-    def render(gaussians, camera, *args, **kwargs):
-        rendered.append((camera.width, camera.height))
-        return gsjax.render_exact(gaussians, camera, *args, **kwargs)
-
-    monkeypatch.setattr("gsjax.train.evaluation.render_exact", render)
     together = scored(gaussians, scene, photos)
-    assert rendered == [(32, 24)] * 2
     for index, found in enumerate(together):
         part = replace(scene, views=scene.views[index : index + 1])
         alone = scored(gaussians, part, photos[index : index + 1])[0]
@@ -139,7 +129,7 @@ def test_photographs_of_unequal_sizes(gaussians, scene, renders, monkeypatch):
         assert alone.psnr > 40
 
 
-def test_as_many_photographs_as_views(gaussians, scene, renders):
+def test_missing_photographs_are_rejected(gaussians, scene, renders):
     photo = photo_of(scene.views[0], renders[0])
     with pytest.raises(ValueError, match="shorter"):
         list(evaluate(gaussians, scene.views, [photo], config=CONFIG))
@@ -148,7 +138,7 @@ def test_as_many_photographs_as_views(gaussians, scene, renders):
 @pytest.mark.parametrize(
     ("part", "value"),
     [
-        ("pixels", np.zeros((24, 32, 3), np.float32)),  # 0 to 1: learnt as black
+        ("pixels", np.zeros((24, 32, 3), np.float32)),
         ("pixels", np.zeros((24, 32, 4), np.uint8)),
         ("pixels", np.zeros((24, 32), np.uint8)),
         ("pixels", np.zeros((0, 32, 3), np.uint8)),
@@ -160,7 +150,7 @@ def test_as_many_photographs_as_views(gaussians, scene, renders):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_photographs_of_another_kind(part, value, gaussians, scene):
+def test_malformed_photographs_are_rejected(part, value, gaussians, scene):
     view = scene.views[0]
     photo = photo_of(view, np.zeros((24, 32, 3), np.uint8))._replace(**{part: value})
     with pytest.raises(InputError, match=f"{view.name}: {part} of the photo"):
@@ -169,8 +159,7 @@ def test_photographs_of_another_kind(part, value, gaussians, scene):
         check_photos(replace(scene, views=scene.views[:1]), [photo])
 
 
-def test_the_settings_of_a_training_will_do(gaussians, scene, renders):
-    """With absolute gradients, which only a derivative has."""
+def test_absgrad_is_ignored(gaussians, scene, renders):
     photo = photo_of(scene.views[0], renders[0])
     config = CONFIG.replace(absgrad=True)
     (found,) = scored(gaussians, scene, [photo], config=config)

@@ -1,10 +1,10 @@
-"""Photographs made smaller for the first steps of a training."""
+"""Laws of downscaled photographs and of the order of views."""
 
 import numpy as np
 import pytest
 
 from gsjax.data.types import Photo
-from gsjax.train.frames import make_frames
+from gsjax.train.frames import make_frames, views_of_step
 
 
 def photo_of(pixels, alpha=None) -> Photo:
@@ -18,20 +18,19 @@ def shrunk(photo, divisor, view) -> np.ndarray:
 
 @pytest.fixture
 def view():
-    from training import scene
+    from training import dataset
 
-    return scene().views[0]
+    return dataset().views[0]
 
 
 def over(pixels, alpha, background):
-    """[H, W, 3] of colours and opacities of 0 to 255 before a background."""
+    """Return colours [H, W, 3] over a background; all values are 0 to 255."""
     share = np.asarray(alpha, np.float64)[..., None] / 255
     return share * pixels + (1 - share) * background
 
 
 @pytest.mark.parametrize("divisor", [2, 4])
-def test_a_smaller_photograph_looks_as_the_photograph_does_from_afar(divisor, view):
-    """Before any background: averages of what is seen, not of what is stored."""
+def test_downscaling_averages_the_image_over_any_background(divisor, view):
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 256, (24, 32, 3)).astype(np.uint8)
     alpha = rng.choice(np.asarray([0, 0, 1, 90, 255, 255], np.uint8), (24, 32))
@@ -41,11 +40,11 @@ def test_a_smaller_photograph_looks_as_the_photograph_does_from_afar(divisor, vi
         seen = over(pixels, alpha, background)
         blocks = seen.reshape(24 // divisor, divisor, 32 // divisor, divisor, 3)
         found = over(small[..., :3], small[..., 3], background)
-        # Half a step of the colour, and half of one of the opacity.
+        # Rounding of colour and opacity.
         assert np.abs(found - blocks.mean(axis=(1, 3))).max() <= 1.0 + 1e-3
 
 
-def test_colours_that_are_not_seen_do_not_matter(view):
+def test_transparent_colours_have_no_effect(view):
     rng = np.random.default_rng(1)
     pixels = rng.integers(0, 256, (24, 32, 3)).astype(np.uint8)
     alpha = rng.choice(np.asarray([0, 128, 255], np.uint8), (24, 32))
@@ -54,21 +53,20 @@ def test_colours_that_are_not_seen_do_not_matter(view):
     small = shrunk(photo_of(pixels, alpha), 2, view)
     np.testing.assert_array_equal(small, shrunk(photo_of(other, alpha), 2, view))
     assert (small[..., 3] == 0).any()
-    assert (small[small[..., 3] == 0] == 0).all(), "black where nothing is"
+    assert (small[small[..., 3] == 0] == 0).all()
     assert small.max() > 100
 
 
-def test_one_that_is_opaque_is_averaged_as_one_without_opacity(view):
+def test_an_opaque_alpha_channel_has_no_effect(view):
     pixels = np.random.default_rng(2).integers(0, 256, (24, 32, 3)).astype(np.uint8)
     plain = shrunk(photo_of(pixels), 3, view)
     opaque = shrunk(photo_of(pixels, np.full((24, 32), 255, np.uint8)), 3, view)
     assert (opaque[..., 3] == 255).all()
-    assert np.abs(opaque[..., :3] - plain).max() <= 1  # of rounding at halves
+    assert np.abs(opaque[..., :3] - plain).max() <= 1
 
 
 @pytest.mark.parametrize("divisor", [1, 2])
-def test_opacity_is_kept_where_any_photograph_has_it(view, divisor):
-    """The others are opaque; where none has it there is no such channel."""
+def test_the_opacity_channel_is_added_if_any_photograph_has_one(view, divisor):
     pixels = np.full((24, 32, 3), 90, np.uint8)
     clear = photo_of(pixels, np.full((24, 32), 60, np.uint8))
     both = make_frames([view, view], [photo_of(pixels), clear], divisor).pixels
@@ -76,3 +74,27 @@ def test_opacity_is_kept_where_any_photograph_has_it(view, divisor):
     assert (both[0, ..., 3] == 255).all()
     assert (both[1, ..., 3] == 60).all()
     assert make_frames([view], [photo_of(pixels)], divisor).pixels.shape[-1] == 3
+
+
+def test_smaller_photographs_are_padded(view):
+    """Padding is not valid; intrinsics scale with the divisor."""
+    pixels = np.random.default_rng(3).integers(0, 256, (24, 32, 3)).astype(np.uint8)
+    large, small = photo_of(pixels), photo_of(pixels[:20, :30])
+    frames = make_frames([view] * 2, [large, small])
+    np.testing.assert_array_equal(frames.pixels[1, :20, :30], small.pixels)
+    assert frames.valid[0].all()
+    assert frames.valid[1].sum() == 20 * 30
+    assert frames.size.tolist() == [[32, 24], [30, 20]]
+    half = make_frames([view] * 2, [large, small], 2)
+    assert half.pixels.shape == (2, 12, 16, 3)
+    assert half.valid[1].sum() == 10 * 15
+    np.testing.assert_allclose(half.camera.K[1], np.diag([0.5, 0.5, 1]) @ small.K)
+    assert make_frames([view] * 2, [large, large]).valid is None
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_each_view_once_per_epoch(batch):
+    order = np.concatenate([views_of_step(5, step, batch, 4) for step in range(8)])
+    epochs = order[: len(order) // 4 * 4].reshape(-1, 4)
+    assert (np.sort(epochs, axis=1) == np.arange(4)).all()
+    assert len({tuple(e) for e in epochs.tolist()}) > 1

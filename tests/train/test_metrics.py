@@ -1,4 +1,4 @@
-"""PSNR and SSIM: against direct sums over windows, and what weights may not let by."""
+"""Laws of PSNR and SSIM, against direct sums over windows."""
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +8,8 @@ import pytest
 from gsjax.errors import InputError
 from gsjax.train.metrics import psnr, ssim, ssim_map, weighted_mean
 
-# One pixel, smaller than the window, and larger than what is taken at a time.
-SIZES = [(1, 1), (3, 20), (24, 32), (130, 257), (7, 700)]
+# One pixel, smaller than the window, and larger than the blocks.
+SIZES = [(1, 1), (3, 20), (24, 32), (70, 400)]
 
 maps = jax.jit(ssim_map)
 scores = jax.jit(lambda x, y, w: (psnr(x, y, w), ssim(x, y, w)))
@@ -23,7 +23,7 @@ def gradients(image, target, weight):
 
 
 def pair(height, width, channels=3, seed=0):
-    """A picture and a disturbed copy of it, in [0, 1]."""
+    """Return an image and a noisy copy, in [0, 1]."""
     rng = np.random.default_rng(seed)
     ramp = np.add.outer(np.arange(height), np.arange(width)) / (height + width)
     first = np.clip(ramp[..., None] + 0.3 * rng.uniform(size=channels), 0, 1)
@@ -32,7 +32,7 @@ def pair(height, width, channels=3, seed=0):
 
 
 def dense_ssim(x, y):
-    """SSIM of every pixel by sums over 11 × 11 px, zeros beyond the border."""
+    """Return the SSIM of each pixel by sums over 11 × 11 px, zero padded."""
     offsets = np.arange(-5, 6)
     window = np.exp(-0.5 * (offsets / 1.5) ** 2)
     window = np.outer(window, window) / window.sum() ** 2
@@ -69,8 +69,7 @@ def test_ssim_is_the_sum_over_windows(size, report):
 
 
 @pytest.mark.parametrize("types", [("float32", "float64"), ("float64", "float32")])
-def test_types_may_differ(types):
-    """As in any sum, the wider one counts."""
+def test_mixed_dtypes_promote(types):
     x, y = (jnp.asarray(a, t) for a, t in zip(pair(12, 20), types))
     found = maps(x, y)
     assert found.dtype == jnp.float64
@@ -98,11 +97,11 @@ def test_symmetry_bounds_and_identity(channels):
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
-def test_constant_pictures(value):
+def test_constant_images(value):
     flat = np.full((24, 32, 3), value, np.float32)
     assert abs(scores(flat, flat, None)[1] - 1) <= 1e-6
     np.testing.assert_allclose(psnr(flat, flat + 0.1), 20, atol=1e-4)
-    # Away from the border only the first factor is left.
+    # Away from the border, the contrast term is 1.
     inside = maps(flat, np.full_like(flat, 0.25))[8:-8, 8:-8]
     wanted = (0.5 * value + 1e-4) / (value**2 + 0.0625 + 1e-4)
     np.testing.assert_allclose(inside, wanted, rtol=1e-4)
@@ -118,27 +117,22 @@ def test_psnr_of_known_errors():
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32, bool])
 @pytest.mark.parametrize("measure", [psnr, ssim])
-def test_whole_numbers_are_refused(dtype, measure):
-    """Differences of uint8 wrap; what reads images gives that."""
+def test_integer_images_are_rejected(dtype, measure):
     x, y = (picture.astype(np.float32) for picture in pair(24, 32))
     for both in ((x.astype(dtype), y), (x, y.astype(dtype))):
-        with pytest.raises(InputError, match=r"a picture of .*picture / 255"):
+        with pytest.raises(InputError, match=r"image: expected .*image / 255"):
             measure(*both)
-        with pytest.raises(InputError, match=r"a picture of .*picture / 255"):
+        with pytest.raises(InputError, match=r"image: expected .*image / 255"):
             jax.jit(measure)(*both)
 
 
-def test_of_no_pixel_there_is_no_psnr():
-    x, y = pair(24, 32)
-    assert np.isnan(psnr(x, y, np.zeros((24, 32))))
-
-
-def test_weights_count():
+def test_weights():
+    """Pixels of weight 0 are excluded."""
     x, y = pair(13, 17)
     half = np.zeros((13, 17))
     half[:, :9] = 1
+    assert np.isnan(psnr(x, y, 0 * half))
     np.testing.assert_allclose(psnr(x, y, half), psnr(x[:, :9], y[:, :9]))
-    # Black beyond the weight is what lies beyond the border.
     np.testing.assert_allclose(ssim(x, y, half), ssim(x[:, :9], y[:, :9]), rtol=1e-11)
     rng = np.random.default_rng(0)
     values, weight = rng.normal(size=(2, 13, 17))
@@ -147,8 +141,8 @@ def test_weights_count():
     assert weighted_mean(values, np.zeros_like(values)) == 0
 
 
-@pytest.mark.parametrize("garbage", [0.7, 1e30, np.inf, np.nan])
-def test_what_lies_under_weight_0_is_nothing(garbage):
+@pytest.mark.parametrize("garbage", [1e30, np.inf, np.nan])
+def test_excluded_pixels_have_no_effect(garbage):
     x, y = (np.float32(a) for a in pair(24, 32))
     weight = np.float32(np.random.default_rng(1).uniform(size=(24, 32)) > 0.3)
     hidden = (weight == 0)[..., None]
@@ -166,7 +160,7 @@ def test_what_lies_under_weight_0_is_nothing(garbage):
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_gradients_are_slopes(weighted, report):
+def test_gradients_are_finite_differences(weighted, report):
     rng = np.random.default_rng(2)
     x, y = pair(14, 12)
     weight = rng.uniform(size=(14, 12)) * (rng.uniform(size=(14, 12)) > 0.2)

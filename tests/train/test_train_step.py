@@ -1,4 +1,4 @@
-"""The train step as a function: pure, safe, and learning what it says it learns.
+"""Laws of the training step: pure, guarded, with correct gradients.
 
 Two programs are compiled: "plain" (adaptive, photographs with an alpha channel over
 random backgrounds, no threshold within reach) and "tuned" (MCMC, two views a step,
@@ -24,24 +24,24 @@ from training import (
     bits,
     changed,
     copy,
+    dataset,
     photos,
     rough_start,
-    scene,
     true_gaussians,
 )
 
 import gsjax
-import gsjax.train.step as step_module
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.math.sh import num_bases
-from gsjax.train.camera_refinement import CameraRefinement, exposed, refine_camera
+from gsjax.train.camera_refinement import refine_camera
 from gsjax.train.config import TrainConfig
-from gsjax.train.frames import Batch, draw, make_frames, views_of_step
+from gsjax.train.frames import Batch, draw, make_frames, targets, views_of_step
 from gsjax.train.losses import photometric
 from gsjax.train.optimiser import Rates
+from gsjax.train.setup import make_setup
 from gsjax.train.state import gradients_like, init_state
-from gsjax.train.step import background_of, make_stages, make_train_step, targets
+from gsjax.train.step import background_of, make_stages, make_train_step
 
 SLOTS = 96
 PLAIN = TrainConfig(
@@ -75,7 +75,7 @@ tuned_step = jax.jit(make_train_step(TUNED, EXTENT))
 @cache
 def plain_frames():
     opaque = np.full((HEIGHT, WIDTH), 255, np.uint8)
-    return make_frames(scene().views, [p._replace(alpha=opaque) for p in photos()])
+    return make_frames(dataset().views, [p._replace(alpha=opaque) for p in photos()])
 
 
 def plain_batch(step=0):
@@ -89,7 +89,7 @@ def plain_state(seed=0):
 
 
 def run_plain(state, steps):
-    """State and metrics after so many, from copies: each call is given its own."""
+    """Return state and metrics after a number of steps; the state is kept."""
     state, told = copy(state), []
     for _ in range(steps):
         state, metrics = plain_step(state, plain_batch(state.step))
@@ -97,7 +97,7 @@ def run_plain(state, steps):
     return state, told
 
 
-def test_is_a_function():
+def test_the_step_is_pure():
     start = plain_state()
     first, second = (run_plain(start, 3) for _ in range(2))
     assert bits(first) == bits(second)
@@ -106,26 +106,14 @@ def test_is_a_function():
         assert any(m.endswith(name) for m in moved), name
     assert ".key" not in moved
     assert int(first[0].step) == 3
-    # The edit after the second step: everything is hot, until slots run out.
+    # The edit after the second step densifies until slots run out.
     assert [int(m.wanted) for m in first[1]] == [0, 120, 0]
     assert [int(m.gaussians) for m in first[1]] == [60, SLOTS, SLOTS]
 
 
-def test_all_that_is_visible_has_room():
-    """Metrics tell of pairs alone, so a room for what is visible is not used."""
-    state, batch = plain_state(), plain_batch()
-    few = PLAIN.raster.replace(visible_capacity=3)
-    wanted = jax.make_jaxpr(make_train_step(PLAIN, EXTENT))(state, batch)
-    for step in (
-        make_train_step(PLAIN, EXTENT, few),
-        make_train_step(PLAIN.replace(raster=few), EXTENT),
-    ):
-        assert str(jax.make_jaxpr(step)(state, batch)) == str(wanted)
-
-
-def test_stages_one_by_one_are_the_step():
-    """As a run takes them, over two edits; none is due where nothing was learnt."""
-    stages = make_stages(PLAIN, EXTENT)
+def test_the_stages_compose_to_the_step():
+    """Over two edits; none is due after an overflow or a non-finite loss."""
+    stages = make_stages(make_setup(PLAIN, EXTENT))
     differentiate, advance, edit = map(jax.jit, stages)
 
     def one_by_one(state, batch):
@@ -148,7 +136,7 @@ def test_stages_one_by_one_are_the_step():
         state, metrics = found
         edits += int(metrics.wanted) > 0
     assert edits == 2
-    gradients = differentiate(state, batch)  # step 5: behind it an edit is due
+    gradients = differentiate(state, batch)  # an edit is due after this step
     nan, full = jnp.asarray(jnp.nan), jnp.asarray(True)
     skipped, metrics, due = advance(state, gradients._replace(loss=nan))
     assert (changed(state, skipped), bool(due)) == ([".step"], False)
@@ -160,29 +148,8 @@ def test_stages_one_by_one_are_the_step():
     assert due
 
 
-@pytest.mark.parametrize("strategy", ["adaptive", "mcmc"])
-@pytest.mark.parametrize("batch", [1, 2])
-def test_shapes_of_gradients(strategy, batch):
-    """Also where cameras are wider than what is learnt, and pictures of all sizes."""
-    config = TUNED.replace(strategy=strategy, batch=batch)
-    config = config.replace(adaptive=replace(config.adaptive, absgrad=True))
-    state = init_state(rough_start(0, SLOTS), config, EXTENT, VIEWS)
-    narrow = jax.tree.map(
-        lambda a: a.astype(jnp.float32) if a.dtype == jnp.float64 else a, state
-    )
-    stages = make_stages(config, EXTENT)
-    views = jnp.zeros(batch, jnp.int32)
-    sizes = jnp.full((batch, 2), 8, jnp.int32)
-    for begun in (state, narrow):
-        seen = draw(plain_frames(), views)._replace(size=sizes)
-        found = jax.eval_shape(stages.differentiate, begun, seen)
-        assert found == gradients_like(begun, batch)
-        after, *_ = jax.eval_shape(stages.advance, begun, found)
-        assert after == jax.eval_shape(lambda s: s, begun)
-
-
-def test_its_state_may_be_donated():
-    """None of its arrays is in it twice; what was given is gone afterwards."""
+def test_the_state_can_be_donated():
+    """It holds no buffer twice."""
     state = plain_state()
     after, metrics = plain_step(state, plain_batch())
     assert state.gaussians.params.means.is_deleted()
@@ -193,13 +160,13 @@ def test_its_state_may_be_donated():
     for strategy in ("adaptive", "mcmc"):
         config = PLAIN.replace(strategy=strategy, **kinds)
         state = init_state(rough_start(2, SLOTS), config, EXTENT, VIEWS)
-        held = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(
-            replace(state, key=jax.random.key_data(state.key))
-        )]  # fmt: skip
-        assert len(set(held)) == len(held)
+        arrays = jax.tree.leaves(replace(state, key=jax.random.key_data(state.key)))
+        shards = [shard.data for a in arrays for shard in a.addressable_shards]
+        pointers = [shard.unsafe_buffer_pointer() for shard in shards]
+        assert len(set(pointers)) == len(pointers)
 
 
-def test_bands_join_one_by_one():
+def test_sh_degrees_are_enabled_one_by_one():
     state = plain_state()
     wanted = np.asarray([1, 1, 1, 4, 4, 4, 9])
     for bands in wanted:
@@ -207,12 +174,12 @@ def test_bands_join_one_by_one():
         sh = np.asarray(state.gaussians.params.sh[np.asarray(state.gaussians.active)])
         np.testing.assert_array_equal(sh[:, bands:], 0)
         assert (sh[:, :bands] != 0).any((0, 2)).all()
-        for moment in (state.moments.mu.sh, state.moments.nu.sh):
-            np.testing.assert_array_equal(moment[:, bands:], 0)
+        for moment in (state.moments[0].mu, state.moments[0].nu):
+            np.testing.assert_array_equal(moment.gaussians.sh[:, bands:], 0)
     assert bands == num_bases(PLAIN.sh_degree)
 
 
-def test_mapped_over_seeds_and_scanned_equals_the_loop():
+def test_vmap_and_scan_equal_the_loop():
     steps = 3
     starts = [plain_state(seed) for seed in (3, 4)]
     batches = jax.tree.map(
@@ -231,16 +198,16 @@ def test_mapped_over_seeds_and_scanned_equals_the_loop():
             jax.tree.leaves((found.gaussians.params, found.moments, found.stats)),
             jax.tree.leaves((wanted.gaussians.params, wanted.moments, wanted.stats)),
         ):
-            # Adam makes full steps of gradients that are nothing but rounding.
+            # Adam amplifies gradients that are rounding errors.
             assert np.isclose(a, b, rtol=1e-4, atol=1e-6).mean() > 0.98
         np.testing.assert_allclose(metrics.loss, [m.loss for m in told], rtol=1e-6)
         means.append(np.asarray(found.gaussians.params.means))
     assert np.abs(means[0] - means[1]).max() > 0.01  # splits draw from the seed
 
 
-def test_what_is_not_finite_changes_only_the_step():
+def test_a_non_finite_loss_changes_only_the_step():
     start = tuned_state()
-    # Of a scene and its cameras the renderer leaves out what is not finite.
+    # The renderer ignores non-finite Gaussians and cameras.
     exposures = start.refinement.exposures.at[:, 0, 3].set(jnp.inf)
     start = start.replace(refinement=replace(start.refinement, exposures=exposures))
     after, metrics = tuned_step(start, tuned_batch())
@@ -251,14 +218,14 @@ def test_what_is_not_finite_changes_only_the_step():
     assert metrics.wanted == 0
 
 
-def test_a_step_out_of_the_numbers_is_not_made():
-    """By what it would take out alone; and it is told."""
+def test_numbers_that_would_become_non_finite_are_kept():
     start = plain_state()
-    mu = start.moments.mu
-    mu = mu.replace(means=mu.means.at[:7, 1].set(1e308))
-    after, told = plain_step(
-        copy(start.replace(moments=start.moments._replace(mu=mu))), plain_batch()
-    )
+    adam, *rest = start.moments
+    means = adam.mu.gaussians.means.at[:7, 1].set(1e308)
+    gaussians = adam.mu.gaussians.replace(means=means)
+    adam = adam._replace(mu=adam.mu._replace(gaussians=gaussians))
+    moments = (adam, *rest)
+    after, told = plain_step(copy(start.replace(moments=moments)), plain_batch())
     assert not told.finite
     assert int(told.step) == 1
     wanted, _ = run_plain(start, 1)
@@ -266,36 +233,18 @@ def test_a_step_out_of_the_numbers_is_not_made():
         np.asarray(s.gaussians.params.means) for s in (start, after, wanted)
     )
     np.testing.assert_array_equal(found[:7, 1], before[:7, 1])
-    held = np.zeros_like(before, bool)
-    held[:7, 1] = True
-    np.testing.assert_array_equal(found[~held], wanted[~held])
-    assert (found[~held] != before[~held]).sum() > 100
+    kept = np.zeros_like(before, bool)
+    kept[:7, 1] = True
+    np.testing.assert_array_equal(found[~kept], wanted[~kept])
+    assert (found[~kept] != before[~kept]).sum() > 100
 
 
-@pytest.mark.new_emitters
-def test_guards_change_no_bit_where_nothing_is_wrong(monkeypatch):
-    start = plain_state()
-    wanted, told = run_plain(start, 3)
-    assert all(m.finite for m in told)
-    monkeypatch.setattr(step_module, "all_within", lambda *_: jnp.asarray(True))
-    monkeypatch.setattr(
-        step_module, "_still_numbers", lambda _, params: (jnp.asarray(True), params)
-    )
-    unguarded = jax.jit(make_train_step(PLAIN, EXTENT), donate_argnums=0)
-    state = copy(start)
-    for _ in range(3):
-        state, metrics = unguarded(state, plain_batch(state.step))
-    assert changed(state, wanted) == []
-    assert bits(metrics) == bits(told[-1])
-
-
-def test_the_statistic_is_the_slope_by_a_shift_of_the_projection(report):
+def test_the_statistic_is_the_derivative_by_the_projected_means(report):
     start, batch = plain_state(), plain_batch()
     after, _ = run_plain(start, 1)
-    # As the step derives it.
     key = jax.random.split(jax.random.fold_in(start.key, 0), 3)[0]
     behind = background_of(PLAIN, False, key, jnp.float64)
-    target, _ = targets(batch, behind, jnp.float64)
+    target, _ = targets(batch._replace(background=behind), jnp.float64)
     config = SMOOTH.replace(outputs=("rgb",))
 
     @jax.jit
@@ -306,7 +255,7 @@ def test_the_statistic_is_the_slope_by_a_shift_of_the_projection(report):
 
         def slope(index):
             one = jnp.zeros((1, SLOTS, 2)).at[0, index // 2, index % 2].set(1e-6)
-            # Both ends in a map, so that the renderer is compiled once.
+            # A map compiles the renderer once.
             ends, radii = jax.lax.map(lambda s: value(s * one), jnp.array([1.0, -1.0]))
             return (ends[0] - ends[1]) / 2e-6, radii[0]
 
@@ -333,8 +282,8 @@ def exact_gaussians():
 
 
 def tuned_batch(index=(0, 2), gain=1.0, viewmats=None, K=None, seed=None):
-    """Photographs of views, some pixels padding, of cameras as told."""
-    views = [scene().views[i] for i in index]
+    """Return a batch with some padding."""
+    views = [dataset().views[i] for i in index]
     taken = [photos()[i].pixels for i in index]
     pixels = np.rint(gain * np.stack(taken)).astype(np.uint8)
     valid = np.ones(pixels.shape[:3], bool)
@@ -356,7 +305,7 @@ def tuned_state(gaussians=None):
     return init_state(gaussians, TUNED, EXTENT, VIEWS)
 
 
-def test_padding_does_not_matter():
+def test_padding_has_no_effect():
     start = tuned_state()
     first, second, third = (
         tuned_step(start, tuned_batch(gain=0.7, seed=seed)) for seed in (None, 1, 2)
@@ -365,13 +314,12 @@ def test_padding_does_not_matter():
     assert first[1].loss > 0.01
 
 
-def test_a_padded_view_gives_the_statistic_of_the_view_alone():
-    """In units of its own size; what the padding alone would show is not seen."""
+def test_the_statistics_of_a_padded_view_are_those_of_the_view():
     size = width, height = 20, 15
     config = TUNED.replace(
         strategy="adaptive", adaptive=AdaptiveSettings(), raster=RASTER
     )
-    views = scene().views[:2]
+    views = dataset().views[:2]
     taken = [p._replace(pixels=255 - p.pixels) for p in photos()[:2]]
     taken[1] = taken[1]._replace(pixels=taken[1].pixels[:height, :width])
     params = exact_gaussians().params
@@ -401,8 +349,8 @@ def test_a_padded_view_gives_the_statistic_of_the_view_alone():
     assert (frame.gradient > 1.05 * wanted.gradient).sum() > 15
 
 
-def test_masked_tiles_are_skipped_and_nothing_else_changes(report):
-    """All that was gathered in the moments: Adam's step itself makes much of little."""
+def test_skipping_masked_tiles_keeps_the_gradients(report):
+    """As the moments hold them; the step itself amplifies rounding."""
     config = TUNED.replace(rates=Rates())
     batch = tuned_batch(gain=0.7)
     valid = np.asarray(batch.valid) & (np.arange(batch.valid.shape[2]) < 20)
@@ -413,9 +361,9 @@ def test_masked_tiles_are_skipped_and_nothing_else_changes(report):
         for skip in (True, False)
     )
     assert int(told.pairs) < 0.9 * int(more.pairs)
-    assert float(jnp.abs(one.moments.mu.means).max()) > 0
+    assert float(jnp.abs(one.moments[0].mu.gaussians.means).max()) > 0
     worst = abs(float(told.loss / more.loss) - 1)
-    gathered = ((s.moments.mu, s.refinement_moments.mu) for s in (one, other))
+    gathered = ((s.moments[0].mu, s.shared_moments[0].mu) for s in (one, other))
     for a, b in zip(*map(jax.tree.leaves, gathered), strict=True):
         scale = float(jnp.abs(b).max()) or 1.0
         worst = max(worst, float(jnp.abs(a - b).max()) / scale)
@@ -423,8 +371,7 @@ def test_masked_tiles_are_skipped_and_nothing_else_changes(report):
     assert worst < 1e-10
 
 
-def test_a_step_of_each_correction():
-    """Adam's first step is the rate: wherever a gradient is, and nowhere else."""
+def test_the_first_step_of_each_correction_is_its_rate():
     start = tuned_state()
     after, metrics = tuned_step(start, tuned_batch(gain=0.7))
     assert metrics.finite
@@ -438,25 +385,25 @@ def test_a_step_of_each_correction():
 
 
 def projected(viewmat, K):
-    at = scene().points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    at = dataset().points @ viewmat[:3, :3].T + viewmat[:3, 3]
     return at[:, :2] / at[:, 2:] * np.diag(K)[:2] + K[:2, 2]
 
 
 def off_by(start, batch):
-    """px, root mean square, between where points fall and where they did truly."""
+    """Return the RMS reprojection error in px."""
     camera = refine_camera(batch.camera, start.refinement, batch.view, EXTENT)
     errors = []
     for at, index in enumerate(batch.view):
-        view = scene().views[int(index)]
+        view = dataset().views[int(index)]
         found = projected(np.asarray(camera.viewmat[at]), np.asarray(camera.K[at]))
         errors.append(found - projected(view.viewmat, view.K))
     return np.sqrt(np.mean(np.square(errors)))
 
 
 @pytest.mark.parametrize("wrong", ["poses", "intrinsics", "exposures"])
-def test_corrections_go_the_right_way(wrong, report):
+def test_corrections_reduce_the_error(wrong, report):
     rng = np.random.default_rng(0)
-    viewmats, K, gain = [scene().views[i].viewmat for i in (0, 2)], None, 1.0
+    viewmats, K, gain = [dataset().views[i].viewmat for i in (0, 2)], None, 1.0
     if wrong == "poses":
         moved = []
         for viewmat in viewmats:
@@ -467,7 +414,7 @@ def test_corrections_go_the_right_way(wrong, report):
             moved.append(error @ viewmat)
         viewmats = moved
     elif wrong == "intrinsics":
-        K = scene().views[0].K * [[1.06, 1, 1], [1, 0.95, 1], [1, 1, 1]]
+        K = dataset().views[0].K * [[1.06, 1, 1], [1, 0.95, 1], [1, 1, 1]]
         K[0, 2] += 0.5
     else:
         gain = 0.7
@@ -492,9 +439,8 @@ def test_corrections_go_the_right_way(wrong, report):
     assert after < 0.4 * before
 
 
-def test_what_shows_through_a_photograph_has_no_exposure():
-    """It is ours, and the same behind the picture: where both are nothing, a random
-    background tells nothing of the exposure."""
+def test_the_background_has_no_exposure():
+    """If photograph and scene are empty, the loss and its gradient are zero."""
     config = PLAIN.replace(exposure=True, ssim_weight=0.0)
     state = init_state(rough_start(2, SLOTS), config, EXTENT, VIEWS)
     nothing = state.gaussians.replace(active=jnp.zeros(SLOTS, bool))
@@ -505,31 +451,15 @@ def test_what_shows_through_a_photograph_has_no_exposure():
     )
     batch = plain_batch()
     empty = batch._replace(pixels=batch.pixels.at[..., 3].set(0))
-    differentiate = jax.jit(make_stages(config, EXTENT).differentiate)
+    differentiate = jax.jit(make_stages(make_setup(config, EXTENT)).differentiate)
     found = differentiate(state, empty)
     assert float(found.loss) < 1e-12
-    by = found.by_refinement.exposures
+    by = found.by_shared.refinement.exposures
     assert float(jnp.abs(by).max()) == 0
     assert float(differentiate(state, batch).loss) > 0.01
 
 
-def test_exposures_of_what_is_half_there():
-    """An affine map of its colour, whatever share of it shows."""
-    rng = np.random.default_rng(0)
-    affine, colours = rng.normal(size=(2, 3, 4)), rng.uniform(size=(1, 5, 4, 3))
-    alphas = rng.uniform(size=(1, 5, 4))
-    refinement, index = (
-        CameraRefinement(exposures=jnp.asarray(affine)),
-        jnp.asarray([1]),
-    )
-    found = exposed(jnp.asarray(colours * alphas[..., None]), refinement, index, alphas)
-    mapped = colours + colours @ affine[1, :, :3].T + affine[1, :, 3]
-    np.testing.assert_allclose(found, mapped * alphas[..., None], atol=1e-12)
-    whole = exposed(jnp.asarray(colours), refinement, index)
-    np.testing.assert_allclose(whole, mapped, atol=1e-12)
-
-
-def test_an_overflow_changes_nothing_and_says_so():
+def test_an_overflow_changes_nothing():
     gaussians = exact_gaussians()
     params = gaussians.params.replace(log_scales=gaussians.params.log_scales + 4)
     start = tuned_state(gaussians.replace(params=params))
@@ -544,60 +474,23 @@ def test_an_overflow_changes_nothing_and_says_so():
 def test_targets():
     pixels = np.random.default_rng(0).integers(0, 256, (2, 3, 4, 4)).astype(np.uint8)
     behind = jnp.asarray([0.1, 0.5, 0.9])
-    batch = tuned_batch()._replace(pixels=jnp.asarray(pixels), valid=None)
-    found, weight = targets(batch, behind, jnp.float64)
+    batch = tuned_batch()._replace(
+        pixels=jnp.asarray(pixels), valid=None, background=behind
+    )
+    found, weight = targets(batch, jnp.float64)
     rgb, alpha = pixels[..., :3] / 255, pixels[..., 3:] / 255
     np.testing.assert_allclose(found, rgb * alpha + behind * (1 - alpha), rtol=1e-12)
     assert weight is None
     opaque = batch._replace(pixels=jnp.asarray(pixels[..., :3]))
-    np.testing.assert_allclose(targets(opaque, behind, jnp.float64)[0], rgb)
+    np.testing.assert_allclose(targets(opaque, jnp.float64)[0], rgb)
     valid = pixels[..., 0] > 99
-    _, weight = targets(batch._replace(valid=jnp.asarray(valid)), behind, jnp.float32)
+    _, weight = targets(batch._replace(valid=jnp.asarray(valid)), jnp.float32)
     np.testing.assert_array_equal(weight, valid.astype(np.float32))
-
-
-def test_backgrounds():
-    def behind(name, transparent, key):
-        config = TUNED.replace(background=name)
-        return background_of(config, transparent, key, jnp.float32)
-
-    key = jax.random.key(0)
-    for name, value in (("black", 0.0), ("white", 1.0)):
-        for transparent in (False, True):
-            found = behind(name, transparent, key)
-            assert found.tolist() == [value] * 3
-            assert found.dtype == jnp.float32
-    drawn = jax.vmap(lambda k: behind("random", False, k))(jax.random.split(key, 500))
-    assert drawn[0].tolist() != drawn[1].tolist()
-    # A photograph that can tell nothing from black is put over what cannot be learnt.
-    assert behind("auto", False, key).tolist() == [0] * 3
-    for name in ("auto", "random"):
-        assert behind(name, True, key).tolist() == behind("random", False, key).tolist()
-    assert drawn.min() >= 0
-    assert drawn.max() <= 1
-    np.testing.assert_allclose(drawn.mean(0), 0.5, atol=0.06)
-    assert (np.abs(np.corrcoef(drawn.T)[~np.eye(3, dtype=bool)]) < 0.2).all()
-
-
-def test_the_random_background_is_behind_photographs_too():
-    """Where a photograph is transparent and nothing is, every colour is right."""
-    batch = plain_batch()
-    clear = batch._replace(pixels=batch.pixels.at[..., 3].set(0))
-    losses = []
-    for seed in range(3):
-        state = plain_state(seed)
-        gaussians = state.gaussians.replace(active=state.gaussians.active & False)
-        state = state.replace(gaussians=gaussians)
-        assert plain_step(copy(state), clear)[1].loss < 1e-12
-        losses.append(float(plain_step(state, batch)[1].loss))
-    assert len(set(losses)) == 3
-    assert min(losses) > 0.05
 
 
 @pytest.mark.parametrize("strategy", ["adaptive", "mcmc"])
 @pytest.mark.parametrize("absgrad", [False, True])
-def test_float32_stays_with_x64(strategy, absgrad):
-    """Traced only: the step gives back what it was given, leaf by leaf."""
+def test_dtypes_are_kept(strategy, absgrad):
     config = PLAIN.replace(
         strategy=strategy, adaptive=replace(PLAIN.adaptive, absgrad=absgrad)
     )
@@ -607,44 +500,3 @@ def test_float32_stays_with_x64(strategy, absgrad):
         after, _ = jax.eval_shape(make_train_step(config, EXTENT), state, plain_batch())
         for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(after)):
             assert (a.shape, a.dtype) == (b.shape, b.dtype)
-
-
-def test_every_view_once_an_epoch():
-    frames = plain_frames()
-    for batch in (1, 3):
-        order = []
-        for step in range(8):
-            drawn = draw(frames, views_of_step(5, step, batch, VIEWS))
-            order += drawn.view.tolist()
-            np.testing.assert_array_equal(drawn.pixels, frames.pixels[drawn.view])
-            np.testing.assert_array_equal(
-                drawn.camera.viewmat, frames.camera.viewmat[drawn.view]
-            )
-        epochs = np.asarray(order[: len(order) // VIEWS * VIEWS]).reshape(-1, VIEWS)
-        assert (np.sort(epochs, axis=1) == np.arange(VIEWS)).all()
-        assert len({tuple(e) for e in epochs}) > 1
-
-
-def test_frames_of_several_sizes_are_padded():
-    first, second = photos()[:2]
-    K = np.asarray([[30.0, 0, 10], [0, 31, 8], [0, 0, 1]])
-    small = second._replace(pixels=second.pixels[:20, :30], K=K)
-    views = scene().views[:2]
-    frames = make_frames(views, [first, small])
-    assert frames.pixels.shape == (2, HEIGHT, WIDTH, 3)
-    np.testing.assert_array_equal(frames.pixels[1, :20, :30], small.pixels)
-    assert frames.valid[0].all()
-    assert frames.valid[1].sum() == 20 * 30
-    np.testing.assert_allclose(frames.camera.K[1], K)
-    half = make_frames(views, [first, small], 2)
-    assert half.pixels.shape == (2, 12, 16, 3)
-    assert half.valid[1].sum() == 10 * 15
-    np.testing.assert_allclose(half.camera.K[1], np.diag([0.5, 0.5, 1]) @ K)
-    wanted = first.pixels.reshape(12, 2, 16, 2, 3).mean((1, 3))
-    assert np.abs(half.pixels[0] - wanted).max() <= 0.76  # OpenCV rounds
-    clear = small._replace(alpha=np.full((20, 30), 9, np.uint8))
-    mixed = make_frames(views, [first, clear])
-    assert mixed.pixels.shape[-1] == 4
-    assert (mixed.pixels[0, ..., 3] == 255).all()
-    assert (mixed.pixels[1, :20, :30, 3] == 9).all()
-    assert make_frames(views, [first, second]).valid is None

@@ -1,20 +1,16 @@
-"""The window of SSIM: both ways to its means against sums over neighbours, and that it
-is its own transpose, in every kind of derivative.
-"""
+"""Laws of the SSIM window: sums over neighbours, and its own transpose."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import on_cpu
 
-from gsjax.runtime import loops
 from gsjax.train import ssim_window
 from gsjax.train.ssim_window import window_means
 
-# Smaller than the window, one block of rows, more than one, and more than one stretch.
-SIZES = [(1, 1, 3), (4, 3, 1), (32, 33, 2), (70, 40, 3), (3, 700, 3)]
-WAYS = {"loops": ssim_window._by_loops, "products": ssim_window._by_products}
+# Smaller than the window, one block, several blocks, several segments.
+SIZES = [(1, 1, 3), (4, 3, 1), (70, 40, 3), (3, 700, 3)]
+METHODS = {"loops": ssim_window._by_loops, "products": ssim_window._by_products}
 
 
 def planes_of(shape, count=2, seed=0):
@@ -23,7 +19,7 @@ def planes_of(shape, count=2, seed=0):
 
 
 def dense_means(plane):
-    """By a product with all weights of an axis, one after the other."""
+    """Return the means by one dense product per axis."""
     for axis in (0, 1):
         offset = np.subtract.outer(*(2 * [np.arange(plane.shape[axis])]))
         weights = np.exp(-0.5 * (offset / 1.5) ** 2) * (np.abs(offset) <= 5)
@@ -32,17 +28,17 @@ def dense_means(plane):
     return plane
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("shape", SIZES, ids=str)
-def test_means_are_sums_over_neighbours(shape, way):
+def test_means_are_weighted_sums(shape, method):
     planes = planes_of(shape)
-    found = WAYS[way](planes)
+    found = METHODS[method](planes)
     for one, plane in zip(found, planes, strict=True):
         np.testing.assert_allclose(one, dense_means(plane), rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("shape", [(9, 14, 3), (3, 700, 3)], ids=str)
-def test_every_derivative_is_the_map_itself(shape):
+@pytest.mark.parametrize("shape", [(9, 14, 3)], ids=str)
+def test_derivatives_are_the_map_itself(shape):
     (x, y), (slope, other) = planes_of(shape), planes_of(shape, seed=1)
 
     def means(x):
@@ -66,13 +62,3 @@ def test_every_derivative_is_the_map_itself(shape):
     both = jax.vmap(jax.grad(half_square))(batch)
     for one, found in zip(batch, both, strict=True):
         np.testing.assert_allclose(found, jax.grad(half_square)(one), **near)
-
-
-@on_cpu
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_each_loop_is_one_kernel(dtype):
-    planes = [jax.ShapeDtypeStruct((20, 2000, 3), dtype)] * 3
-    assert loops.large_are_kernels()
-    program = ssim_window._by_loops.lower(planes).compile().as_text()
-    assert "xla_cpu_small_call" in program
-    assert not loops.has_loop_by_turns(program)
