@@ -11,8 +11,9 @@ from gsjax.math.sh import rgb_to_dc
 from gsjax.plots import figures
 from gsjax.plots.contact_sheets import depth_colors
 from gsjax.raster.lists import binning
-from gsjax.raster.lists.depth_order import depth_order
-from gsjax.raster.primitives.ellipsoid import project
+from gsjax.raster.primitives.ellipsoid import ELLIPSOID
+from gsjax.raster.render_camera import visible_order
+from gsjax.raster.types import Inputs
 from gsjax.synthetic.torus_knot import torus_knot_scene
 
 ASSETS = Path(__file__).parent / "assets"
@@ -71,9 +72,15 @@ def pipeline() -> None:
         for one in (small, gaussians)
     )
     config = gsjax.RasterConfig(tile_size=_TILE, devices=1, num_size_buckets=1)
-    slots, count = depth_order(gaussians, camera, config)
-    seen = project(gaussians, camera, config, slots, count)
-    panels = [dots, _ellipses(seen, dots.shape), _lengths(seen, picture), picture]
+    inputs = Inputs(gaussians, camera)
+    slots, count = visible_order(ELLIPSOID, inputs, config)
+    seen = ELLIPSOID.project(inputs, config, slots, count)
+    panels = [
+        dots,
+        _ellipses(seen, dots.shape),
+        _lengths(seen.footprint, picture),
+        picture,
+    ]
     captions = [
         ("Gaussians", "position, rotation,\nscale, opacity, colour"),
         ("project", "each to an ellipse,\nwith its colour from here"),
@@ -104,14 +111,20 @@ def pipeline() -> None:
 
 def _ellipses(seen, shape: tuple[int, ...]) -> np.ndarray:
     """Draw the one-sigma ellipse of one splat in six, far to near."""
-    page = np.full(shape, 255, np.uint8)
+    page, footprint = np.full(shape, 255, np.uint8), seen.footprint
     u, v, var_y, slope, inv_sx = (
         np.asarray(a, np.float64)
-        for a in (seen.u, seen.v, seen.var_y, seen.slope, seen.inv_sx)
+        for a in (
+            footprint.u,
+            footprint.v,
+            footprint.var_y,
+            footprint.slope,
+            footprint.inv_sx,
+        )
     )
-    colors = 255 * np.clip(np.asarray(seen.colors), 0, 1)
+    colors = 255 * np.clip(np.asarray(seen.channels.colors), 0, 1)
     for rank in range(len(u) - 1, -1, -6):
-        if not seen.reach[rank] > 0:
+        if not footprint.reach[rank] > 0:
             continue
         var_x = 1 / inv_sx[rank] ** 2
         cov = slope[rank] * var_x
@@ -124,13 +137,12 @@ def _ellipses(seen, shape: tuple[int, ...]) -> np.ndarray:
     return page / 255
 
 
-def _lengths(seen, picture: np.ndarray) -> np.ndarray:
+def _lengths(footprint, picture: np.ndarray) -> np.ndarray:
     """Return the picture under the lengths of the tile lists, as colours."""
     height, width = picture.shape[:2]
     grid = binning.make_grid(width, height, _TILE, 1)
     device = jnp.int32(0)
-    spans = binning.row_spans(seen, grid, device)
-    lists = binning.make_lists(seen, spans, grid, device, 2**17)
+    lists = binning.make_lists(footprint, grid, device, 2**17)
     assert lists.fit
     length = np.asarray(lists.length, np.float64).reshape(grid.rows, grid.cols)
     levels = np.rint(255 * length / length.max()).astype(np.uint8)

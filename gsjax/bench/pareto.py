@@ -7,7 +7,6 @@ pixels, including the worst of every point, the error is compared with its bound
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
@@ -147,10 +146,10 @@ def _compile_all(
 ) -> list[_Program]:
     """Return the program of the exact image and that of each point, all compiled."""
     exact = Point("exact", "", _EXACT, double=True)
-    capacities = _Capacities()
+    known: dict[tuple, RasterConfig] = {}
 
     def ready(point: Point) -> _Program:
-        program = _compile(scene, point, weights, capacities)
+        program = _compile(scene, point, weights, known)
         if point is not exact:
             with jax.enable_x64(point.double):
                 jax.block_until_ready(program.forward())
@@ -164,32 +163,27 @@ def _compile_all(
         return all_of(pool, ready, every)
 
 
-class _Capacities:
-    """Capacities that fit a view, computed once for all points of equal sizes."""
+def _fitted(
+    point: Point, gaussians: Gaussians, camera: Camera, known: dict[tuple, RasterConfig]
+) -> RasterConfig:
+    """Return the config of a point with capacities that fit, unless it has its own.
 
-    def __init__(self):
-        self.found: dict[tuple, RasterConfig] = {}
-        self.locks: dict[tuple, Lock] = {}
-
-    def __call__(
-        self, point: Point, gaussians: Gaussians, camera: Camera
-    ) -> RasterConfig:
-        """Return the config of a point with capacities, unless it has its own."""
-        config = point.config
-        if config.pair_capacity is not None:
-            return config
-        sizes = config.alpha_min, config.tile_size, config.chunk_size, point.double
-        with self.locks.setdefault(sizes, Lock()):
-            if sizes not in self.found:
-                self.found[sizes] = exact_config(gaussians, camera, config)
-        fit = self.found[sizes]
-        return config.replace(
-            pair_capacity=fit.pair_capacity, visible_capacity=fit.visible_capacity
-        )
+    ``known`` keeps them for points of equal sizes.
+    """
+    config = point.config
+    if config.pair_capacity is not None:
+        return config
+    sizes = config.alpha_min, config.tile_size, config.chunk_size, point.double
+    if sizes not in known:
+        known[sizes] = exact_config(gaussians, camera, config)
+    return config.replace(
+        pair_capacity=known[sizes].pair_capacity,
+        visible_capacity=known[sizes].visible_capacity,
+    )
 
 
 def _compile(
-    scene: StressScene, point: Point, weights: np.ndarray, capacities: _Capacities
+    scene: StressScene, point: Point, weights: np.ndarray, known: dict
 ) -> _Program:
     """Compile the calls of a point, and run its gradient once."""
     with jax.enable_x64(point.double):
@@ -197,7 +191,7 @@ def _compile(
         if point.double:
             gaussians, camera = in_float64((gaussians, camera))
         degree = gaussians.sh_degree if point.degree is None else point.degree
-        config = capacities(point, gaussians, camera)
+        config = _fitted(point, gaussians, camera, known)
         params = gaussians.params
         background = jnp.asarray(scene.background, params.means.dtype)
         by_rgb = jnp.asarray(weights, params.means.dtype)
