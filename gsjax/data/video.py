@@ -95,9 +95,9 @@ def _count(path: Path) -> int:
     """Return the number of frames, counting them if the file does not declare it."""
     capture = _opened(path)
     try:
-        told = int(capture.get(opencv().CAP_PROP_FRAME_COUNT))
-        if told > 0:
-            return told
+        declared = int(capture.get(opencv().CAP_PROP_FRAME_COUNT))
+        if declared > 0:
+            return declared
         counted = 0
         with captured_stderr():
             while capture.grab():

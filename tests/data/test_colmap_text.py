@@ -1,5 +1,7 @@
 """COLMAP's text files: blocks give the same as lines, whatever their length."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from gsjax.errors import InputError
 from gsjax.io.numerals import BLOCK
 
 
+@cache
 def random_lines(count: int) -> list[str]:
     """Points with unsorted ids, some beyond what float64 holds, and short tracks."""
     rng = np.random.default_rng(0)
@@ -23,7 +26,10 @@ def random_lines(count: int) -> list[str]:
     return lines
 
 
-def one_by_one(lines: list[str]):
+@cache
+def one_by_one(count: int):
+    """Return the fields of the same points, parsed line by line."""
+    lines = random_lines(count)
     rows = sorted((line.split() for line in lines), key=lambda words: int(words[0]))
     table = np.asarray([[float(word) for word in words[1:8]] for words in rows])
     ids = np.asarray([int(words[0]) for words in rows], np.uint64)
@@ -41,7 +47,7 @@ def test_blocks_give_the_same_points_as_lines(tmp_path, end):
     path.write_bytes(text.encode())
     assert len(text) > 3 * BLOCK
     points = colmap_text.read_points(path)
-    for found, expected in zip(points, one_by_one(lines), strict=True):
+    for found, expected in zip(points, one_by_one(len(lines)), strict=True):
         np.testing.assert_array_equal(found, expected)
 
 

@@ -329,18 +329,8 @@ def test_equal_names_in_subfolders(tmp_path, more, place):
         load_dataset(tmp_path, **more)
 
 
-def test_missing_photographs(tmp_path):
-    nerfstudio_dataset(tmp_path)
-    (tmp_path / "images/frame_2.png").unlink()
-    expected = r"transforms\.json: 1 of 4 photographs .*: images/frame_2\.png"
-    with pytest.raises(InputError, match=expected):
-        load_dataset(tmp_path)
-    with pytest.warns(UserWarning, match=expected):
-        assert len(load_dataset(tmp_path, skip_missing=True).views) == 3
-
-
-def test_scaled_rotations_give_a_warning(tmp_path):
-    made = dataset_of_views(2)
+def test_missing_photographs_and_scaled_rotations(tmp_path):
+    made = dataset_of_views(3)
     frames = frames_of(made)
     matrix = to_opengl(made.views[0].viewmat)
     matrix[:3, :3] *= 2
@@ -350,6 +340,10 @@ def test_scaled_rotations_give_a_warning(tmp_path):
         dataset = load_dataset(tmp_path)
     expected = made.views[0].viewmat
     np.testing.assert_allclose(dataset.views[0].viewmat, expected, atol=1e-14)
+    (tmp_path / "images/2.png").unlink()
+    expected = r"transforms\.json: 1 of 3 photographs .*: images/2\.png"
+    with pytest.raises(InputError, match=expected):
+        load_dataset(tmp_path)
 
 
 @pytest.mark.parametrize(
