@@ -189,23 +189,23 @@ def write_scene(name: str, folder: Path, small: int) -> Path:
 # Bits
 
 
+def _short(value: float) -> float:
+    return float(f"{value:.3g}")
+
+
 def difference(old: np.ndarray, new: np.ndarray) -> dict[str, Any]:
     """Return whether two arrays are bit-equal, and the largest difference if not."""
     if old.shape != new.shape or old.dtype != new.dtype:
         told = f"{old.dtype}{old.shape} became {new.dtype}{new.shape}"
-        return {
-            "equal": False,
-            "max abs": float("nan"),
-            "max rel": float("nan"),
-            "note": told,
-        }
+        return {"equal": False, "note": told}
     if old.tobytes() == new.tobytes():
         return {"equal": True, "max abs": 0.0, "max rel": 0.0}
     finite = np.isfinite(old) & np.isfinite(new)
     apart = np.abs(np.where(finite, old, 0) - np.where(finite, new, 0))
     scale = float(np.abs(np.where(finite, old, 0)).max())
-    found = {"equal": False, "max abs": float(apart.max())}
-    found["max rel"] = found["max abs"] / scale if scale else 0.0
+    largest = float(apart.max())
+    relative = largest / scale if scale else 0.0
+    found = {"equal": False, "max abs": _short(largest), "max rel": _short(relative)}
     same = np.isfinite(old) == np.isfinite(new)
     return found if same.all() else {**found, "note": "finite on one side only"}
 
@@ -252,11 +252,12 @@ def bits_table(rows: list[dict]) -> str:
         unequal = [row for row in some if not row["equal"]]
         told = f"{len(some) - len(unequal)} of {len(some)} arrays bit-equal"
         lines.append(f"{scene:<10}{dtype:<9}{told}")
-        lines += [
-            f"    {row['kind']:<9}{row['array']:<16}max abs {row['max abs']:.3g}, "
-            f"relative {row['max rel']:.3g} {row.get('note', '')}".rstrip()
-            for row in unequal
-        ]
+        for row in unequal:
+            largest, relative = (row.get(k, "unknown") for k in ("max abs", "max rel"))
+            lines.append(
+                f"    {row['kind']:<9}{row['array']:<16}max abs {largest}, relative "
+                f"{relative} {row.get('note', '')}".rstrip()
+            )
     return "\n".join(lines)
 
 
