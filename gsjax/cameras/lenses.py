@@ -143,19 +143,18 @@ def _columns(c: Array, count: int) -> list[Array]:
     return [c[i] if i < c.shape[-1] else 0.0 for i in range(count)]
 
 
-def _opencv_radial(c: Array, r: Array) -> Array:
-    """Distorted over undistorted radius; NaN beyond a pole of the rational model."""
+def _opencv_radial(c: Array, s: Array) -> Array:
+    """Distorted over undistorted radius, from its square; NaN beyond a pole."""
     k1, k2, _, _, k3, k4, k5, k6 = _columns(c, 8)
-    s = r * r
     above = 1 + s * (k1 + s * (k2 + s * k3))
     below = 1 + s * (k4 + s * (k5 + s * k6))
-    return above / _namespace(r).where(below > 0, below, np.nan)
+    return above / _namespace(s).where(below > 0, below, np.nan)
 
 
 def _opencv_plane(c: Array, x: Array, y: Array) -> tuple[Array, Array]:
     _, _, p1, p2, *_ = _columns(c, 8)
     square = x * x + y * y
-    scale = _opencv_radial(c, _namespace(x).sqrt(square))
+    scale = _opencv_radial(c, square)
     return (
         x * scale + 2 * p1 * x * y + p2 * (square + 2 * x * x),
         y * scale + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
@@ -252,7 +251,9 @@ def _distorting(name: str, counts, plane: Callable, radial: Callable) -> Lens:
 
 
 # OpenCV's radial-tangential model: k1 k2 p1 p2 [k3 [k4 k5 k6]].
-OPENCV = _distorting("opencv", (4, 5, 8), _opencv_plane, _opencv_radial)
+OPENCV = _distorting(
+    "opencv", (4, 5, 8), _opencv_plane, lambda c, r: _opencv_radial(c, r * r)
+)
 # OpenCV's fisheye model of Kannala and Brandt (2006): k1 k2 k3 k4.
 FISHEYE = _distorting("fisheye", (4,), _fisheye_plane, _fisheye_radial)
 

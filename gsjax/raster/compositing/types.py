@@ -56,7 +56,7 @@ class Task(NamedTuple):
 
     @property
     def gaussian_form(self) -> bool:
-        """Whether α has the Gaussian form of `Splat`."""
+        """True if α has the Gaussian form of `Splat`."""
         primitive = self.config.primitive
         return primitive is None or primitive.alpha is None
 
