@@ -145,11 +145,8 @@ def _webp(data: Buffer) -> tuple[int, int]:
     if length + 8 > len(data):
         raise _Truncated(f"{length + 8} bytes are declared")
     if kind == b"VP8X":
-        low, high = (
-            struct.unpack_from("<HB", data, 24),
-            struct.unpack_from("<HB", data, 27),
-        )
-        return low[0] + (low[1] << 16) + 1, high[0] + (high[1] << 16) + 1
+        width, more, height, rest = struct.unpack_from("<HBHB", data, 24)
+        return width + (more << 16) + 1, height + (rest << 16) + 1
     if kind == b"VP8L":
         (bits,) = struct.unpack_from("<I", data, 21)
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1

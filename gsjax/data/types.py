@@ -167,23 +167,22 @@ class Photo(NamedTuple):
           InputError: if an array does not match the attributes above.
         """
         size = np.shape(self.pixels)[:2]
-        shapes = {
-            "pixels": (*size, 3) if len(size) == 2 else ("H", "W", 3),
-            "alpha": size,
-            "valid": size,
-            "K": (3, 3),
+        arrays = {
+            "pixels": ((*size, 3), np.dtype(np.uint8)),
+            "alpha": (size, np.dtype(np.uint8)),
+            "valid": (size, np.dtype(bool)),
+            "K": ((3, 3), None),
         }
-        dtypes = {"pixels": np.uint8, "alpha": np.uint8, "valid": np.bool_}
-        for part, shape in shapes.items():
-            value, dtype = getattr(self, part), dtypes.get(part)
+        for part, (shape, dtype) in arrays.items():
+            value = getattr(self, part)
             if value is None and part in ("alpha", "valid"):
                 continue
             array = np.asarray(value)
-            wrong = array.shape != shape or array.size == 0
-            if wrong or (dtype is not None and array.dtype != dtype):
-                kind = np.dtype(dtype).name if dtype else "numbers"
-                raise InputError(
-                    f"{name}: {part} of the photo: expected {kind} of shape {shape}, "
-                    f"got {array.dtype} of shape {array.shape}; use `load_photo` or "
-                    "`make_dataset`"
+            fits = array.shape == shape and dtype in (None, array.dtype)
+            if not fits or array.size == 0:
+                raise unexpected(
+                    f"{name}: {part} of the photo",
+                    f"{dtype or 'numbers'} of shape {shape}",
+                    f"{array.dtype} of shape {array.shape}",
+                    "use `load_photo` or `make_dataset`",
                 )
