@@ -82,9 +82,6 @@ class McmcSettings:
         }
         require_ranges(self, checks)
 
-    def likely(self, count, since, until):
-        return self.schedule.expected(count, since, until)
-
     @property
     def schedule(self) -> EditSchedule:
         """When edits are due, and the growth to expect."""

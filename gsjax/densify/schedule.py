@@ -70,7 +70,3 @@ def schedule_of(due: Callable[[Any], Any], steps: int) -> EditSchedule:
         return EditSchedule(stop=0)
     every = int(np.diff(found).min()) if len(found) > 1 else 1
     return EditSchedule(int(found[0]) - 1, int(found[-1]), every)
-
-
-def edits_between(since, until, start, stop, every):
-    return EditSchedule(start, stop, every).edits_between(since, until)

@@ -73,7 +73,7 @@ class Batch(NamedTuple):
 
     @property
     def transparent(self) -> bool:
-        """Whether the photographs have an opacity channel."""
+        """True if the photographs have an opacity channel."""
         return self.pixels.shape[-1] == 4
 
 

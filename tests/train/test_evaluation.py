@@ -159,14 +159,6 @@ def test_malformed_photographs_are_rejected(part, value, gaussians, scene):
         check_photos(replace(scene, views=scene.views[:1]), [photo])
 
 
-def test_absgrad_is_ignored(gaussians, scene, renders):
-    photo = photo_of(scene.views[0], renders[0])
-    config = CONFIG.replace(absgrad=True)
-    (found,) = scored(gaussians, scene, [photo], config=config)
-    (wanted,) = scored(gaussians, scene, [photo])
-    assert (found.psnr, found.ssim) == (wanted.psnr, wanted.ssim)
-
-
 def test_summary_is_the_mean_of_the_views():
     none = np.zeros((1, 1, 3))
     results = [

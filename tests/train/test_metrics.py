@@ -96,25 +96,6 @@ def test_symmetry_bounds_and_identity(channels):
             assert abs(likeness - 1) <= bar
 
 
-@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
-def test_constant_images(value):
-    flat = np.full((24, 32, 3), value, np.float32)
-    assert abs(scores(flat, flat, None)[1] - 1) <= 1e-6
-    np.testing.assert_allclose(psnr(flat, flat + 0.1), 20, atol=1e-4)
-    # Away from the border, the contrast term is 1.
-    inside = maps(flat, np.full_like(flat, 0.25))[8:-8, 8:-8]
-    wanted = (0.5 * value + 1e-4) / (value**2 + 0.0625 + 1e-4)
-    np.testing.assert_allclose(inside, wanted, rtol=1e-4)
-
-
-def test_psnr_of_known_errors():
-    x, y = pair(5, 7)
-    np.testing.assert_allclose(psnr(x, y), -10 * np.log10(np.mean((x - y) ** 2)))
-    one = np.zeros((10, 10, 1))
-    one[0, 0] = 1
-    np.testing.assert_allclose(psnr(one, np.zeros_like(one)), 20)
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32, bool])
 @pytest.mark.parametrize("measure", [psnr, ssim])
 def test_integer_images_are_rejected(dtype, measure):
@@ -132,6 +113,7 @@ def test_weights():
     half = np.zeros((13, 17))
     half[:, :9] = 1
     assert np.isnan(psnr(x, y, 0 * half))
+    np.testing.assert_allclose(psnr(x, y), -10 * np.log10(np.mean((x - y) ** 2)))
     np.testing.assert_allclose(psnr(x, y, half), psnr(x[:, :9], y[:, :9]))
     np.testing.assert_allclose(ssim(x, y, half), ssim(x[:, :9], y[:, :9]), rtol=1e-11)
     rng = np.random.default_rng(0)

@@ -135,11 +135,3 @@ def test_slots_without_gradient_are_kept(garbage):
         assert (after[~dead] != before[~dead]).all()
         for moment in (moments[0].mu, moments[0].nu):
             assert (getattr(moment, name)[dead] == 0).all()
-
-
-def test_times_multiplies_every_rate():
-    rates = RATES.times(3.0)
-    assert rates[-2:] == RATES[-2:]
-    for found, one in zip(jax.tree.leaves(rates[:-2]), jax.tree.leaves(RATES[:-2])):
-        assert found == pytest.approx(3 * one)
-    assert isinstance(rates.means, tuple)
