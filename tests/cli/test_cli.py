@@ -193,7 +193,7 @@ ERRORS = [
     (2, "RENDER -o o --background=0,0,-1", "each from 0 to 1"),
     (2, "RENDER -o o --fps fast", "--fps: expected a number, got 'fast'; see gsjax r"),
     (2, "RENDER -o a.gif --fps inf", "--fps: expected at least 0.1 and below 1000"),
-    (2, "view a --up z", "(choose +x, -x"),
+    (2, "view a --up z", "invalid choice 'z' for argument '--up'"),
     (2, "view a --port 70000", "--port: expected 1 to 65,535, got 70000"),
     (2, "demo --steps 0", "--steps: expected 1 to 2,147,483,646, got 0"),
     (2, "demo --steps 2147483647", "to 2,147,483,646"),

@@ -433,7 +433,7 @@ def started(monkeypatch):
 
 
 def test_a_run_is_resumed_with_its_own_options_only(made, started, capsys):
-    """What is not given is the run's."""
+    """Options that are not given are those of the run."""
     run = made / "again"
     options = ["--preset", "fast", "--steps", "2", "--max-gaussians", "40"]
     options += ["--antialias", "--test-images", "0.png"]
