@@ -7,7 +7,6 @@ D (1 − Π_S (1 − α)), where D is the colour range including the background.
 from functools import cache, partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gsjax.math.numerics import in_float64
@@ -26,7 +25,7 @@ _EXACT = COMPAT.replace(
     pair_capacity=4096,
 )
 _ROUNDING = 1e-6
-_render = jax.jit(render, static_argnames="config")
+_render = scenes.with_numpy(jax.jit(render, static_argnames="config"))
 
 
 def _dense():
@@ -39,8 +38,7 @@ def _dense():
 
 
 def _rgb(gaussians, config: RasterConfig) -> np.ndarray:
-    out = _render(gaussians, camera_of(), config, jnp.asarray(BACKGROUND))
-    return np.asarray(out.rgb)
+    return _render(gaussians, camera_of(), background=BACKGROUND, config=config).rgb
 
 
 @cache

@@ -21,7 +21,7 @@ from gsjax.stress.scenes import BACKGROUND, COMPAT, MAX_FULL, SIZE, SLOTS, camer
 from gsjax.stress.types import Measurement, StressCase
 
 _TILES = (SIZE // COMPAT.tile_size) ** 2
-_render = jax.jit(render, static_argnames="config")
+_render = scenes.with_numpy(jax.jit(render, static_argnames="config"))
 
 
 @partial(jax.jit, static_argnames="product")
@@ -140,7 +140,7 @@ def past_32_bits(full: bool) -> Measurement:
         config = COMPAT.replace(
             **tiny, outputs=("alpha",), occlusion=False, pair_capacity=8192
         )
-        out = _render(scene, camera, config)
+        out = _render(scene, camera, config=config)
         wrong += int(not out.overflowed) + int(out.demand.pairs != most)
     return Measurement(wrong, f"{len(sums) + 1} sums" + ", 2^32 pairs" * full)
 
@@ -167,7 +167,7 @@ def odd_sizes(_full: bool) -> Measurement:
     for width, height in _SIZES:
         centre = (0.5 * width, 0.5 * height)
         camera = camera_of(np.eye(4), centre=centre, width=width, height=height)
-        found = scenes.to_numpy(_render(scene, camera, config))
+        found = _render(scene, camera, config=config)
         with jax.enable_x64(True):
             wanted = scenes.to_numpy(slow(*in_float64((scene.params, camera))))
         errors = found.rgb - wanted["rgb"], (found.alpha - wanted["alpha"])[..., None]

@@ -137,6 +137,7 @@ def nonfinite_depth(_full: bool) -> Measurement:
     return Measurement(count, "NaN, inf, -inf")
 
 
+@scenes.with_numpy
 @jax.jit
 def _rows_of_tiles(gaussians: Gaussians, camera, value):
     """Return the rows of tiles of Gaussians moved to ± ``value`` px, and before."""

@@ -85,6 +85,7 @@ def gradient_error(full: bool) -> Measurement:
     )
 
 
+@scenes.with_numpy
 @jax.jit
 def projected(gaussians: Gaussians, camera: Camera):
     """Return means px [N, 2], antialias ratios [N] and opacities [N] (0 if culled)."""
@@ -111,7 +112,7 @@ def antialias_ratio(full: bool) -> Measurement:
     for seed in range(seeds):
         given = needles(1_000, seed), level_camera()
         wanted = np.sqrt(np.maximum(reference_projected(*given)[3], 0.005**2))
-        found = np.asarray(projected(*given)[1])
+        found = projected(*given)[1]
         worst = np.maximum(worst, float(np.max(np.abs(found / wanted - 1))))
     return Measurement(worst, f"{SLOTS * seeds} needles")
 
@@ -186,7 +187,7 @@ def wrongly_culled(full: bool) -> Measurement:
     lost, seen = 0, 0
     for seed in range(16 if full else 2):
         scene, camera = extreme_but_valid(seed), level_camera()
-        found, radii = (np.asarray(a) for a in scenes.alpha_per_gaussian(scene, camera))
+        found, radii = scenes.alpha_per_gaussian(scene, camera)
         wanted = scenes.reference_alpha(clipped(scene), camera)
         visible = wanted.max((1, 2)) >= VISIBLE
         seen += int(visible.sum())

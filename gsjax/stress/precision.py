@@ -182,6 +182,7 @@ def projection_gradient(full: bool) -> Measurement:
     return Measurement(worst, f"{_DIRECTIONS} directions")
 
 
+@scenes.with_numpy
 @jax.jit
 def _covariances(gaussians: Gaussians, camera: Camera) -> tuple[jax.Array, ...]:
     """Return xx, xy, yy of the projected covariances, and whether each is drawn."""
@@ -202,7 +203,7 @@ def linearisation_limits(_full: bool) -> Measurement:
     points = scenes.frustum_points(np.random.default_rng(0), spread=2.5)
     fields = scenes.gaussian_fields(points, (0.3, 0.1, 0.05), 0.5, np.eye(4))
     scene = scene_of(fields)
-    xx, xy, yy, drawn = (np.asarray(a) for a in _covariances(scene, camera))
+    xx, xy, yy, drawn = _covariances(scene, camera)
     means, scales = (scenes.to_float64(fields[n]) for n in ("means", "log_scales"))
     rotations = scenes.to_float64(quaternion_to_matrix(scene.params.quats))
     K, z = scenes.to_float64(camera.K), means[:, 2]

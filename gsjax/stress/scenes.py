@@ -61,6 +61,18 @@ def to_numpy(tree):
     return jax.tree.map(np.asarray, tree)
 
 
+def with_numpy(function):
+    """Wrap a jitted function to take and return NumPy arrays.
+
+    Otherwise every placement of the arguments on devices would compile a program.
+    """
+
+    def call(*args, **kwargs):
+        return to_numpy(function(*to_numpy(args), **kwargs))
+
+    return call
+
+
 def random_pose(seed: int = 0) -> np.ndarray:
     """Return a general world → camera matrix, rounded to float32."""
     rng = np.random.default_rng(seed)
@@ -165,6 +177,7 @@ def _channels(rgb, alpha, depth) -> Array:
     return jnp.concatenate([rgb, alpha[..., None], depth[..., None]], -1)
 
 
+@with_numpy
 @partial(jax.jit, static_argnames="config")
 def _render_and_gradients(
     gaussians: Gaussians,
@@ -202,7 +215,7 @@ def render_and_gradients(
     camera = camera_of() if camera is None else camera
     weights = loss_weights() if weights is None else weights
     given = to_float32(background), to_float32(weights)  # one dtype, one program
-    return to_numpy(_render_and_gradients(gaussians, camera, *given, config=config))
+    return _render_and_gradients(gaussians, camera, *given, config=config)
 
 
 def _hide_inactive(params: GaussianParams, active: Array) -> Gaussians:
@@ -238,9 +251,10 @@ def reference(gaussians: Gaussians, camera: Camera):
     with jax.enable_x64(True):
         given = in_float64((gaussians.params, camera, BACKGROUND, loss_weights()))
         params, *rest = given
-        return to_numpy(_reference(params, gaussians.active, *rest))
+        return to_numpy(_reference(params, np.asarray(gaussians.active), *rest))
 
 
+@with_numpy
 @jax.jit
 def alpha_per_gaussian(gaussians: Gaussians, camera: Camera) -> tuple[Array, Array]:
     """Return α [N, H, W] of each Gaussian alone, without cut-offs, and radii [N]."""
