@@ -212,9 +212,9 @@ spread = bounds.color_range(scene, solid.background)
 allowed = {
     "stop 1e-2": bounds.stop_error(1e-2, "after", 1 - 1e-6, spread),
     "SH degree 0": bounds.degree_error(scene, 0),
-    "compat": bounds.cut_error(scene, 1 / 255, spread)
+    "compat": bounds.alpha_min_error(scene, 1 / 255, spread)
     + bounds.stop_error(1e-4, "before", 0.99, spread)
-    + bounds.cap_error(0.99, spread),
+    + bounds.alpha_max_error(0.99, spread),
 }
 for name, bound in allowed.items():
     print(f"{name:12} {255 * found[name]:7.3f}/255 of {255 * bound:.3f}/255")
