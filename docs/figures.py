@@ -17,6 +17,7 @@ from gsjax.raster.types import Inputs
 from gsjax.synthetic.torus_knot import torus_knot_scene
 
 ASSETS = Path(__file__).parent / "assets"
+INK = "#464a52"
 
 
 def write(name: str, rgb: np.ndarray) -> None:
@@ -94,8 +95,8 @@ def pipeline() -> None:
         axes = figure.add_axes((left, 0.42, 0.216, 0.545))
         axes.imshow(np.clip(panel, 0, 1), interpolation="nearest")
         axes.set(xticks=[], yticks=[])
-        figure.text(left, 0.35, title, fontsize=19, color=figures.INK)
-        figure.text(left, 0.31, text, fontsize=14, color=figures.INK, va="top")
+        figure.text(left, 0.35, title, fontsize=19, color=INK)
+        figure.text(left, 0.31, text, fontsize=14, color=INK, va="top")
         if index:
             place = {"xycoords": "axes fraction", "arrowprops": across}
             axes.annotate("", (-0.02, 0.5), (-0.14, 0.5), **place)

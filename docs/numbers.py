@@ -25,12 +25,12 @@ def result(name: str) -> dict[str, Any]:
     return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
 
 
-def row_of(data: dict[str, Any], **wanted: Any) -> dict[str, Any]:
-    """Return the first row of a result whose entries equal ``wanted``."""
+def row_of(data: dict[str, Any], **entries: Any) -> dict[str, Any]:
+    """Return the first row of a result whose entries equal ``entries``."""
     return next(
         row
         for row in data["rows"]
-        if all(row.get(key) == value for key, value in wanted.items())
+        if all(row.get(key) == value for key, value in entries.items())
     )
 
 
