@@ -29,7 +29,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import gsjax
-from gsjax.plots.histograms import histograms
+from gsjax.plots.figures import histograms
 from gsjax.synthetic.torus_knot import torus_knot_scene
 from gsjax.viewer.notebook import Picture, movie, show
 
