@@ -19,7 +19,7 @@ from pathlib import Path
 import measure
 
 from gsjax.io import images
-from gsjax.plots.curves import Series, curves
+from gsjax.plots.figures import Series, curves_figure, figure_pixels
 from gsjax.runs.folder import run_files
 from gsjax.runs.history import read_metrics
 from gsjax.runtime import files
@@ -131,17 +131,15 @@ def write(
 ) -> None:
     """Write a chart of the lines, if there are any."""
     if series:
-        # The legend is beside the title.
         size = (720 if len(series) < 4 else 1200, 420)
-        picture = curves(
-            series,
-            title=title,
-            x_label=x_label,
-            size=size,
-            log_x=log_x,
-            min_y_span=LEAST,
-        )
-        files.write_file(path, images.encode_png(picture))
+        figure = curves_figure(series, title=title, x_label=x_label, size=size)
+        (axes,) = figure.axes
+        if log_x:
+            axes.set_xscale("log", nonpositive="mask")
+        low, high = axes.get_ylim()
+        missing = max(0.0, LEAST - (high - low)) / 2
+        axes.set_ylim(low - missing, high + missing)
+        files.write_file(path, images.encode_png(figure_pixels(figure)))
 
 
 if __name__ == "__main__":

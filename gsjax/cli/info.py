@@ -33,8 +33,9 @@ class InfoCommand(HeavyCommand):
                 [self.plot], self.overwrite, "another name with --plot"
             )
         start_jax()
+        from gsjax.io import images
         from gsjax.io.formats import load
-        from gsjax.plots.histograms import histograms_png
+        from gsjax.plots.figures import histograms
         from gsjax.runs.folder import run_files
         from gsjax.runs.run_info import describe_run, run_text
         from gsjax.runs.scene_info import describe, info_text
@@ -57,7 +58,8 @@ class InfoCommand(HeavyCommand):
             if self.plot is not None:
                 files.make_folder(self.plot.parent)
                 named = self.scene.resolve() if "run" in report else splat
-                histograms_png(self.plot, gaussians, title=named.name)
+                plot = histograms(gaussians, title=named.name)
+                files.write_file(self.plot, images.encode_png(plot))
                 report["plot"] = str(self.plot)
                 texts.append(str(self.plot))
         say(json.dumps(report, indent=2) if self.json else "\n".join(texts))

@@ -13,30 +13,21 @@ from gsjax.errors import InputError
 from gsjax.io import images
 from gsjax.plots import figures
 
-MAGNIFIED = 4  # factor on the error
-
-_PAPER, _TEXT, _ALARM = (24, 26, 31), "#c8ccd4", "#ff785a"
+PAPER = "#181a1f"
 _MISSING = (255, 0, 255)  # pixels that are not finite
-_NOTHING = (44, 47, 54)  # pixels without depth
-_GAP, _LINE, _CHARACTER = 6, 15, 6.1  # px: margin, height of a line, width of a letter
-_FONT = {"family": "DejaVu Sans Mono", "fontsize": 7.2, "parse_math": False}
+_NOTHING = "#2c2f36"  # pixels without depth
+_NARROW, _GAP = 96, 6  # px, least width of a cell with a caption, and between cells
+_PAGE = 960  # px, default width of a page
+_LINE, _LETTER = 13, 6.1  # px, height of a line and width of a letter
 
 
 class SheetRow(NamedTuple):
-    """One view of a contact sheet.
-
-    Attributes:
-      name: caption of the photograph.
-      truth: [H, W, 3] the photograph, uint8, or floats in [0, 1].
-      render: [H, W, 3] alike.
-      depth: [H, W] of the render, 0 where there is none; or None.
-      rendered: caption of the render, before its PSNR.
-    """
+    """One view of a contact sheet; `comparison` explains its pictures."""
 
     name: str
     truth: np.ndarray
     render: np.ndarray
-    depth: np.ndarray | None = None
+    depth: np.ndarray
     rendered: str = "render"
 
 
@@ -55,64 +46,96 @@ def comparison(rows: Sequence[SheetRow], *, width: int = 320) -> np.ndarray:
     2nd and the 98th percentile of each view. PSNR is that of the pixels as given.
 
     Args:
-      rows: the views, of any sizes.
+      rows: (name of the photograph, photograph [H, W, 3], render [H, W, 3], depth
+        [H, W], caption of the render) of each view, of any sizes. Pictures are uint8 or
+        floats in [0, 1]; depth is 0 where there is none.
       width: of a cell in px; pictures are scaled to it.
 
     Raises:
       InputError: if there is no row, or the pictures of one differ in size.
     """
-    if not rows:
-        raise InputError("comparison: expected at least one row, got none")
-    return cell_grid([_row(row, width) for row in rows])
+    cells = [cell for row in rows for cell in _row(row)]
+    scaled = [cell._replace(pixels=_scale(cell.pixels, width)) for cell in cells]
+    return cell_grid(scaled, columns=4)
 
 
-def cell_grid(rows: Sequence[Sequence[Cell]]) -> np.ndarray:
+def _row(row: SheetRow) -> list[Cell]:
+    size = row.depth.shape
+    if not row.truth.shape == row.render.shape == (*size, 3):
+        raise InputError(
+            f"{row.name}: expected photograph and render of one shape [H, W, 3] and "
+            f"depth [H, W], got {row.truth.shape}, {row.render.shape} and {size}"
+        )
+    truth, render = (
+        picture / 255.0 if picture.dtype == np.uint8 else np.asarray(picture, float)
+        for picture in (row.truth, row.render)
+    )
+    square = float(np.mean((truth - render) ** 2))
+    with np.errstate(divide="ignore"):
+        caption = f"{row.rendered} {-10 * np.log10(square):.2f} dB"  # inf if identical
+    return [
+        Cell(display_pixels(truth), row.name),
+        Cell(display_pixels(render), caption),
+        Cell(display_pixels(4 * np.abs(truth - render)), "error × 4"),
+        depth_cell(row.depth),
+    ]
+
+
+def cell_grid(
+    cells: Sequence[Cell], columns: int | None = None, max_width: int | None = None
+) -> np.ndarray:
     """Return cells in rows [H, W, 3] uint8, pixel by pixel, over their captions.
 
-    Columns are as wide as the widest cell; captions are broken into lines.
+    Columns are as wide as the widest cell; by default as many as fit into 960 px. Only
+    a grid wider than ``max_width`` is scaled.
+
+    Raises:
+      InputError: if there is no cell.
     """
-    width = max(cell.pixels.shape[1] for row in rows for cell in row)
-    captions = [[_wrapped(cell.caption, width) for cell in row] for row in rows]
-    heights = [
-        max(cell.pixels.shape[0] + _GAP for cell in row)
-        + (_LINE * max(map(len, texts)) + _GAP if any(texts) else 0)
-        for row, texts in zip(rows, captions)
-    ]
-    size = max(map(len, rows)) * (width + _GAP), sum(heights)
-    page, places, top = np.full((*size[::-1], 3), _PAPER, np.uint8), [], _GAP // 2
-    for row, height in zip(rows, heights):
-        places.append([(_GAP // 2 + i * (width + _GAP), top) for i in range(len(row))])
-        top += height
-    if any(text for texts in captions for text in texts):
-        page = _page_of_text(size, rows, captions, places)
-    for row, where in zip(rows, places):
-        for cell, (x, y) in zip(row, where):
-            page[y : y + cell.pixels.shape[0], x : x + cell.pixels.shape[1]] = (
-                cell.pixels
-            )
-    return page
+    if not cells:
+        raise InputError("picture: expected at least one picture, got none")
+    narrow = _NARROW if any(cell.caption for cell in cells) else 1
+    width = _GAP + max(narrow, *(cell.pixels.shape[1] for cell in cells))
+    columns = columns or max(1, min(len(cells), _PAGE // width))
+    high, placed = _GAP // 2, []
+    for start in range(0, len(cells), columns):
+        row = cells[start : start + columns]
+        texts = [_wrap(cell.caption, width - _GAP) for cell in row]
+        placed += [(cell, text, high) for cell, text in zip(row, texts)]
+        lines = max(len(text.splitlines()) for text in texts)
+        high += max(cell.pixels.shape[0] for cell in row) + _GAP
+        high += lines * _LINE + (_GAP if lines else 0)
+    wide, high = min(columns, len(cells)) * width, high - _GAP // 2
+    figure = figures.new_figure((wide, high), facecolor=PAPER)
+    for index, (cell, text, top) in enumerate(placed):
+        left, bottom = index % columns * width + _GAP // 2, top + cell.pixels.shape[0]
+        figure.figimage(cell.pixels, left, high - bottom, origin="upper")
+        figure.text(
+            left / wide, 1 - (bottom + 3) / high, text, va="top", family="monospace",
+            fontsize=7.2, color="#ff785a" if cell.alarm else "#c8ccd4",
+        )  # fmt: skip
+    page = figures.figure_pixels(figure)
+    return page if wide <= (max_width or wide) else _scale(page, max_width or wide)
 
 
-def _page_of_text(size: tuple[int, int], rows, captions, places) -> np.ndarray:
-    """Draw the captions of `cell_grid`."""
-    width, height = size
-    figure = figures.new_figure(size, color=_PAPER)
-    for row, texts, where in zip(rows, captions, places):
-        for cell, lines, (x, y) in zip(row, texts, where):
-            top = y + cell.pixels.shape[0] + 3
-            for number, line in enumerate(lines):
-                figure.text(
-                    (x + 2) / width, 1 - (top + _LINE * number) / height, line,
-                    va="top", color=_ALARM if cell.alarm else _TEXT, **_FONT,
-                )  # fmt: skip
-    return figures.figure_pixels(figure)
+def _wrap(text: str, width: int) -> str:
+    """Break a text into lines of at most ``width`` px."""
+    lines = [textwrap.fill(line, int(width / _LETTER)) for line in text.splitlines()]
+    return figures.plain("\n".join(lines))
 
 
-def _wrapped(text: str, width: int) -> list[str]:
-    """Break a caption into lines that fit into ``width`` px."""
-    letters = max(1, int((width - 4) / _CHARACTER))
-    lines = [figures.printable(line) for line in text.splitlines()]
-    return [piece for line in lines for piece in textwrap.wrap(line, letters)]
+def _scale(pixels: np.ndarray, width: int) -> np.ndarray:
+    """Scale [H, W, 3] uint8 to ``width`` px: by area, or by repeating pixels."""
+    cv2 = images.opencv()
+    height = max(1, round(width * pixels.shape[0] / pixels.shape[1]))
+    how = cv2.INTER_AREA if width < pixels.shape[1] else cv2.INTER_NEAREST
+    return cv2.resize(pixels, (width, height), interpolation=how)
+
+
+def depth_cell(depth: np.ndarray, name: str = "depth") -> Cell:
+    """Return depth [H, W] in the colours of `depth_colors`, with its range."""
+    pixels, near, far = depth_colors(depth)
+    return Cell(pixels, f"{name} {near:.3g} to {far:.3g}")
 
 
 def depth_colors(
@@ -123,17 +146,17 @@ def depth_colors(
     Near and far are ``limits``, or else the 2nd and the 98th percentile; both 0 if
     there is no depth.
     """
-    cv2 = images.opencv()
-    found = np.isfinite(depth) & (depth > 0)
-    pixels = np.full((*depth.shape, 3), _NOTHING, np.uint8)
-    if not found.any():
-        return pixels, 0.0, 0.0
-    near, far = limits or np.percentile(depth[found], (2, 98)).tolist()
-    closeness = (far - np.where(found, depth, far)) / max(far - near, 1e-12)
+    from matplotlib import colormaps
+
+    missing = ~(np.isfinite(depth) & (depth > 0))
+    if missing.all():
+        limits = 0.0, 0.0
+    near, far = limits or np.percentile(depth[~missing], (2, 98)).tolist()
+    closeness = (far - np.where(missing, far, depth)) / max(far - near, 1e-12)
     # The ends of the map are nearly black.
-    level = images.to_8_bit(0.06 + 0.88 * np.clip(closeness, 0, 1))
-    colors = cv2.applyColorMap(level, cv2.COLORMAP_TURBO)[..., ::-1]
-    return np.where(found[..., None], colors, pixels), near, far
+    levels = np.ma.array(0.06 + 0.88 * np.clip(closeness, 0, 1), mask=missing)
+    colors = colormaps["turbo"].with_extremes(bad=_NOTHING)(levels, bytes=True)
+    return colors[..., :3], near, far
 
 
 def display_pixels(picture) -> np.ndarray:
@@ -153,50 +176,6 @@ def display_pixels(picture) -> np.ndarray:
         )
     if picture.dtype == np.uint8:
         return picture
-    picture = picture.astype(np.float64)
     finite = np.isfinite(picture).all(axis=-1, keepdims=True)
-    pixels = images.to_8_bit(np.where(finite, picture, 0))
+    pixels = images.to_8_bit(np.where(finite, picture, 0).astype(np.float64))
     return np.where(finite, pixels, np.asarray(_MISSING, np.uint8))
-
-
-def _row(row: SheetRow, width: int) -> list[Cell]:
-    for what, picture in (("photograph", row.truth), ("render", row.render)):
-        if picture.ndim != 3 or picture.shape != (*row.truth.shape[:2], 3):
-            raise InputError(
-                f"{row.name}: expected the photograph and the render to have one "
-                f"shape [H, W, 3], got {what} {picture.shape}"
-            )
-    if row.depth is not None and row.depth.shape != row.truth.shape[:2]:
-        raise InputError(
-            f"{row.name}: expected a depth of shape {row.truth.shape[:2]}, got "
-            f"{row.depth.shape}"
-        )
-    truth, render = (
-        picture / 255.0 if picture.dtype == np.uint8 else np.asarray(picture, float)
-        for picture in (row.truth, row.render)
-    )
-    error = np.abs(truth - render)
-    cells = [
-        Cell(display_pixels(truth), row.name),
-        Cell(display_pixels(render), f"{row.rendered} {_psnr(error)}"),
-        Cell(display_pixels(MAGNIFIED * error), f"error × {MAGNIFIED}"),
-    ]
-    if row.depth is not None:
-        pixels, near, far = depth_colors(row.depth)
-        cells.append(Cell(pixels, f"depth, 2 to 98 %: {near:.3g} to {far:.3g}"))
-    return [cell._replace(pixels=scale_to_width(cell.pixels, width)) for cell in cells]
-
-
-def _psnr(error: np.ndarray) -> str:
-    square = float(np.mean(error**2))
-    if not np.isfinite(square):
-        return "not finite"
-    return f"{-10 * np.log10(square):.2f} dB" if square > 0 else "identical"
-
-
-def scale_to_width(pixels: np.ndarray, width: int) -> np.ndarray:
-    """Scale [H, W, 3] uint8 to ``width`` px: by area, or by repeating pixels."""
-    cv2 = images.opencv()
-    height = max(1, round(width * pixels.shape[0] / pixels.shape[1]))
-    how = cv2.INTER_AREA if width < pixels.shape[1] else cv2.INTER_NEAREST
-    return cv2.resize(np.ascontiguousarray(pixels), (width, height), interpolation=how)

@@ -1,106 +1,164 @@
-"""Matplotlib figures of a given size in px, drawn off screen.
+"""Matplotlib figures of a given size in px, drawn off screen: curves and histograms.
 
-Figures use the object-oriented API and the Agg canvas, which need no display and share
-no global state between threads. Matplotlib is imported inside the functions.
+The object-oriented API and the Agg canvas need no display and share no global state.
+Matplotlib is imported inside the functions, because it takes long to load.
 """
 
 from __future__ import annotations
 
 import typing
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import expit
 
-from gsjax.errors import InputError
+from gsjax.gaussians import Gaussians
 
 if typing.TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 DPI = 100
-INK, GRID, FRAME = "#464a52", "#e4e6ea", "#969aa2"
-COLORS = (
-    "#2662ba", "#d65c34", "#2c8e5c", "#8e52a8", "#b08a1c",
-    "#1496aa", "#be3c78", "#6e6e6e", "#5a3c1e", "#000000",
-)  # fmt: skip
-_LEAST_SIZE = (200, 120)
-_LARGEST = 1e100  # larger values are drawn as gaps: their range would overflow
+_TAIL = 1e-3  # share of the values at either end that a logarithmic axis may leave out
+_DECADES = 200.0  # larger powers of ten count as not finite
 
 
-def new_figure(
-    size: tuple[int, int], color: tuple[int, int, int] = (255, 255, 255), **options
-) -> Figure:
-    """Return a figure of (width, height) px over a colour of 8-bit RGB.
+class Series(NamedTuple):
+    """A line ``y`` over ``x``, of one length; non-finite values leave a gap.
 
-    ``options`` are those of `Figure`.
+    A ``faint`` line is thin and pale, for noise behind what matters.
     """
+
+    label: str
+    x: Sequence[float] | np.ndarray
+    y: Sequence[float] | np.ndarray
+    faint: bool = False
+
+
+def new_figure(size: tuple[int, int], **options: Any) -> Figure:
+    """Return a figure of (width, height) px; ``options`` are those of `Figure`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     # The canvas rounds down: the excess keeps width / DPI · DPI above width.
     width, height = ((side + 1e-3) / DPI for side in size)
-    paper = "#{:02x}{:02x}{:02x}".format(*color)
-    figure = Figure((width, height), dpi=DPI, facecolor=paper, **options)
+    figure = Figure((width, height), dpi=DPI, **options)
     FigureCanvasAgg(figure)
     return figure
 
 
 def new_chart(size: tuple[int, int], rows: int = 1) -> tuple[Figure, list[Axes]]:
-    """Return a figure of plain axes, one below the other.
-
-    Raises:
-      InputError: if ``size`` is below 200 × 120 px.
-    """
-    if size[0] < _LEAST_SIZE[0] or size[1] < _LEAST_SIZE[1]:
-        raise InputError(f"size: expected at least 200 × 120 px, got {size}")
+    """Return a figure of axes, one below the other."""
     figure = new_figure(size, layout="constrained")
     axes = list(figure.subplots(rows, squeeze=False)[:, 0])
     for each in axes:
-        each.grid(color=GRID, linewidth=0.8)
-        each.set_axisbelow(True)
-        each.tick_params(which="both", colors=INK, labelsize=8)
+        each.grid(alpha=0.3)
         each.spines[["top", "right"]].set_visible(False)
-        each.spines[["left", "bottom"]].set_color(FRAME)
     return figure, axes
-
-
-def label_axes(axes: Axes, title: str, x_label: str, y_label: str = "") -> None:
-    """Set the texts of a chart."""
-    style = {"color": INK, "fontsize": 9, "parse_math": False}
-    axes.set_title(printable(title), loc="left", **{**style, "fontsize": 10})
-    axes.set_xlabel(printable(x_label), **style)
-    axes.set_ylabel(printable(y_label), **style)
-
-
-def add_legend(axes: Axes) -> None:
-    """Name the labelled lines above the axes, at the right."""
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        axes.legend(
-            loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=min(len(labels), 5),
-            frameon=False, fontsize=8, labelcolor=INK, borderaxespad=0.2,
-            handlelength=1.4, columnspacing=1.2,
-        )  # fmt: skip
 
 
 def figure_pixels(figure: Figure) -> np.ndarray:
     """Draw a figure and return its pixels [H, W, 3] uint8."""
-    figure.canvas.draw()
+    with warnings.catch_warnings():  # letters that the font lacks become boxes
+        warnings.simplefilter("ignore", UserWarning)
+        figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()  # pyright: ignore
 
 
-def drawable(values) -> np.ndarray:
-    """Return float64 values with NaN for what no axis can show."""
-    values = np.asarray(values, np.float64)
-    with np.errstate(invalid="ignore"):
-        return np.where(np.abs(values) < _LARGEST, values, np.nan)
+def plain(text: str) -> str:
+    """Escape a text that Matplotlib would take for a formula."""
+    return text.replace("$", r"\$")
 
 
-def printable(text: str) -> str:
-    """Replace characters that the default font lacks by "?".
+def curves(series: Sequence[Series], **options: Any) -> np.ndarray:
+    """Return the pixels [H, W, 3] uint8 of `curves_figure`, same arguments."""
+    return figure_pixels(curves_figure(series, **options))
 
-    Latin, Greek, Cyrillic, punctuation and mathematical operators stay.
+
+def curves_figure(
+    series: Sequence[Series],
+    *,
+    title: str = "",
+    x_label: str = "step",
+    size: tuple[int, int] = (720, 420),
+    marks: Mapping[str, float] | None = None,
+) -> Figure:
+    """Draw all series in one chart of (width, height) px.
+
+    ``marks`` are labels of vertical lines and their x.
     """
-    return "".join(
-        c if c.isprintable() and (c < "\u0530" or "\u2010" <= c < "\u2300") else "?"
-        for c in text
-    )
+    figure, (axes,) = new_chart(size)
+    for line in series:
+        points = np.isfinite(np.asarray(line.y, np.float64)).sum()
+        axes.plot(
+            line.x, line.y, label=plain(line.label), marker="o" if points == 1 else "",
+            linewidth=0.8 if line.faint else 1.6, alpha=0.45 if line.faint else 1,
+        )  # fmt: skip
+    for label, x in (marks or {}).items():
+        axes.axvline(x, color="gray", linewidth=0.8, zorder=1)
+        place = {"transform": axes.get_xaxis_transform(), "rotation": 90}
+        axes.text(x, 0.02, plain(label), fontsize=8, **place)
+    axes.margins(x=0.01)
+    axes.ticklabel_format(useOffset=False)
+    axes.set(title=plain(title), xlabel=plain(x_label))
+    if series:
+        columns = max(1, size[0] // 180)
+        figure.legend(loc="outside lower center", ncols=columns, frameon=False)
+    return figure
+
+
+def histograms(gaussians: Gaussians, *, title: str = "") -> np.ndarray:
+    """Return the pixels [H, W, 3] uint8 of `histograms_figure`."""
+    return figure_pixels(histograms_figure(gaussians, title=title))
+
+
+def histograms_figure(gaussians: Gaussians, *, title: str = "") -> Figure:
+    """Draw three histograms of the active Gaussians, one below the other.
+
+    They show the opacity, the scales in world units by length of the axis, and the
+    ratio of the longest to the shortest scale. The last two have logarithmic axes from
+    the 0.1 % to the 99.9 % quantile; labels count the values that are not shown.
+    """
+    active = np.asarray(gaussians.active)
+    opacity = expit(np.asarray(gaussians.params.logit_opacities, np.float64)[active])
+    logs = np.asarray(gaussians.params.log_scales, np.float64)[active]
+    logs = np.sort(logs / np.log(10), axis=1)
+    with np.errstate(invalid="ignore"):
+        ratio = logs[:, 2] - logs[:, 0]
+    names = ("shortest axis", "middle axis", "longest axis")
+    figure, axes = new_chart((720, 900), rows=3)
+    _histogram(axes[0], "opacity", {"": opacity}, (0.0, 1.0))
+    _histogram(axes[1], "scale, world units", dict(zip(names, logs.T)))
+    _histogram(axes[2], "longest / shortest axis", {"": ratio})
+    count = f"{active.sum():,} Gaussians"
+    axes[0].set_title(f"{plain(title)}: {count}" if title else count)
+    axes[1].legend(frameon=False)
+    return figure
+
+
+def _histogram(
+    axes: Axes,
+    label: str,
+    groups: Mapping[str, np.ndarray],
+    bounds: tuple[float, float] | None = None,
+) -> None:
+    """Draw counts of each group; without ``bounds``, values are log10."""
+    every = np.concatenate(list(groups.values()))
+    finite = every[np.abs(every) < _DECADES]
+    low, high = bounds or (-1.0, 0.0)
+    if bounds is None and len(finite):
+        # The nearest values that exist: all of fewer than a thousand are shown.
+        low = np.quantile(finite, _TAIL, method="lower") - 0.1
+        high = np.quantile(finite, 1 - _TAIL, method="higher") + 0.1
+    edges = np.linspace(low, high, 61)
+    shown, hidden = (edges if bounds else 10**edges), len(every)
+    for name, values in groups.items():
+        counts, _ = np.histogram(values, edges)
+        hidden -= counts.sum()
+        axes.stairs(counts, shown, label=name)
+    axes.set_xscale("linear" if bounds else "log")
+    axes.set_xlim(shown[0], shown[-1])
+    axes.set_xlabel(f"{label} ({hidden:,} not shown)" if hidden else label)
+    axes.set_ylabel("count")

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.plots.curves import Mark, Series, curves_png
+from gsjax.io import images
+from gsjax.plots.figures import Series, curves
 from gsjax.runtime.files import append_to_file, finite_or_none, read_bytes, write_file
 
 _REQUIRED = ("step", "seconds", "gaussians")
@@ -144,23 +145,21 @@ def plot_curves(
         points = [[r["step"] for r in held_out], [r["psnr"] for r in held_out]]
         series.append(Series("held out", *np.asarray(points, float)))
     gaussians = int(metrics[-1]["gaussians"]) if metrics else 0
-    curves_png(
-        path,
+    plot = curves(
         series,
         title="PSNR in training, dB",
         x_label=f"step ({gaussians:,} Gaussians after the last)",
         marks=_size_changes(metrics),
     )
+    write_file(path, images.encode_png(plot))
 
 
-def _size_changes(metrics: Sequence[dict[str, Any]]) -> list[Mark]:
-    """Return the first step of each image size; [] if there is only one size."""
-    marks: list[Mark] = []
+def _size_changes(metrics: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Return the first step of each image size; empty if there is only one size."""
+    marks: dict[str, float] = {}
     for record in metrics:
         divisor = record.get("divisor")
-        if type(divisor) is not int:  # older runs lack it
-            continue
-        label = "full size" if divisor == 1 else f"1/{divisor} of the size"
-        if not marks or marks[-1].label != label:
-            marks.append(Mark(label, record["step"]))
-    return marks if len(marks) > 1 else []
+        if type(divisor) is int:  # older runs lack it
+            label = "full size" if divisor == 1 else f"1/{divisor} of the size"
+            marks.setdefault(label, record["step"])
+    return marks if len(marks) > 1 else {}

@@ -17,15 +17,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from gsjax.cameras.camera import Camera
 from gsjax.errors import InputError, MissingExtraError
-from gsjax.gaussians import Gaussians
+from gsjax.gaussians import Gaussians, has_values
 from gsjax.io.movies import write_movie
 from gsjax.plots import previews
-from gsjax.plots.contact_sheets import Cell, SheetRow, comparison, display_pixels
-from gsjax.plots.curves import Series, curves
+from gsjax.plots.contact_sheets import (
+    Cell,
+    SheetRow,
+    cell_grid,
+    comparison,
+    depth_cell,
+    display_pixels,
+)
+from gsjax.plots.figures import Series, curves
 from gsjax.raster.exact import render_exact
 from gsjax.raster.types import RasterConfig, Render
 from gsjax.runtime.settings import whole
@@ -63,28 +69,22 @@ def picture(
     cells = [cell for value in values for cell in _cells(value)]
     if captions is not None:
         if len(captions) != len(cells):
-            raise InputError(
-                f"captions: expected {len(cells)}, one for each picture, got "
-                f"{len(captions)}; pass None for none"
-            )
+            expected = f"expected {len(cells)}, one for each picture"
+            got = f"got {len(captions)}; pass None for none"
+            raise InputError(f"captions: {expected}, {got}")
         cells = [cell._replace(caption=text) for cell, text in zip(cells, captions)]
-    if not cells:
-        raise InputError("picture: expected at least one picture, got none")
     if zoom > 1:
-        cells = [c._replace(pixels=previews.enlarge(c.pixels, zoom)) for c in cells]
+        cells = [
+            c._replace(pixels=c.pixels.repeat(zoom, 0).repeat(zoom, 1)) for c in cells
+        ]
     if len(cells) == 1 and not cells[0].caption:
         return Picture(cells[0].pixels)
-    return Picture(previews.cell_sheet(cells, columns, _MAX_WIDTH))
+    return Picture(cell_grid(cells, columns, _MAX_WIDTH))
 
 
-def show(
-    *values,
-    captions: Sequence[str] | None = None,
-    columns: int | None = None,
-    zoom: int = 1,
-) -> None:
+def show(*values, **options) -> None:
     """Display the `picture` of the same arguments."""
-    _display(picture(*values, captions=captions, columns=columns, zoom=zoom))
+    _display(picture(*values, **options))
 
 
 def save_png(path: str | PathLike[str], *values, **options) -> None:
@@ -117,21 +117,21 @@ def movie(
     """
     if kind not in MIME_TYPES:
         raise InputError(f"kind: expected one of {', '.join(MIME_TYPES)}, got {kind!r}")
-    size = (0, 0)
+    shape = (0, 0, 3)
 
     def pictures():
-        nonlocal size
+        nonlocal shape
         for frame in frames:
             pixels = picture(frame).pixels
-            size = pixels.shape[1], pixels.shape[0]
+            shape = pixels.shape
             yield pixels
 
     with tempfile.TemporaryDirectory(prefix="gsjax-") as folder:
         path = Path(folder) / f"movie.{kind}"
         count = write_movie(path, pictures(), fps=fps)
         data = path.read_bytes()
-    zoom = width / size[0] if width else max(1, MIN_SIZE // max(size))
-    return Movie(data, kind, count, (round(zoom * size[0]), round(zoom * size[1])))
+    zoom = width / shape[1] if width else max(1, MIN_SIZE // max(shape))
+    return Movie(data, kind, count, (round(zoom * shape[1]), round(zoom * shape[0])))
 
 
 def live(
@@ -182,7 +182,7 @@ def live(
         title = f"PSNR, dB; {int(metrics.gaussians):,} Gaussians"
         size = (max(preview.shape[1], 400), 300)
         plot = curves(_lines(steps), title=title, size=size)
-        drawn = Picture(previews.stack_pictures([preview, plot]))
+        drawn = Picture(cell_grid([Cell(preview), Cell(plot)], columns=1))
         if handle is None:
             handle = _display(drawn, display_id=True)
         else:
@@ -209,9 +209,8 @@ def _preview(view: Render, photo: np.ndarray | None, name: str) -> np.ndarray:
         rgb = np.clip(rgb, 0, 1)
         row = SheetRow("photograph", photo, rgb, depth, rendered=f"{name},")
         return comparison([row], width=width)
-    found = previews.depth_cell(depth)
-    cells = [Cell(display_pixels(rgb), name), found]
-    return previews.cell_sheet(cells, None, _MAX_WIDTH)
+    cells = [Cell(display_pixels(rgb), name), depth_cell(depth)]
+    return cell_grid(cells, max_width=_MAX_WIDTH)
 
 
 def _display(value, **options):
@@ -221,9 +220,6 @@ def _display(value, **options):
     except ImportError as error:
         raise MissingExtraError("IPython is missing: pip install ipython") from error
     return display(value, **options)
-
-
-# --- display methods ---
 
 
 def _cells(value) -> list[Cell]:
@@ -240,10 +236,8 @@ def _cells(value) -> list[Cell]:
         return [cell for one in value for cell in _cells(one)]
     array = np.asarray(value)
     if array.dtype.kind not in "buif":
-        raise InputError(
-            "picture: expected arrays, a Render or Gaussians, got "
-            f"{type(value).__name__}; pass the image itself"
-        )
+        got = f"{type(value).__name__}; pass the image itself"
+        raise InputError(f"picture: expected arrays, a Render or Gaussians, got {got}")
     if array.ndim == 4 or (array.ndim == 3 and array.shape[-1] != 3):
         return [Cell(display_pixels(one)) for one in array]
     return [Cell(display_pixels(array))]
@@ -253,13 +247,7 @@ def _concrete(value) -> bool:
     """Return True if the leaves of a pytree are arrays whose values can be read now."""
     leaves = jax.tree.leaves(value)
     return bool(leaves) and all(
-        isinstance(leaf, np.ndarray)
-        or (
-            isinstance(leaf, jax.Array)
-            and not isinstance(leaf, Tracer)
-            and not leaf.is_deleted()  # donated to a step
-        )
-        for leaf in leaves
+        isinstance(leaf, np.ndarray) or has_values(leaf) for leaf in leaves
     )
 
 
@@ -282,12 +270,9 @@ def _html(camera: Camera) -> str | None:
     first = jax.tree.map(lambda a: np.asarray(a)[0] if camera.batched else a, camera)
     viewmat, K = np.asarray(first.viewmat), np.asarray(first.K)
     if camera.lens.name == "pinhole":
-        angles = [
-            np.degrees(
-                np.arctan((side - K[i, 2]) / K[i, i]) + np.arctan(K[i, 2] / K[i, i])
-            )
-            for i, side in enumerate((camera.width, camera.height))
-        ]
+        focal, centre = np.diag(K)[:2], K[:2, 2]
+        rest = np.array([camera.width, camera.height]) - centre
+        angles = np.degrees(np.arctan(rest / focal) + np.arctan(centre / focal))
         facts.append(f"{angles[0]:.1f}° × {angles[1]:.1f}°")
     place = ", ".join(f"{x:.3g}" for x in -viewmat[:3, :3].T @ viewmat[:3, 3] + 0.0)
     ahead = ", ".join(f"{x + 0:.2f}" for x in viewmat[2, :3])

@@ -10,8 +10,13 @@ from conftest import frustum_points, gaussians_at
 
 import gsjax
 from gsjax.cli.main import main
-from gsjax.plots.curves import Mark, Series, curves, curves_figure, curves_png
-from gsjax.plots.histograms import histograms, histograms_figure
+from gsjax.plots.figures import (
+    Series,
+    curves,
+    curves_figure,
+    histograms,
+    histograms_figure,
+)
 from gsjax.runs import history
 
 
@@ -30,62 +35,33 @@ def test_importing_gsjax_does_not_load_matplotlib():
 def test_series_and_marks_reach_the_figure():
     x = np.arange(100.0)
     y = np.where((x > 40) & (x < 60), np.nan, 3 * x)
-    marks = [Mark("1/2 of the size", 7), Mark("full size", 50), Mark("beyond", 500)]
     lines = [Series("up", x, y), Series("inf", x, np.full(100, np.inf), faint=True)]
-    (axes,) = curves_figure(lines, title="$a_b$ 日", marks=marks).axes
+    (axes,) = curves_figure(lines, marks={"half the size": 7, "full size": 50}).axes
     up, infinite, first, second = axes.lines
     np.testing.assert_array_equal(up.get_xydata(), np.stack([x, y], 1))
-    assert np.isnan(infinite.get_ydata()).all()
+    assert not np.isfinite(infinite.get_ydata()).any()
     assert [line.get_xdata()[0] for line in (first, second)] == [7, 50]
-    assert [text.get_text() for text in axes.texts] == ["1/2 of the size", "full size"]
-    assert axes.get_title(loc="left") == "$a_b$ ?"
+    assert [text.get_text() for text in axes.texts] == ["half the size", "full size"]
 
 
-def test_a_logarithmic_axis_leaves_out_values_of_zero_and_below():
-    line = Series("a", [-1.0, 0.0, 1.0, 100.0], [5.0, 6.0, 7.0, 8.0])
-    (axes,) = curves_figure([line], log_x=True).axes
-    assert axes.get_xscale() == "log"
-    np.testing.assert_array_equal(
-        axes.lines[0].get_xdata(), [np.nan, np.nan, 1.0, 100.0]
-    )
-
-
-def test_a_small_range_is_drawn_small():
-    line = Series("a", [0, 1], [3, 3.01])
-    (axes,) = curves_figure([line], min_y_span=0.5).axes
-    assert np.ptp(axes.get_ylim()) == pytest.approx(0.5)
-    assert np.mean(axes.get_ylim()) == pytest.approx(3.005)
-
-
-@pytest.mark.parametrize("log_x", [False, True])
 @pytest.mark.parametrize(
     "series",
     [
         [],
         [Series("none", [], [])],
         [Series("nan", [0, 1], [np.nan, np.inf])],
-        [Series("one", [5], [7])],
+        [Series("one $point_$ 日", [5], [7])],
         [Series("flat", [0, 1, 2], [0, 0, 0])],
         [Series("huge", [0, 1e9], [-1e30, 1e30]), Series("tiny", [3, 3], [1e-30, 0])],
-        [Series("largest", [0, 1], [-1.7e308, 1.7e308])],
         [Series(f"line {i}", range(9), np.arange(9) * i) for i in range(12)],
     ],
     ids=lambda series: series[0].label if series else "empty",
 )
-def test_any_series_give_a_picture(series, log_x):
-    plot = curves(series, title="title ×", size=(301, 203), log_x=log_x)
+def test_any_series_give_a_picture(series):
+    plot = curves(series, title="title ×", size=(301, 203))
     assert plot.shape == (203, 301, 3)
     assert plot.dtype == np.uint8
     assert (plot < 128).any()
-
-
-def test_curves_png_and_its_errors(tmp_path):
-    curves_png(tmp_path / "a.png", [Series("a", [0, 1], [1, 2])], title="a")
-    assert cv2.imread(str(tmp_path / "a.png")).shape == (420, 720, 3)
-    with pytest.raises(gsjax.InputError, match=r"a: .* got \(1,\) and \(2,\)"):
-        curves([Series("a", [0], [1, 2])])
-    with pytest.raises(gsjax.InputError, match="at least 200"):
-        curves([], size=(100, 100))
 
 
 @pytest.mark.parametrize("divisors", [[4, 4, 2, 1, 1], [1, 1], [None, None]])
@@ -98,46 +74,37 @@ def test_the_curves_of_a_run_are_a_png(divisors, tmp_path):
     assert cv2.imread(str(tmp_path / "a.png")).shape == (420, 720, 3)
 
 
-def counts(axes):
-    """Edges and counts of each group of a histogram."""
-    return [(p.get_data().edges, p.get_data().values) for p in axes.patches]
-
-
 def test_histograms_count_the_values():
     axes = histograms_figure(scene((0.02, 0.1, 0.5), 0.9), title="a").axes
-    wanted = [[0.9], [0.02, 0.1, 0.5], [25.0]]
-    for each, values in zip(axes, wanted):
-        for (edges, found), value in zip(counts(each), values, strict=True):
-            (index,) = np.flatnonzero(found)
-            assert found[index] == 64
+    for each, values in zip(axes, [[0.9], [0.02, 0.1, 0.5], [25.0]]):
+        for patch, value in zip(each.patches, values, strict=True):
+            counts, edges, _ = patch.get_data()
+            (index,) = np.flatnonzero(counts)
+            assert counts[index] == 64
             assert edges[index] <= value * 1.0001
             assert value <= edges[index + 1] * 1.0001
     assert [each.get_xscale() for each in axes] == ["linear", "log", "log"]
 
 
-@pytest.mark.parametrize(("count", "low", "high"), [(4000, 2, 1), (300, 1, 1)])
-def test_outliers_do_not_set_the_axes_and_are_counted(count, low, high):
+@pytest.mark.parametrize(("count", "hidden"), [(4000, 4), (300, 1)])
+def test_outliers_do_not_set_the_axes_and_are_counted(count, hidden):
     """One value in a thousand at either end is left out, and the label says so."""
     scales = np.full((count, 3), 0.02)
-    scales[:low, 0], scales[low : low + high, 0] = 1e-9, 1e7
+    scales[:2, 0], scales[2, 0] = 1e-9, 1e7
     broken = scene(scales, count=count)
     logs = broken.params.log_scales.at[-1, 0].set(np.nan)
     broken = broken.replace(params=broken.params.replace(log_scales=logs))
     axes = histograms_figure(broken).axes[1]
-    if count < 1000:
-        assert axes.get_xlim()[0] <= 1e-9
-        assert axes.get_xlim()[1] >= 1e7
-        assert axes.get_xlabel() == "scale, world units (1 not finite)"
-        return
-    np.testing.assert_allclose(axes.get_xlim(), (1e-2, 1e-1))
-    told = f"({low} below, {high} above, 1 not finite)"
-    assert axes.get_xlabel() == f"scale, world units {told}"
+    low, high = axes.get_xlim()
+    assert (low <= 1e-9 and high >= 1e7) == (count < 1000)
+    assert low < 0.02 < high
+    assert axes.get_xlabel() == f"scale, world units ({hidden} not shown)"
 
 
 def test_any_scene_gives_histograms():
     good = scene()
     logs = good.params.log_scales.at[:9].set(np.nan).at[10:13].set(1e30)
-    logits = good.params.logit_opacities.at[3].set(np.inf)
+    logits = good.params.logit_opacities.at[3].set(np.inf).at[4].set(np.nan)
     broken = good.params.replace(log_scales=logs, logit_opacities=logits)
     empty = good.replace(active=np.zeros(64, bool))
     for each in (good.replace(params=broken), empty):
