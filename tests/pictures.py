@@ -1,5 +1,6 @@
-"""Pictures of the catalogue's scenes, and how two of them are compared."""
+"""Images of the scenes of the catalogue, and comparisons of two of them."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from conftest import ALL, BACKGROUND, WHOLE, assert_not_empty, cast, render
@@ -33,7 +34,10 @@ def largest_difference(first, second):
 
 
 def errors_of(out, wanted, band):
-    """Largest error of each output outside the band, depths relative to 1 or more."""
+    """Return the largest error of each output, and all errors, outside the band.
+
+    Errors of depths above 1 are relative.
+    """
     clear = np.asarray(wanted["margin"]) > band
     assert clear.mean() > 0.97
     errors = {}
@@ -45,3 +49,13 @@ def errors_of(out, wanted, band):
             error = error / np.maximum(1, np.abs(target))
         errors[name] = error.reshape(*clear.shape, -1).max(-1)[clear]
     return {name: error.max() for name, error in errors.items()}, errors
+
+
+def assert_close(report, name, found, wanted, bar, least=1e-30):
+    """Compare the leaves of two trees in the L2 norm, relative to ``least`` or more."""
+    pairs = zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True)
+    for a, b in pairs:
+        assert np.isfinite(a).all(), name
+        error = np.linalg.norm(a - b) / max(np.linalg.norm(b), least)
+        report(f"{name}, {np.shape(b)}", error, bar)
+        assert error <= bar, (name, np.shape(b))

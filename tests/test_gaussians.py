@@ -97,3 +97,60 @@ def test_other_types_are_named(row):
     ):
         with pytest.raises(gsjax.InputError, match=rf"expected Gaussians, {message}"):
             call(wrong)
+
+
+GOOD = {
+    "means": np.zeros((4, 3)),
+    "quats": np.ones((4, 4)),
+    "log_scales": np.zeros((4, 3)),
+    "logit_opacities": np.zeros(4),
+    "sh": np.zeros((4, 1, 3)),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "named"),
+    [
+        ("means", np.zeros((4, 2)), "means"),
+        ("means", np.zeros(4), "means"),
+        ("means", np.zeros((5, 3)), "quats"),  # the others are one short
+        ("means", np.zeros((4, 3), complex), "means"),
+        ("quats", np.zeros((4, 3)), "quats"),
+        ("log_scales", np.zeros((4, 1)), "log_scales"),
+        ("logit_opacities", np.zeros((4, 2)), "logit_opacities"),
+        ("sh", np.zeros((4, 3)), "sh"),
+        ("sh", np.zeros((3, 1, 3)), "sh"),
+        ("sh", np.zeros((4, 5, 3)), "5"),
+        *(("capacity", v, "capacity") for v in (3, 100.5, "100", True)),
+    ],
+    ids=str,
+)
+def test_gaussians_are_checked(name, value, named):
+    with pytest.raises(gsjax.InputError, match=named):
+        gsjax.make_gaussians(**{**GOOD, name: value})
+
+
+def test_opacities_may_be_a_column_and_scenes_empty():
+    column = {**GOOD, "logit_opacities": np.arange(4.0)[:, None]}
+    flat = gsjax.make_gaussians(**column).params.logit_opacities
+    np.testing.assert_array_equal(flat, np.arange(4.0))
+    none = gsjax.make_gaussians(**{name: array[:0] for name, array in GOOD.items()})
+    assert none.capacity == 1
+    assert gsjax.num_active(none) == 0
+
+
+def test_slots_are_checked():
+    gaussians, count = scene(), 5
+    for keep in (np.ones((count, 1), bool), np.ones(1, bool), np.ones(count, int)):
+        with pytest.raises(gsjax.InputError, match="keep"):
+            gsjax.select(gaussians, keep)
+    for degree in (-1, 5):
+        with pytest.raises(gsjax.InputError, match="0 to 4"):
+            gsjax.with_sh_degree(gaussians, degree)
+    unseen = gsjax.select(gaussians, np.zeros(count, bool))
+    for change in (gsjax.compact, gsjax.grow):
+        for capacity in (0, -1, 100.5):
+            with pytest.raises(gsjax.InputError, match="capacity"):
+                change(unseen, capacity)
+    assert gsjax.compact(unseen, 1).capacity == 1
+    assert gsjax.grow(gaussians, np.int64(count + 1)).capacity == count + 1
