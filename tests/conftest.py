@@ -1,8 +1,7 @@
 """Set-up of all tests: float64, two CPU devices, small scenes, shared compilations.
 
 Compiling dominates the run time. So the scenes of the catalogue share one number of
-Gaussians and one image size, tests share jitted functions, XLA optimises little, and
-compiled programs are cached on disk for all processes of a run.
+Gaussians and one image size, tests share jitted functions, and XLA optimises little.
 """
 
 import gc
@@ -48,9 +47,6 @@ def _set_up_environment():
         "XDG_CACHE_HOME": folder.name,
         "XLA_FLAGS": " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip(),
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-        "JAX_COMPILATION_CACHE_DIR": f"{folder.name}/programs",
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2",
-        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0",
     }
     return folder
 
