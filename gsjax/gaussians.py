@@ -16,7 +16,7 @@ from gsjax.errors import InputError
 from gsjax.math import sh as sh_lib
 from gsjax.math.numerics import exp_log_scale, real_floats
 from gsjax.runtime.devices import place
-from gsjax.runtime.settings import whole
+from gsjax.runtime.settings import as_int
 
 Array = jax.Array
 
@@ -66,7 +66,7 @@ class Gaussians:
         try:
             *batch, slots = self.active.shape
             told = [f"batch={tuple(batch)}"] * bool(batch)
-            if isinstance(self.active, np.ndarray) or _has_values(self.active):
+            if isinstance(self.active, np.ndarray) or has_values(self.active):
                 count = np.count_nonzero(np.asarray(self.active))
                 told.append(f"active={count}/{self.active.size}")
             else:
@@ -78,7 +78,11 @@ class Gaussians:
             return f"Gaussians(params={self.params!r}, active={self.active!r})"
 
 
-def _has_values(array) -> bool:
+def _unexpected(where: str, expected: str, got, remedy: str) -> InputError:
+    return InputError(f"{where}: expected {expected}, got {got}; {remedy}")
+
+
+def has_values(array) -> bool:
     """Return True for an array of JAX whose values can be read now."""
     return (
         isinstance(array, jax.Array)
@@ -89,11 +93,7 @@ def _has_values(array) -> bool:
 
 
 def check_gaussians(value, argument: str = "gaussians") -> None:
-    """Check the type of an argument.
-
-    Raises:
-      InputError: if ``value`` is not `Gaussians`; names the type found and a remedy.
-    """
+    """Raise `InputError` if an argument is not `Gaussians`; names type and remedy."""
     if isinstance(value, Gaussians):
         return
     remedy = "make them with gsjax.make_gaussians, or read them with gsjax.load"
@@ -105,9 +105,7 @@ def check_gaussians(value, argument: str = "gaussians") -> None:
         remedy = "call gsjax.Gaussians(params=params, active=mask)"
     elif isinstance(value, str) or hasattr(value, "__fspath__"):
         remedy = "call gsjax.load(path)"
-    raise InputError(
-        f"{argument}: expected Gaussians, got {type(value).__name__}; {remedy}"
-    )
+    raise _unexpected(argument, "Gaussians", type(value).__name__, remedy)
 
 
 # Contents of an unused slot: a unit quaternion, and an opacity of e^-20.
@@ -156,17 +154,13 @@ def make_gaussians(
     }
     for name, shape in expected.items():
         if arrays[name].shape != shape:
-            raise InputError(
-                f"{name}: expected shape {shape}, got {arrays[name].shape}; the first "
-                "axis of means sets the number of Gaussians"
-            )
+            got = f"{arrays[name].shape}; the first axis of means sets the number"
+            raise InputError(f"{name}: expected shape {shape}, got {got} of Gaussians")
     sh_lib.degree_of(arrays["sh"].shape[1])
-    slots = max(count, 1) if capacity is None else whole("capacity", capacity)
+    slots = max(count, 1) if capacity is None else as_int("capacity", capacity)
     if slots < max(count, 1):
-        raise InputError(
-            f"capacity: expected at least {max(count, 1)} for {count} Gaussians, got "
-            f"{capacity}; pass a larger number, or None"
-        )
+        expected = f"at least {max(count, 1)} for {count} Gaussians"
+        raise _unexpected("capacity", expected, capacity, "pass more, or None")
     padded = {
         name: _padded(array, slots - count, _EMPTY.get(name, 0.0))
         for name, array in arrays.items()
@@ -200,12 +194,10 @@ def capacity_bucket(count: int, minimum: int = 1024) -> int:
     Raises:
       InputError: if ``minimum`` is not a bucket.
     """
-    size = whole("minimum", minimum)
+    size = as_int("minimum", minimum)
     if size < 1 or size // (size & -size) not in (1, 3):
-        raise InputError(
-            f"minimum: expected a bucket, 2^k or 1.5 · 2^k, got {minimum}; pass a "
-            "power of two"
-        )
+        expected = "a bucket, 2^k or 1.5 · 2^k"
+        raise _unexpected("minimum", expected, minimum, "pass a power of two")
     while size < count:
         size = size // 3 * 4 if size & (size - 1) else max(2, size * 3 // 2)
     return size
@@ -237,12 +229,11 @@ def grow(gaussians: Gaussians, capacity: int) -> Gaussians:
       InputError: if ``capacity`` is below N (see `compact`).
     """
     check_gaussians(gaussians)
-    extra = whole("capacity", capacity) - gaussians.capacity
+    extra = as_int("capacity", capacity) - gaussians.capacity
     if extra < 0:
-        raise InputError(
-            f"capacity: expected at least the present {gaussians.capacity}, got "
-            f"{capacity}; use compact(gaussians, capacity) to shrink"
-        )
+        expected = f"at least the present {gaussians.capacity}"
+        remedy = "use compact(gaussians, capacity) to shrink"
+        raise _unexpected("capacity", expected, capacity, remedy)
     if extra == 0:
         return gaussians
     return concatenate(gaussians, empty_like(gaussians, extra))
@@ -270,10 +261,9 @@ def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
     check_gaussians(first, "first")
     check_gaussians(second, "second")
     if first.sh_degree != second.sh_degree:
-        raise InputError(
-            f"concatenate: expected equal SH degrees, got {first.sh_degree} and "
-            f"{second.sh_degree}; change one with with_sh_degree"
-        )
+        got = f"{first.sh_degree} and {second.sh_degree}"
+        remedy = "change one with with_sh_degree"
+        raise _unexpected("concatenate", "equal SH degrees", got, remedy)
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
 
 
@@ -290,10 +280,8 @@ def select(gaussians: Gaussians, keep: Array) -> Gaussians:
     check_gaussians(gaussians)
     keep = jnp.asarray(keep)
     if keep.shape != gaussians.active.shape or keep.dtype != bool:
-        raise InputError(
-            f"keep: expected bool {gaussians.active.shape}, got {keep.dtype} "
-            f"{keep.shape}; pass one flag for each slot"
-        )
+        expected, got = f"bool {gaussians.active.shape}", f"{keep.dtype} {keep.shape}"
+        raise _unexpected("keep", expected, got, "pass one flag for each slot")
     return gaussians.replace(active=gaussians.active & keep)  # pyright: ignore
 
 
@@ -311,15 +299,14 @@ def compact(gaussians: Gaussians, capacity: int | None = None) -> Gaussians:
       InputError: if ``capacity`` is below 1, or outside jit if more are active.
     """
     check_gaussians(gaussians)
-    capacity = whole("capacity", gaussians.capacity if capacity is None else capacity)
+    capacity = as_int("capacity", gaussians.capacity if capacity is None else capacity)
     active, least = gaussians.active, 1
     if not isinstance(active, Tracer):
         least = max(1, int(np.sum(np.asarray(active))))
     if capacity < least:
-        raise InputError(
-            f"capacity: expected at least {least} for the active Gaussians, got "
-            f"{capacity}; pass a larger number, or deactivate some with select"
-        )
+        expected = f"at least {least} for the active Gaussians"
+        remedy = "pass a larger number, or deactivate some with select"
+        raise _unexpected("capacity", expected, capacity, remedy)
     order = jnp.argsort(~active, stable=True)[:capacity]
     packed = jax.tree.map(lambda a: a[order], gaussians)
     return packed if capacity <= gaussians.capacity else grow(packed, capacity)
@@ -336,11 +323,10 @@ def with_sh_degree(gaussians: Gaussians, degree: int) -> Gaussians:
       InputError: if ``degree`` is out of range.
     """
     check_gaussians(gaussians)
-    degree = whole("degree", degree)
+    degree = as_int("degree", degree)
     if not 0 <= degree <= sh_lib.MAX_DEGREE:
-        raise InputError(
-            f"degree: expected 0 to {sh_lib.MAX_DEGREE}, got {degree}; pass one of them"
-        )
+        expected = f"0 to {sh_lib.MAX_DEGREE}"
+        raise _unexpected("degree", expected, degree, "pass one of them")
     sh = gaussians.params.sh
     bases = sh_lib.num_bases(degree)
     extra = max(0, bases - sh.shape[1])

@@ -19,7 +19,7 @@ from gsjax.cameras.shutter import GLOBAL, Shutter
 from gsjax.errors import InputError
 from gsjax.math.numerics import real_floats
 from gsjax.runtime.devices import place
-from gsjax.runtime.settings import whole
+from gsjax.runtime.settings import as_int
 
 # Default near plane, in world units.
 NEAR = 0.01
@@ -186,7 +186,7 @@ def _broadcast(value: Array | np.ndarray, shape: tuple[int, ...]):
 def _whole_size(width, height) -> tuple[int, int]:
     message = f"image size: expected whole numbers ≥ 1, got {width} × {height}"
     try:
-        size = whole("width", width), whole("height", height)
+        size = as_int("width", width), as_int("height", height)
     except InputError as error:
         raise InputError(message) from error
     if min(size) < 1:

@@ -6,7 +6,7 @@ from pathlib import PurePosixPath
 
 from gsjax.data.types import View, unexpected
 from gsjax.errors import InputError
-from gsjax.runtime.settings import whole
+from gsjax.runtime.settings import as_int
 
 _EVERY = 8
 
@@ -32,10 +32,8 @@ def split_views(
         there is no view, or no view is left to train with.
     """
     if not views:
-        raise InputError(
-            "views: expected at least one to split, got none; pass a dataset's"
-        )
-    every = None if every is None else whole("every", every)
+        raise unexpected("views", "at least one to split", "none", "pass a dataset's")
+    every = None if every is None else as_int("every", every)
     if every is not None and every < 0:
         raise unexpected("every", "0 (no test views) or more", every, "pass 8")
     if test_names:

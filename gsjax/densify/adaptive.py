@@ -19,7 +19,7 @@ from gsjax.densify.types import Observation, SlotEdit, Strategy
 from gsjax.gaussians import Gaussians
 from gsjax.math.numerics import exp_log_scale, logit
 from gsjax.math.rotations import quaternion_to_matrix
-from gsjax.runtime.settings import require_ranges, settle
+from gsjax.runtime.settings import convert_fields, require_ranges
 
 Array = jax.Array
 
@@ -85,20 +85,19 @@ class AdaptiveSettings:
     initial_scale: float = 1.0
 
     def __post_init__(self):
-        settle(self)
-        checks = {
-            "start": self.start >= 0,
-            "every": self.every >= 1,
-            "threshold": self.threshold > 0,
-            "shrink": self.shrink > 0,
-            "prune_opacity": 0 <= self.prune_opacity < 1,
-            "reset_every": self.reset_every >= 0,
-            "reset_opacity": 0 < self.reset_opacity < 1,
-            "opacity_penalty": self.opacity_penalty >= 0,
-            "scale_penalty": self.scale_penalty >= 0,
-            "max_gaussians": self.max_gaussians >= 1,
-        }
-        require_ranges(self, checks)
+        convert_fields(self)
+        require_ranges(self, {
+            "start": "[0, inf)",
+            "every": "[1, inf)",
+            "threshold": "(0, inf)",
+            "shrink": "(0, inf)",
+            "prune_opacity": "[0, 1)",
+            "reset_every": "[0, inf)",
+            "reset_opacity": "(0, 1)",
+            "opacity_penalty": "[0, inf)",
+            "scale_penalty": "[0, inf)",
+            "max_gaussians": "[1, inf)",
+        })  # fmt: skip
 
     @property
     def schedule(self) -> EditSchedule:
@@ -131,20 +130,17 @@ def adaptive(settings: AdaptiveSettings, extent: float) -> Strategy:
     """
 
     def init(gaussians: Gaussians) -> AdaptiveStats:
-        def zeros():  # distinct arrays: a buffer can be donated only once
-            return jnp.zeros(gaussians.capacity, gaussians.params.means.dtype)
-
-        return AdaptiveStats(zeros(), zeros(), zeros())
+        shape, dtype = gaussians.capacity, gaussians.params.means.dtype
+        # Distinct arrays: a buffer can be donated only once.
+        return AdaptiveStats(*(jnp.zeros(shape, dtype) for _ in range(3)))
 
     def observe(stats: AdaptiveStats, observation: Observation) -> AdaptiveStats:
-        gradient, radii = observation.gradient, observation.radii
-        sides = observation.width, observation.height
+        gradient, radii, *sides = observation
         size = jnp.stack([jnp.atleast_1d(side) for side in sides], -1)
         size = size[:, None]  # [B or 1, 1, 2]
         norm = jnp.linalg.norm(gradient * (size / 2).astype(gradient.dtype), axis=-1)
         visible = radii > 0
-        longer = jnp.max(size, -1).astype(radii.dtype)
-        share = jnp.max(radii / longer, 0)
+        share = jnp.max(radii / jnp.max(size, -1).astype(radii.dtype), 0)
         updated = AdaptiveStats(
             gradient=stats.gradient + jnp.sum(jnp.where(visible, norm, 0), 0),
             views=stats.views + jnp.sum(visible, 0),
@@ -174,13 +170,9 @@ def adaptive(settings: AdaptiveSettings, extent: float) -> Strategy:
 
 
 def _densify(
-    settings: AdaptiveSettings,
-    extent: float,
-    key: Array,
-    step: Array,
-    gaussians: Gaussians,
-    stats: AdaptiveStats,
-) -> SlotEdit:
+    settings: AdaptiveSettings, extent: float, key: Array, step: Array,
+    gaussians: Gaussians, stats: AdaptiveStats,
+) -> SlotEdit:  # fmt: skip
     """Plan which Gaussians are cloned, split and removed."""
     params, active = gaussians.params, gaussians.active
     scales = exp_log_scale(params.log_scales)
@@ -213,17 +205,18 @@ def _densify(
     rotations = quaternion_to_matrix(params.quats)
     shifts = jnp.einsum("nij,knj->kni", rotations, noise * scales, precision="highest")
     smaller = params.log_scales - jnp.log(settings.shrink)
-    halves = logit(-jnp.expm1(0.5 * jnp.log1p(-opacity)))
     revised = params.logit_opacities
     if settings.revised_opacity:
+        halves = logit(-jnp.expm1(0.5 * jnp.log1p(-opacity)))
         revised = jnp.where(split | cloned, halves, revised)
 
     def child(shift):
         wide = split[:, None]
-        means = jnp.where(wide, params.means + shift, params.means)
-        scales = jnp.where(wide, smaller, params.log_scales)
-        changes = {"means": means, "log_scales": scales, "logit_opacities": revised}
-        return params.replace(**changes)  # pyright: ignore
+        return params.replace(  # pyright: ignore
+            means=jnp.where(wide, params.means + shift, params.means),
+            log_scales=jnp.where(wide, smaller, params.log_scales),
+            logit_opacities=revised,
+        )
 
     in_place = where_slots(new.chosen, child(shifts[0]), params)
     born = new.source < active.shape[0]

@@ -21,7 +21,7 @@ from gsjax.densify.types import SlotEdit, Strategy
 from gsjax.gaussians import Gaussians
 from gsjax.math.numerics import exp_log_scale, logit
 from gsjax.math.rotations import times_covariance
-from gsjax.runtime.settings import require_ranges, settle
+from gsjax.runtime.settings import convert_fields, require_ranges
 
 Array = jax.Array
 
@@ -69,18 +69,17 @@ class McmcSettings:
     initial_scale: float = 0.1
 
     def __post_init__(self):
-        settle(self)
-        checks = {
-            "start": self.start >= 0,
-            "every": self.every >= 1,
-            "max_gaussians": self.max_gaussians >= 1,
-            "growth": self.growth >= 1,
-            "dead_opacity": 0 < self.dead_opacity < 1,
-            "noise": self.noise >= 0,
-            "opacity_penalty": self.opacity_penalty >= 0,
-            "scale_penalty": self.scale_penalty >= 0,
-        }
-        require_ranges(self, checks)
+        convert_fields(self)
+        require_ranges(self, {
+            "start": "[0, inf)",
+            "every": "[1, inf)",
+            "max_gaussians": "[1, inf)",
+            "growth": "[1, inf)",
+            "dead_opacity": "(0, 1)",
+            "noise": "[0, inf)",
+            "opacity_penalty": "[0, inf)",
+            "scale_penalty": "[0, inf)",
+        })  # fmt: skip
 
     @property
     def schedule(self) -> EditSchedule:
@@ -115,12 +114,9 @@ def mcmc(settings: McmcSettings, extent: float = USUAL_EXTENT) -> Strategy:
         chosen = free & (jnp.cumsum(free, dtype=jnp.int32) <= target - count)
         after = Gaussians(params=moved.params, active=active)  # pyright: ignore
         born = spawn(growth_key, after, chosen, active, settings)
-        edit = born._replace(
-            cleared=moved.cleared | born.cleared,
-            wanted=target,
-            source=_compose(moved.source, born.source),
-        )
-        return edit, stats
+        cleared = moved.cleared | born.cleared
+        source = _compose(moved.source, born.source)
+        return born._replace(cleared=cleared, wanted=target, source=source), stats
 
     def penalty(gaussians: Gaussians) -> Array:
         weights = settings.opacity_penalty, settings.scale_penalty
@@ -134,8 +130,7 @@ def mcmc(settings: McmcSettings, extent: float = USUAL_EXTENT) -> Strategy:
         shift = times_covariance(params.quats, exp_log_scale(params.log_scales), noise)
         # The rate may be float64 while the parameters are float32.
         strength = settings.noise / unit**2 * rate.astype(gate.dtype)
-        shift = shift * (gate * strength)[:, None]
-        moved = params.means + shift
+        moved = params.means + shift * (gate * strength)[:, None]
         good = gaussians.active[:, None] & jnp.isfinite(moved)
         means = jnp.where(good, moved, params.means)
         return params.replace(means=means)  # pyright: ignore
@@ -190,13 +185,11 @@ def spawn(
     shared = shared_opacity(opacity, copies + 1)
     factor = shared_scale(opacity, shared, copies + 1)
     shared = jnp.clip(shared, settings.dead_opacity, None)
+    wider = params.log_scales + jnp.log(factor)[:, None]
     edited = params.replace(  # pyright: ignore
         logit_opacities=jnp.where(parents, logit(shared), params.logit_opacities),
-        log_scales=jnp.where(
-            parents[:, None], params.log_scales + jnp.log(factor)[:, None],
-            params.log_scales,
-        ),
-    )  # fmt: skip
+        log_scales=jnp.where(parents[:, None], wider, params.log_scales),
+    )
     born = source < size
     return SlotEdit(
         params=copy_into(edited, source, edited),

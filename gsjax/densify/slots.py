@@ -40,17 +40,10 @@ def assign(candidates: Array, priority: Array, free: Array, limit: Array) -> Ass
     by_slot = jnp.argsort(~free, stable=True)
     given = jnp.minimum(jnp.sum(candidates), jnp.sum(free))
     taken = place < jnp.minimum(given, limit)
-    source = (
-        jnp.full(slots, slots, jnp.int32)
-        .at[jnp.where(taken, by_slot, slots)]
-        .set(by_priority.astype(jnp.int32), mode="drop")
-    )
-    chosen = (
-        jnp.zeros(slots, bool)
-        .at[jnp.where(taken, by_priority, slots)]
-        .set(True, mode="drop")
-    )
-    return Assignment(source, chosen)
+    receivers = jnp.full(slots, slots, jnp.int32).at[jnp.where(taken, by_slot, slots)]
+    source = receivers.set(by_priority.astype(jnp.int32), mode="drop")
+    givers = jnp.zeros(slots, bool).at[jnp.where(taken, by_priority, slots)]
+    return Assignment(source, givers.set(True, mode="drop"))
 
 
 def slot_mask(mask: Array, like: Array) -> Array:

@@ -1,0 +1,1 @@
+"""Functions on arrays of numbers, without scenes: `numerics`, `rotations`, `sh`."""

@@ -1,8 +1,8 @@
-"""Guarded elementary functions: every singularity of the library lives here.
+"""Guarded elementary functions; all singularities of the library are handled here.
 
-Each function is finite, with finite derivatives, for every input it documents; the
-input as well as the output is guarded (double ``where``), because a ``where`` on
-the output alone still multiplies an infinite derivative by zero.
+Each function is finite, with finite derivatives, for every input it documents. Inputs
+and outputs are both guarded (double ``where``): a ``where`` on the output alone still
+multiplies an infinite derivative by zero.
 """
 
 import jax
@@ -14,14 +14,13 @@ from gsjax.runtime.devices import on_cpu
 
 Array = jax.Array
 
-# Range of log scales that the projection can square in float32 without overflow
-# (e^20 = 4.9e8) or loss to denormals (e^-40, squared 1.8e-35). Values beyond are
-# clipped, not culled: a finite Gaussian stays visible.
+# Log scales that the projection can square in float32 without overflow (e^20 = 4.9e8)
+# or denormals (e^-40, squared 1.8e-35). Values beyond are clipped, not culled.
 LOG_SCALE_RANGE = (-40.0, 20.0)
 
 
 def in_float64(tree):
-    """The same pytree with its floats in float64; within ``jax.enable_x64(True)``."""
+    """Convert the floats of a pytree to float64; within ``jax.enable_x64(True)``."""
 
     def one(leaf):
         floating = jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
@@ -31,10 +30,9 @@ def in_float64(tree):
 
 
 def host_array(value) -> Array | np.ndarray:
-    """What is JAX's, or has a part that is, in JAX; all else in NumPy.
+    """Return a JAX array if any part of ``value`` is JAX's, else a NumPy array.
 
-    There nothing is compiled: in a new process each kind of operation, by shape and
-    dtype, takes JAX some 20 ms, on however few numbers.
+    NumPy compiles nothing; JAX compiles each operation anew for each shape and dtype.
     """
     leaves = jax.tree.leaves(value)
     if any(isinstance(x, jax.Array) or hasattr(x, "__jax_array__") for x in leaves):
@@ -43,25 +41,23 @@ def host_array(value) -> Array | np.ndarray:
 
 
 def real_floats(name: str, value) -> Array | np.ndarray:
-    """An array of the type that JAX has for floats; in no memory of the caller's.
-
-    What NumPy need not convert is JAX's then, which copies it once.
+    """Return an array of JAX's default float type that shares no memory with ``value``.
 
     Raises:
-      InputError: if it is complex; ``name`` says what.
+      InputError: if it is complex; ``name`` is that of the argument.
     """
     array, dtype = host_array(value), jnp.result_type(float)
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
-        raise InputError(f"{name} is complex; pass real numbers")
+        raise InputError(f"{name}: expected real numbers, got {array.dtype}")
     if isinstance(array, np.ndarray) and array.dtype == dtype:
         return jnp.asarray(array)
     return array.astype(dtype)
 
 
 def to_device(tree):
-    """The same pytree, what is NumPy's of it in JAX; it may share that memory.
+    """Move the NumPy arrays of a pytree to JAX; memory may be shared.
 
-    Nothing is compiled for that: `jax.numpy.asarray` compiles its copying.
+    Compiles nothing, unlike `jax.numpy.asarray`.
     """
 
     def one(leaf):
@@ -71,21 +67,21 @@ def to_device(tree):
 
 
 def safe_divide(numerator: Array, denominator: Array, where: Array) -> Array:
-    """``numerator / denominator`` where ``where``, else 0, with finite derivatives."""
+    """Return ``numerator / denominator`` where ``where``, else 0."""
     return jnp.where(where, numerator / jnp.where(where, denominator, 1), 0)
 
 
 def safe_sqrt(x: Array) -> Array:
-    """Square root with value and derivative 0 at and below 0."""
+    """Return the square root, with value and derivative 0 at and below 0."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
 
 
 def materialize_mask(mask: Array) -> Array:
-    """``mask``, on a CPU worked out once.
+    """Return ``mask``, computed only once on CPUs.
 
-    By a division: XLA's CPU backend (jax 0.10.2) takes all that leads to a mask for so
-    cheap that it does it anew in each kernel that uses it.
+    XLA's CPU backend (jax 0.10.2) considers the computation of a mask so cheap that it
+    repeats it in every kernel that uses the mask. A division prevents that.
     """
     if not on_cpu():
         return mask
@@ -94,11 +90,11 @@ def materialize_mask(mask: Array) -> Array:
 
 
 def materialize(values: tuple[Array, ...], mask: Array) -> tuple[Array, ...]:
-    """``values``, and what is derived by them, on a CPU worked out once, as `materialize_mask` is.
+    """Return ``values``, computed only once on CPUs; see `materialize_mask`.
 
     Args:
       values: equally shaped arrays.
-      mask: what of them counts; the rest may come out as halves.
+      mask: which elements are used; the others may come out halved.
     """
     if not on_cpu():
         return values
@@ -107,26 +103,26 @@ def materialize(values: tuple[Array, ...], mask: Array) -> tuple[Array, ...]:
 
 
 def near_one(components: tuple[Array, ...], fallback: tuple[float, ...]):
-    """A vector times the power of two that brings its largest number to 3/4 … 3/2.
+    """Scale a vector by the power of two that brings its largest number to 3/4 … 3/2.
 
-    Exact: no number is rounded, but what is 2^-126 times the largest. Afterwards
-    neither 1e-23 nor 1e20 leaves the range of float32 when squared. A vector that is
-    zero, denormal or not finite becomes ``fallback`` with zero derivative.
+    Exact, except for numbers 2^-126 times the largest; afterwards squares stay within
+    float32. A vector that is zero, denormal or not finite becomes ``fallback`` with
+    zero derivative.
 
     Args:
       components: equally shaped arrays.
 
     Returns:
-      The components of the vector, and a mask of where it was usable.
+      The components of the vector, and a mask of the usable vectors.
     """
     size = jax.lax.stop_gradient(
         jnp.max(jnp.stack([jnp.abs(c) for c in components]), axis=0)
     )
     limits = jnp.finfo(size.dtype)
-    # A NaN fails both comparisons: guards are phrased positively.
+    # NaN fails both comparisons.
     good = (size >= limits.tiny) & (size < jnp.inf)
-    # The largest numbers would be rounded to infinity: those stay below 4. A division,
-    # not a product with the inverse, for the reason that `materialize_mask` gives.
+    # The largest numbers would be rounded to infinity, so they are scaled to below 4.
+    # The division keeps XLA from repeating the computation; see `materialize_mask`.
     below = jnp.minimum(jnp.where(good, size, 1), 2.0 ** (limits.maxexp - 2))
     scale = jax.lax.reduce_precision(below, limits.nexp, 0)
     scaled = tuple(jnp.where(good, c, f) / scale for c, f in zip(components, fallback))
@@ -134,24 +130,23 @@ def near_one(components: tuple[Array, ...], fallback: tuple[float, ...]):
 
 
 def safe_normalize(components: tuple[Array, ...], fallback: tuple[float, ...]):
-    """Unit vector of ``components``, as `near_one` takes and returns them."""
+    """Return the unit vector of ``components``; arguments and results as `near_one`."""
     scaled, good = near_one(components, fallback)
     norm = jnp.sqrt(sum(c * c for c in scaled))
     return tuple(c / norm for c in scaled), good
 
 
 def logit(probability: Array) -> Array:
-    """Inverse of the sigmoid; probabilities are clamped to [2^-24, 1 - 2^-23].
+    """Return the inverse of the sigmoid; inputs are clamped to [2^-24, 1 - 2^-23].
 
-    Both ends come back from `jax.nn.sigmoid` with a slope: that of the logit of
-    1 - 2^-24 is rounded to 1.
+    At both ends `jax.nn.sigmoid` still has a derivative other than 0.
     """
     p = jnp.clip(probability, 2.0**-24, 1 - 2.0**-23)
     return jnp.log(p) - jnp.log1p(-p)
 
 
 def all_within(tree, limit: float = float("inf")) -> Array:
-    """[] bool: whether all numbers of a pytree, in size, are below ``limit``."""
+    """Return [] bool: whether the magnitudes of all numbers are below ``limit``."""
     good = jnp.asarray(True)
     for leaf in jax.tree.leaves(tree):
         good &= jnp.all(jnp.abs(leaf) < limit)
@@ -159,25 +154,24 @@ def all_within(tree, limit: float = float("inf")) -> Array:
 
 
 def exp_log_scale(log_scale: Array) -> Array:
-    """``exp`` clipped to `LOG_SCALE_RANGE` in the log domain; zero slope beyond."""
+    """Return ``exp`` of inputs clipped to `LOG_SCALE_RANGE`; derivative 0 beyond."""
     low, high = LOG_SCALE_RANGE
     inside = (log_scale >= low) & (log_scale <= high)
     return jnp.exp(jnp.where(inside, log_scale, jnp.clip(log_scale, low, high)))
 
 
-# 2^f for |f| ≤ 1/2 is 1 + f (c1 + f (c2 + …)), relative error 1e-7: fitted to the
-# smallest largest error, by reweighted least squares.
+# 2^f for |f| ≤ 1/2 is 1 + f (c1 + f (c2 + …)): a minimax fit, relative error 1e-7.
 _EXP2 = (0.0013264726, 0.009671513, 0.055507336, 0.24022242, 0.693147)
-# Added to a float32 that is an integer below 2^22, it leaves that in the low bits.
+# Adding it leaves an integer below 2^22 in the low bits of a float32.
 _INTEGER = 1.5 * 2.0**23
 
 
 @jax.custom_jvp
 def exp_negative(x: Array) -> Array:
-    """``exp(x)`` for x ≤ 0, to 1e-6 down to −12 and 4e-6 to −87; 1e-38 below.
+    """Return ``exp(x)`` for x ≤ 0, to 1e-6 down to −12 and 4e-6 to −87; 1e-38 below.
 
-    In float32 on a CPU in fewer operations than `jnp.exp`: nothing has to be guarded
-    above, and one term less is enough. Elsewhere it is `jnp.exp`.
+    Faster than `jnp.exp` in float32 on a CPU: no guard against overflow, one term less.
+    Otherwise it is `jnp.exp`.
     """
     if x.dtype != jnp.float32 or not on_cpu():
         return jnp.exp(x)

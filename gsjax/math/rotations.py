@@ -1,7 +1,7 @@
-"""Rotations: quaternions in the order w, x, y, z, of any norm above zero.
+"""Rotations by quaternions w, x, y, z of any norm above zero.
 
-Components are separate arrays throughout (structure of arrays): the long axis, over
-Gaussians, stays innermost, which is what vector units want.
+Components are separate arrays, so that the long axis over Gaussians is innermost and
+vectorises.
 """
 
 import jax
@@ -14,8 +14,10 @@ Array = jax.Array
 
 @jax.custom_jvp
 def _squares(a: Array, b: Array, c: Array, d: Array) -> Array:
-    """a² − b² + c² − d². Its slope by what is 0 is 0, to the last bit: of the products
-    here it would be a difference of equal ones, which a compiler may round but once.
+    """Return a² − b² + c² − d²; the derivative by a zero is exactly zero.
+
+    The derivative of the products would be a difference of equal terms, of which a
+    compiler may round only one.
     """
     return (a - b) * (a + b) + (c - d) * (c + d)
 
@@ -27,12 +29,11 @@ def _squares_jvp(numbers, rates):
 
 
 def rotation_rows(w: Array, x: Array, y: Array, z: Array):
-    """Rows of the rotation matrix of a quaternion times its squared norm, as tuples.
+    """Return the rows of a quaternion's rotation matrix times its squared norm.
 
-    Homogeneous in the quaternion: none of its numbers is rounded to normalise it, and
-    a direction is known to a few roundings of products alone. No product is used
-    twice: a compiler would fuse it into the one sum and not into the other, and which
-    it does may differ between programs, by a bit.
+    Homogeneous in the quaternion, so that normalising rounds nothing. No product is
+    used twice: a compiler might fuse it into one sum and not the other, which differs
+    by a bit between programs.
     """
 
     w2, x2, y2, z2 = (2 * q for q in (w, x, y, z))
@@ -44,7 +45,7 @@ def rotation_rows(w: Array, x: Array, y: Array, z: Array):
 
 
 def quaternion_to_matrix(quats: Array) -> Array:
-    """Rotation matrices [..., 3, 3] of quaternions [..., 4] (wxyz, of any norm)."""
+    """Return rotation matrices [..., 3, 3] of quaternions [..., 4] (wxyz, any norm)."""
     components = tuple(jnp.moveaxis(jnp.asarray(quats), -1, 0))
     quat, _ = near_one(components, (1.0, 0.0, 0.0, 0.0))
     rows = jnp.stack([jnp.stack(row, -1) for row in rotation_rows(*quat)], -2)
@@ -53,13 +54,13 @@ def quaternion_to_matrix(quats: Array) -> Array:
 
 
 def covariance(quats: Array, scales: Array) -> Array:
-    """Covariances R S Sᵀ Rᵀ [..., 3, 3] from wxyz [..., 4] and scales [..., 3]."""
+    """Return R S Sᵀ Rᵀ [..., 3, 3] of wxyz [..., 4] and scales [..., 3]."""
     half = quaternion_to_matrix(quats) * jnp.asarray(scales)[..., None, :]
     return jnp.einsum("...ij,...kj->...ik", half, half, precision="highest")
 
 
 def times_covariance(quats: Array, scales: Array, vectors: Array) -> Array:
-    """R S Sᵀ Rᵀ v of vectors v [..., 3]: along each axis, and back."""
+    """Return R S Sᵀ Rᵀ v of vectors v [..., 3], without forming the matrix."""
     quat, scale, vector = (
         tuple(jnp.moveaxis(a, -1, 0)) for a in (quats, scales, vectors)
     )

@@ -1,4 +1,4 @@
-"""Real spherical harmonics of static degree 0 to 4, in the field's sign convention.
+"""Real spherical harmonics of static degree 0 to 4, with the signs of 3DGS.
 
 Basis: Sloan, "Efficient Spherical Harmonic Evaluation" (JCGT 2013), signs as in
 Kerbl et al. 2023: degree 1 is -C1 y, C1 z, -C1 x. Colour = basis · coefficients
@@ -19,28 +19,28 @@ MAX_DEGREE = 4
 
 
 def num_bases(degree: int) -> int:
-    """Number of basis functions of degrees 0 to ``degree``."""
+    """Return the number of basis functions of degrees 0 to ``degree``."""
     return (degree + 1) ** 2
 
 
 def degree_of(bases: int) -> int:
-    """Degree with ``bases`` basis functions.
+    """Return the degree with ``bases`` basis functions.
 
     Raises:
-      InputError: if there is none, from 0 to 4.
+      InputError: if no degree from 0 to 4 has that number.
     """
     degree = math.isqrt(bases) - 1
     if degree < 0 or degree > MAX_DEGREE or num_bases(degree) != bases:
-        wanted = [num_bases(d) for d in range(MAX_DEGREE + 1)]
+        known = [num_bases(d) for d in range(MAX_DEGREE + 1)]
         raise InputError(
-            f"{bases} spherical-harmonic coefficients a channel are no whole degree; "
-            f"pass one of {wanted}"
+            f"sh: expected one of {known} spherical-harmonic coefficients per channel, "
+            f"got {bases}"
         )
     return degree
 
 
 def sh_basis(degree: int, x: Array, y: Array, z: Array) -> list[Array]:
-    """The (degree + 1)² basis values at unit directions (x, y, z), each as x."""
+    """Return the (degree + 1)² basis values at unit directions; each shaped as x."""
     basis = [jnp.full_like(x, C0)]
     if degree == 0:
         return basis
@@ -81,7 +81,7 @@ def sh_basis(degree: int, x: Array, y: Array, z: Array) -> list[Array]:
 
 
 def eval_sh(coefficients: Array, directions: Array) -> Array:
-    """Sum of basis times coefficients, without the + 0.5 and the clip.
+    """Return the sum of basis times coefficients, without the + 0.5 and the clip.
 
     Args:
       coefficients: [..., K, C] with K = (degree + 1)².
@@ -96,10 +96,10 @@ def eval_sh(coefficients: Array, directions: Array) -> Array:
 
 
 def rgb_to_dc(rgb: Array) -> Array:
-    """Degree-0 coefficient that shows as ``rgb`` (any shape)."""
+    """Return the degree-0 coefficient of colour ``rgb`` (any shape)."""
     return (rgb - 0.5) / C0
 
 
 def dc_to_rgb(dc: Array) -> Array:
-    """Colour shown by a degree-0 coefficient alone (any shape)."""
+    """Return the colour of a degree-0 coefficient alone (any shape)."""
     return C0 * dc + 0.5

@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jax.experimental import checkify
 
 from gsjax.errors import CapacityError
-from gsjax.runtime.settings import require_ranges, settle
+from gsjax.runtime.settings import convert_fields, require_ranges
 
 if TYPE_CHECKING:
     from gsjax.cameras.camera import Camera
@@ -100,26 +100,24 @@ class RasterConfig:
     devices: int | None = None
 
     def __post_init__(self):
-        settle(self)
+        convert_fields(self)
+        outputs = isinstance(self.outputs, tuple) and len(self.outputs) > 0
+        outputs = outputs and set(self.outputs) <= set(OUTPUTS)
         checks = {
-            "alpha_min": 0 < self.alpha_min < 1,
-            "alpha_max": self.alpha_min < self.alpha_max <= 1,
-            "transmittance_min": 0 <= self.transmittance_min < 1,
-            "stop_rule": self.stop_rule in STOP_RULES,
-            "dilation": 0 <= self.dilation <= 1e9,  # its square fits float32
-            "outputs": isinstance(self.outputs, tuple)
-            and len(self.outputs) > 0
-            and set(self.outputs) <= set(OUTPUTS),
-            "tile_size": self.tile_size >= 1,
-            "chunk_size": self.chunk_size >= 1,
-            "tiles_per_step": self.tiles_per_step is None or self.tiles_per_step >= 1,
-            "pair_capacity": self.pair_capacity is None
-            or 1 <= self.pair_capacity < 2**30,
-            "visible_capacity": self.visible_capacity is None
-            or self.visible_capacity >= 1,
-            "on_overflow": self.on_overflow in OVERFLOW_RULES,
-            "num_size_buckets": self.num_size_buckets >= 1,
-            "devices": self.devices is None or self.devices >= 1,
+            "alpha_min": "(0, 1)",
+            "alpha_max": f"({self.alpha_min}, 1]",
+            "transmittance_min": "[0, 1)",
+            "stop_rule": STOP_RULES,
+            "dilation": "[0, 1e9]",  # its square fits float32
+            "outputs": (outputs, f"a tuple of {', '.join(OUTPUTS)}"),
+            "tile_size": "[1, inf)",
+            "chunk_size": "[1, inf)",
+            "tiles_per_step": "[1, inf)",
+            "pair_capacity": f"[1, {2**30})",
+            "visible_capacity": "[1, inf)",
+            "on_overflow": OVERFLOW_RULES,
+            "num_size_buckets": "[1, inf)",
+            "devices": "[1, inf)",
         }
         require_ranges(self, checks)
 

@@ -1,4 +1,4 @@
-"""What programs say: results on stdout; progress, warnings and errors on stderr."""
+"""Output of programs: results on stdout; progress, warnings and errors on stderr."""
 
 import re
 import signal
@@ -11,27 +11,27 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 T = TypeVar("T")
-# What a terminal obeys instead of showing it: control characters, and those that turn
-# the direction of text. Line breaks and tabs are neither.
-_OBEYED = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+# Control characters, and those that change the direction of text; not line breaks and
+# tabs.
+_CONTROLS = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 
 
 def say(line: str) -> None:
     """Print a result line, above the progress bar if there is one."""
     from tqdm import tqdm
 
-    tqdm.write(harmless(line), file=sys.stdout)
+    tqdm.write(escape_controls(line), file=sys.stdout)
 
 
 def note(line: str) -> None:
     """Print a line on stderr, above the progress bar if there is one."""
     from tqdm import tqdm
 
-    tqdm.write(f"gsjax: {harmless(line)}", file=sys.stderr)
+    tqdm.write(f"gsjax: {escape_controls(line)}", file=sys.stderr)
 
 
 def progress(items: Sequence[T], label: str) -> Iterator[T]:
-    """The items; a bar on a terminal, elsewhere a line at most every two seconds."""
+    """Iterate with a progress bar; if stderr is no terminal, a line every 2 s."""
     if sys.stderr.isatty():
         from tqdm import tqdm
 
@@ -45,67 +45,69 @@ def progress(items: Sequence[T], label: str) -> Iterator[T]:
             note(f"{label} {done}/{len(items)}")
 
 
-def harmless(text: str) -> str:
-    """Text in which what a terminal would obey, as of a file's name, is spelled out."""
-    return _OBEYED.sub(lambda found: repr(found[0])[1:-1], text)
+def escape_controls(text: str) -> str:
+    """Escape the characters that a terminal would interpret."""
+    return _CONTROLS.sub(lambda found: repr(found[0])[1:-1], text)
 
 
 def one_line(text: object, most: int | None = None) -> str:
-    """Text without line breaks, `harmless`.
+    """Return text without line breaks and control characters.
 
     Args:
-      text: anything.
-      most: characters; of more, some in the middle are left out. None for any number.
+      text: any object.
+      most: number of characters beyond which the middle is left out; None for no limit.
     """
-    line = harmless(" ".join(str(text).split()))
+    line = escape_controls(" ".join(str(text).split()))
     if most is None or len(line) <= most:
         return line
     return f"{line[: most // 2]} […] {line[-most // 2 :]}"
 
 
 def decibels(value: float | None) -> str:
-    """PSNR to read; None is that of an image without any error."""
+    """Format a PSNR; None stands for infinity, that of equal images."""
     return "∞ dB" if value is None or value == float("inf") else f"{value:.2f} dB"
 
 
 @contextmanager
-def stopping_on_ctrl_c() -> Iterator[Callable[[], bool]]:
-    """Within, Ctrl-C only sets a flag, so that what goes on is never cut in two.
+def deferred_interrupt() -> Iterator[Callable[[], bool]]:
+    """Within, the first Ctrl-C only sets a flag; a second one interrupts as usual.
 
-    A second one raises `KeyboardInterrupt` as usual. Nothing changes off the main
-    thread, where signals cannot be caught; where Ctrl-C is ignored, as by what a script
-    starts in the background; and where something other than Python handles it.
+    Nothing changes outside the main thread, if Ctrl-C is ignored (as in background
+    processes of a script), or if another library handles it.
+
+    Yields:
+      A function that returns the flag.
     """
-    asked = False
+    requested = False
     previous = signal.getsignal(signal.SIGINT)
-    mine = threading.current_thread() is threading.main_thread()
-    if not mine or previous in (signal.SIG_IGN, None):
+    main = threading.current_thread() is threading.main_thread()
+    if not main or previous in (signal.SIG_IGN, None):
         yield lambda: False
         return
 
     def handle(*_):
-        nonlocal asked
-        if asked:
+        nonlocal requested
+        if requested:
             raise KeyboardInterrupt
-        asked = True
-        note("stopping after this step; once more to stop at once")
+        requested = True
+        note("stopping after this step; press Ctrl-C again to stop at once")
 
     signal.signal(signal.SIGINT, handle)
     try:
-        yield lambda: asked
+        yield lambda: requested
     finally:
         signal.signal(signal.SIGINT, previous)
 
 
 @contextmanager
 def warnings_as_lines() -> Iterator[None]:
-    """Within, a warning is a line ``gsjax: warning: …`` on stderr."""
+    """Within, print warnings as lines ``gsjax: warning: …`` on stderr."""
 
     def show(message, *_):
         note(f"warning: {one_line(message)}")
 
     with warnings.catch_warnings():
-        # Those for the user are always shown; of others, what the filters let through.
+        # User warnings are always shown; others as the filters say.
         warnings.filterwarnings("always", category=UserWarning)
         warnings.showwarning = show
         yield

@@ -12,7 +12,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from gsjax.errors import InputError
 from gsjax.runtime import setup
 from gsjax.runtime.machine import usable_cores
-from gsjax.runtime.settings import whole
+from gsjax.runtime.settings import as_int
 
 
 def platform_name() -> str:
@@ -59,7 +59,7 @@ def use_all_cores(count: int | None = None, *, queued: bool = True) -> int:
       RuntimeError: if JAX has started with another number of devices.
       InputError: if ``count`` is not a positive integer.
     """
-    count = usable_cores() if count is None else whole("count", count)
+    count = usable_cores() if count is None else as_int("count", count)
     if count < 1:
         raise InputError(f"use_all_cores: expected count ≥ 1, got {count}")
     setup.restore_environment()

@@ -1,4 +1,4 @@
-"""Files, read or refused by name, and written complete or not at all."""
+"""Files: read with typed errors, and written completely or not at all."""
 
 import errno
 import json
@@ -18,13 +18,12 @@ from gsjax.runtime.memory import Estimate, require
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _TEMPORARY = ".gsjax-{}.tmp"
-# Of JSON: a camera is an object and five lists in 90 bytes or more, with some 50 keys
-# and 100 values at most; 3 bytes, "[],", take 70 in memory, a key of its own 100. So
-# what is full of them is refused before it is parsed.
+# In JSON a camera is an object and five lists in 90 bytes or more, with at most some 50
+# keys and 100 values. An empty list takes 3 bytes and 70 in memory, so files that are
+# full of them are rejected before parsing.
 _MANY, _LEAST_BYTES, _MOST_ITEMS = 10_000, 10, 100
-# Python's parser takes up to that many times the text: of a short word, 6 bytes, 60.
+# Memory of Python's parser relative to the text.
 _PARSED = 14
-
 
 _short = reprlib.Repr()
 _short.maxlist = _short.maxdict = 20
@@ -32,23 +31,23 @@ _short.maxstring = _short.maxlong = _short.maxother = 80
 
 
 def shown(value: Any) -> str:
-    """A value as found, for a message: 80 characters at most, whatever it is."""
-    if isinstance(value, dict):  # of which all keys would be sorted
+    """Return a value for a message, in at most 80 characters."""
+    if isinstance(value, dict):  # whose keys would all be sorted
         value = dict(islice(value.items(), _short.maxdict))
     return _short.repr(value)[:80]
 
 
 @contextmanager
 def reading(path: Path, wanted: str = "a file") -> Iterator[None]:
-    """Within, what keeps ``path`` from being read is told with its name.
+    """Turn errors of reading ``path`` within the context into typed ones.
 
     Args:
-      path: checked to be a regular file first: a pipe or device may never end.
+      path: a regular file; a pipe or device may never end.
       wanted: what to pass instead, for the message.
 
     Raises:
-      InputError: if it is missing, no regular file, may not be read, or is larger
-        than the memory.
+      InputError: if it is missing, not a regular file, not readable, or larger than
+        the memory.
     """
     try:
         if not stat.S_ISREG(path.stat().st_mode):
@@ -63,39 +62,37 @@ def reading(path: Path, wanted: str = "a file") -> Iterator[None]:
         ) from error
     except MemoryError as error:
         raise InputError(
-            f"{path}: cannot be read: larger than the memory; is it {wanted}?"
+            f"{path}: cannot be read: larger than memory; is it {wanted}?"
         ) from error
 
 
 @contextmanager
 def opened(path: Path, wanted: str = "a file") -> Iterator[BinaryIO]:
-    """A file open to read bytes from; raises as `reading`."""
+    """Open a file for reading bytes; raises as `reading`."""
     with reading(path, wanted), path.open("rb") as file:
         yield file
 
 
 def read_bytes(path: Path, wanted: str = "a file") -> bytes:
-    """All of a file; raises as `reading`."""
+    """Return the bytes of a file; raises as `reading`."""
     with reading(path, wanted):
         return path.read_bytes()
 
 
 def read_json(path: Path, wanted: str = "a JSON file") -> dict[str, Any]:
-    """The object that a JSON file holds.
-
-    It is parsed as a whole, and takes up to 14 times its size in memory meanwhile.
+    """Return the object in a JSON file.
 
     Raises:
-      InputError: as `reading`, and if it is no JSON, no object, or so full of empty
-        objects and lists, keys or values that it can be no list of cameras.
-      CapacityError: if the memory may not hold what is in it.
+      InputError: as `reading`, and if it is not JSON, not an object, or has too many
+        objects, keys or values to be a list of cameras.
+      CapacityError: if parsing may exceed the memory.
     """
     raw = read_bytes(path, wanted)
     _check_json(path, raw, wanted)
     require(
         Estimate({"objects and numbers": _PARSED * len(raw)}),
         f"{path}: {len(raw):,} bytes of JSON",
-        "leave out some of it",
+        "leave out a part of it",
     )
     try:
         data = json.loads(raw)
@@ -105,44 +102,39 @@ def read_json(path: Path, wanted: str = "a JSON file") -> dict[str, Any]:
         ) from error
     if not isinstance(data, dict):
         raise InputError(
-            f"{path}: the top is {shown(data)}, an object is wanted; pass {wanted}"
+            f"{path}: expected an object at the top, got {shown(data)}; pass {wanted}"
         )
     return data
 
 
 def _check_json(path: Path, raw: bytes, wanted: str) -> None:
-    """Refuse what is of another kind than what is kept as JSON, before it is parsed."""
+    """Reject JSON that cannot be a list of cameras, before parsing."""
     size, objects = len(raw), raw.count(b"{")
     keys, values = raw.count(b":"), raw.count(b",")
     nested = objects + raw.count(b"[")
     fault = None
     if nested > _MANY and nested * _LEAST_BYTES > size:
-        told = f"{nested} objects and lists in {size} bytes"
-        fault = f"{told}, fewer than {_LEAST_BYTES} bytes each"
+        fault = f"{nested} objects and lists in {size} bytes"
     elif keys > _MANY + _MOST_ITEMS * objects:
         fault = f"{keys} keys in {objects} objects"
-    # A list of names is as long, but of longer values.
+    # A list of names may be as long, but has longer values.
     elif values > _MANY + _MOST_ITEMS * objects and values * _LEAST_BYTES > size:
         fault = f"{values} values in {objects} objects and {size} bytes"
     if fault is not None:
         raise InputError(
-            f"{path}: {fault}, which no list of cameras has; pass {wanted}"
+            f"{path}: {fault}: too many for a list of cameras; pass {wanted}"
         )
 
 
 @contextmanager
 def writing(path: Path, what: str = "written") -> Iterator[None]:
-    """Within, what keeps ``path`` from being written is told with its name.
-
-    Raises:
-      InputError: on any error of the system.
-    """
+    """Turn errors of writing ``path`` within the context into an `InputError`."""
     try:
         yield
     except OSError as error:
         remedy = "check permissions and space"
         if error.errno in _FULL:
-            remedy = "free some space, then do this again"
+            remedy = "free some space and try again"
         raise InputError(
             f"{path}: cannot be {what}: {error.strerror or error}; {remedy}"
         ) from error
@@ -150,15 +142,14 @@ def writing(path: Path, what: str = "written") -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
-    """A file to write to that becomes ``path``, in place of what is there, at the end.
+    """Open a temporary file that replaces ``path`` at the end of the context.
 
-    It stands beside ``path`` until then, and is gone if anything fails. Where ``path``
-    is a link, all that goes for what it leads to.
+    It lies beside ``path``, or beside the target of a link, and is removed on failure.
 
     Args:
-      path: of the file.
-      durable: wait until it is on the disk before it gets its name, so that a power
-        cut leaves the one file or the other.
+      path: the file.
+      durable: flush to the disk before renaming, so that a power cut leaves the old or
+        the new file.
 
     Raises:
       InputError: as `writing`.
@@ -174,20 +165,19 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
                     os.fsync(file.fileno())
             os.replace(temporary, place)
     finally:
-        with suppress(OSError):  # it is told already
+        with suppress(OSError):  # already reported
             temporary.unlink()
 
 
 def temporary_in(folder: Path) -> Path:
-    """A hidden name that nothing has yet, for what is to be moved when it is done."""
+    """Return an unused hidden name in a folder."""
     return folder / _TEMPORARY.format(secrets.token_hex(6))
 
 
 def remove_leftovers(folder: Path, than: Path) -> None:
-    """Remove what `replacing` was filling in ``folder`` when its process was killed.
+    """Remove temporary files that killed processes left in ``folder``.
 
-    Only what is older ``than`` a file that was just written: what is newer may be that
-    of another process. What cannot be removed stays.
+    Only those older ``than`` a file just written; newer ones may be in use.
     """
     with suppress(OSError):
         written = than.stat().st_mtime_ns
@@ -198,17 +188,13 @@ def remove_leftovers(folder: Path, than: Path) -> None:
 
 
 def write_file(path: Path, data: bytes | memoryview, *, durable: bool = False) -> None:
-    """Write all of a file; as `replacing`."""
+    """Write a file as `replacing` does."""
     with replacing(path, durable=durable) as file:
         file.write(data)
 
 
 def append_to_file(path: Path, data: bytes) -> None:
-    """Add to the end of a file, all or nothing; it is made if it is missing.
-
-    Raises:
-      InputError: as `writing`.
-    """
+    """Append to a file, all or nothing; create it if missing. Raises as `writing`."""
     with writing(path), path.open("ab", buffering=0) as file:
         size = file.tell()
         try:
@@ -216,50 +202,45 @@ def append_to_file(path: Path, data: bytes) -> None:
             while rest:
                 rest = rest[file.write(rest) or 0 :]
         except BaseException:
-            with suppress(OSError):  # what is there stays readable to its end
+            with suppress(OSError):  # keep the old content readable
                 file.truncate(size)
             raise
 
 
 def write_json(path: Path, data: Any, *, indent: int = 1) -> None:
-    """Write ``data`` as JSON, without numbers that it lacks; as `write_file`."""
+    """Write ``data`` as JSON, without NaN and infinity; as `write_file`."""
     form = {"indent": indent, "allow_nan": False}
     try:
-        told = f"{json.dumps(data, ensure_ascii=False, **form)}\n".encode()
-    except UnicodeEncodeError:  # the name of a file that is not UTF-8
-        told = f"{json.dumps(data, **form)}\n".encode()
-    write_file(path, told)
+        text = f"{json.dumps(data, ensure_ascii=False, **form)}\n".encode()
+    except UnicodeEncodeError:  # a file name that is not UTF-8
+        text = f"{json.dumps(data, **form)}\n".encode()
+    write_file(path, text)
 
 
 def finite_or_none(value: float) -> float | None:
-    """For JSON, which has no number for infinity or NaN."""
+    """Return the value, or None if it is not finite, for JSON."""
     return value if math.isfinite(value) else None
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder and those above it.
-
-    Raises:
-      InputError: if that cannot be.
-    """
-    with writing(path, "made a folder"):
+    """Create a folder and its parents. Raises as `writing`."""
+    with writing(path, "created"):
         path.mkdir(parents=True, exist_ok=True)
 
 
 @contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Within, no other process that asks has the folder; that ends with this process,
-    whatever ends it. Where the system has no such locks, nothing is held.
+def locked_folder(folder: Path) -> Iterator[None]:
+    """Lock a folder within the context, where the system supports locks.
 
     Raises:
-      InputError: if another has it.
+      InputError: if another process has locked it.
     """
     try:
         handle = _locked(folder)
     except BlockingIOError:
         raise InputError(
-            f"{folder}: another training is at work in it; wait until it has ended, "
-            "or use another folder"
+            f"{folder}: in use by another training; wait until it has ended, or use "
+            "another folder"
         ) from None
     try:
         yield
@@ -269,7 +250,7 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 def _locked(folder: Path) -> int | None:
-    """What holds a folder until it is closed; None where that cannot be."""
+    """Return the handle that holds the lock; None without locks."""
     try:
         import fcntl  # not on Windows
 
@@ -281,26 +262,30 @@ def _locked(folder: Path) -> int | None:
     except BlockingIOError:
         os.close(handle)
         raise
-    except OSError:  # a disk without locks
+    except OSError:  # a file system without locks
         pass
     return handle
 
 
-def refuse_existing(
+def reject_existing(
     paths: Iterable[Path], overwrite: bool, instead: str = "another name"
 ) -> None:
-    """Check names before the work that would fill them.
+    """Check output names before the work.
 
     Args:
-      instead: what to pass in place of ``--overwrite``, for the message.
+      paths: files to write.
+      overwrite: existing files are accepted.
+      instead: alternative to ``--overwrite``, for the message.
 
     Raises:
-      InputError: if one exists and ``overwrite`` is not set, or is a folder.
+      InputError: if a file exists and ``overwrite`` is not set, or is a folder.
     """
     found = [path for path in paths if path.exists()]
     folders = [path for path in found if path.is_dir()]
     if folders:
-        raise InputError(f"{folders[0]}: is a folder; a file is to be written there")
+        raise InputError(
+            f"{folders[0]}: expected a file to write, got a folder; pass another name"
+        )
     if found and not overwrite:
         more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
         raise InputError(f"{found[0]}{more}: exists; pass --overwrite, or {instead}")

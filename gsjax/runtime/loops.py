@@ -1,13 +1,14 @@
 """Loops over single numbers, for CPUs: each is one compiled kernel.
 
-XLA's CPU backend makes one kernel of a `while` whose turn touches less than 1 kB, if it
-is not told otherwise (its `SmallWhileLoopHoistingPass`), arrays of any size among what
-it carries: a turn then takes a nanosecond or two, and some hundred times as long where
-it does not. So a turn holds arithmetic on numbers, slices and updates of a few, and no
-gather, scatter or sort; and what it reads of an array that it also writes, it carries
-over from the turn before: else XLA copies that array in every turn. No derivative is
-taken here, and a batch goes one after another. Loops whose turns hold more, as those of
-`gsjax.train.ssim_window`, are kernels where XLA is told `gsjax.runtime.devices.KERNEL_BYTES`.
+XLA's CPU backend compiles a `while` to one kernel if its turn touches less than 1 kB
+(by default), however large the arrays are that it carries. A turn then takes a
+nanosecond or two, else some hundred times as long. So a turn holds arithmetic on
+numbers, and slices and updates of a few, but no gather, scatter or sort. Values that it
+reads from an array that it also writes are carried over from the turn before: else XLA
+copies the array in every turn. Loops with larger turns are kernels where XLA is told
+`gsjax.runtime.setup.KERNEL_BYTES`.
+
+No derivative is taken here, and a batch goes one after another.
 
 Axis legend: I items, T tiles.
 """
@@ -24,14 +25,16 @@ from gsjax.runtime.setup import KERNEL_BYTES
 
 Array = jax.Array
 
-STRETCH = 256  # slots that `places` looks at or leaves out together
-_ADDED = 4  # counts that `cumulative_sum` adds in a turn; of 16 it is above 1 kB
+STRETCH = 256  # slots that `places` reads or skips together
+_UNROLL = 4  # counts that `cumulative_sum` adds in a turn; 16 would exceed 1 kB
 
 
 @cache
-def large_are_kernels() -> bool:
-    """Whether this process's XLA makes one kernel also of a loop whose turn touches
-    `KERNEL_BYTES`; see `gsjax.use_all_cores`. Found out by compiling one."""
+def large_loops_are_kernels() -> bool:
+    """Return whether loops whose turn touches `KERNEL_BYTES` are kernels here.
+
+    One is compiled to find out.
+    """
     numbers = jax.ShapeDtypeStruct((KERNEL_BYTES // 9,), jnp.float32)  # 8 bytes each
 
     def loop(x):
@@ -39,76 +42,73 @@ def large_are_kernels() -> bool:
 
     with jax.disable_jit(False):
         program = jax.jit(loop).lower(numbers).compile().as_text() or ""
-    return "xla_cpu_small_call" in program and not has_loop_by_turns(program)
+    return "xla_cpu_small_call" in program and not has_interpreted_loop(program)
 
 
-def has_loop_by_turns(program: str) -> bool:
-    """Whether a `while` of a compiled program's entry is left to be run turn by turn,
-    given its text."""
+def has_interpreted_loop(program: str) -> bool:
+    """Return whether a compiled program's text has a `while` outside of kernels."""
     return " while(" in program[program.index("ENTRY") :]
 
 
 def part_at(values: Array, start: Sequence[Array], shape: Sequence[int]) -> Array:
-    """What of ``values`` begins at ``start``, [] each and none below 0, and is of that
-    shape; the last that is, if there is not so much behind it."""
+    """Return the part of ``values`` from ``start``, [] each and none below 0."""
     return lax.dynamic_slice(values, start, shape, allow_negative_indices=False)
 
 
 def with_part(values: Array, part: Array, start: Sequence[Array]) -> Array:
-    """``values`` with ``part`` in the place that `part_at` would take it from."""
+    """Return ``values`` with ``part`` in the place that `part_at` reads."""
     return lax.dynamic_update_slice(values, part, start, allow_negative_indices=False)
 
 
 def _at(values: Array, index: Array) -> Array:
-    """The number [1] at ``index`` [1]."""
+    """Return the number [1] at ``index`` [1]."""
     return part_at(values, (index[0],), (1,))
 
 
 def _put(values: Array, number: Array, index: Array) -> Array:
-    """``values`` with ``number`` [1] at ``index`` [1]; at the last if past it."""
+    """Return ``values`` with ``number`` [1] at ``index`` [1], or at the last place."""
     return with_part(values, number, (index[0],))
 
 
 def fori_loop(start, end, turn, state):
-    """A `lax.fori_loop` that counts in 32 bits."""
+    """Run a `lax.fori_loop` that counts in 32 bits."""
     return lax.fori_loop(jnp.int32(start), jnp.int32(end), turn, state)
 
 
 @sequential_vmap
 def cumulative_sum(counts: Array) -> Array:
-    """Inclusive sums [n] int32 of counts [n] int32."""
+    """Return inclusive sums [n] int32 of counts [n] int32."""
     size = counts.shape[0]
-    counts = jnp.pad(counts, (0, -size % _ADDED))
+    counts = jnp.pad(counts, (0, -size % _UNROLL))
 
     def turn(i, state):
         total, out = state
-        start, sums = (i * _ADDED,), []
-        some = part_at(counts, start, (_ADDED,))
-        for count in jnp.split(some, _ADDED):
+        start, sums = (i * _UNROLL,), []
+        some = part_at(counts, start, (_UNROLL,))
+        for count in jnp.split(some, _UNROLL):
             total = total + count
             sums.append(total)
         out = with_part(out, jnp.concatenate(sums), start)
         return total, out
 
     init = (jnp.zeros(1, jnp.int32), jnp.zeros_like(counts))
-    return fori_loop(0, counts.shape[0] // _ADDED, turn, init)[1][:size]
+    return fori_loop(0, counts.shape[0] // _UNROLL, turn, init)[1][:size]
 
 
 @sequential_vmap
 def append(
     count: Array, kept: Array, columns: tuple[Array, ...], chosen: Array
 ) -> tuple[Array, Array]:
-    """Rows of what is chosen, behind those that are there.
+    """Append the chosen rows.
 
     Args:
-      count: [1] int32 how many are there.
-      kept: [room + 1, C] int32.
+      count: [1] int32, number of rows so far.
+      kept: [room + 1, C] int32; the last row is spare.
       columns: C arrays [n] int32.
       chosen: [n] bool.
 
     Returns:
-      ``count``, not limited to the room, and ``kept`` with more. There is no use for
-      the last row.
+      The new ``count``, not limited to the room, and ``kept``.
     """
 
     def turn(i, state):
@@ -123,16 +123,16 @@ def append(
 
 @sequential_vmap
 def places(chosen: Array, some: Array, index: Array) -> tuple[Array, Array]:
-    """Where what is chosen stands, together at the front.
+    """Return the places where ``chosen`` is set, compacted to the front.
 
     Args:
       chosen: [n] bool.
-      some: [⌈n / STRETCH⌉] bool, in which stretches anything is.
-      index: [room + 1] what stands past the last of them.
+      some: [⌈n / STRETCH⌉] bool, stretches with a set element.
+      index: [room + 1] values for unused places; the last is spare.
 
     Returns:
-      ``index`` with the rising places of the first ``room``; and [] int32 how many are
-      chosen, not limited to the room. There is no use for the last of ``index``.
+      ``index`` with the rising places of the first ``room``, and the number [] int32 of
+      set elements, not limited to the room.
     """
     numbers = chosen.astype(jnp.int32)
     lengths = jnp.where(some, STRETCH, 0)
@@ -154,14 +154,14 @@ def places(chosen: Array, some: Array, index: Array) -> tuple[Array, Array]:
 
 @sequential_vmap
 def scatter_items(kept: Array, items: Array, place: Array, out: Array) -> Array:
-    """Deal the values of items to lists; the lists of a counting sort.
+    """Scatter the values of items to lists, as in a counting sort.
 
     Args:
-      kept: [I, 3] int32: value, and first and count of the lists first … first +
-        count - 1 that it is put into.
-      items: [] int32, how many there are.
+      kept: [I, 3] int32: value, first and count. The value goes to the lists first …
+        first + count − 1.
+      items: [] int32, number of items.
       place: [T] int32, where in ``out`` each list begins.
-      out: where the lists are put.
+      out: storage of the lists.
 
     Returns:
       ``out`` with the lists, each in the order of the items.

@@ -1,7 +1,6 @@
-"""What memory there is, and refusing what it would not hold before it is taken.
+"""Free memory, and rejecting work that would not fit before it is allocated.
 
-A process that takes more than there is gets killed, without a word and with all that
-it held. So what is about to be taken is estimated, and compared.
+A process that takes more memory than there is gets killed without a message.
 """
 
 import ctypes
@@ -11,25 +10,25 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gsjax.errors import CapacityError
-from gsjax.runtime.machine import ROOT, control_groups, text_of
+from gsjax.runtime.machine import ROOT, control_groups, read_system_file
 
-# Less than that is not worth asking the system for.
+# Less than this is not checked.
 _SMALL = 2**28
 _unlimited = False
 
 
 class Estimate(NamedTuple):
-    """Bytes by what they are for.
+    """Bytes by purpose.
 
     Attributes:
-      parts: by name, in the plural: "photographs".
+      parts: bytes by name, in the plural: "photographs".
     """
 
     parts: dict[str, int]
 
     @property
     def total(self) -> int:
-        """All of it."""
+        """Sum of the parts."""
         return sum(self.parts.values())
 
     def __str__(self) -> str:
@@ -39,17 +38,17 @@ class Estimate(NamedTuple):
 
 
 def size_text(count: int) -> str:
-    """Bytes to read, of 10⁹ or 10⁶."""
+    """Format bytes as GB (10⁹) or MB (10⁶)."""
     if count >= 10**9:
         return f"{count / 1e9:.1f} GB"
     return f"{count / 1e6:.0f} MB"
 
 
 @contextmanager
-def unlimited(really: bool = True) -> Iterator[None]:
-    """Within, nothing is refused for want of memory, in any thread of the process."""
+def unlimited(enabled: bool = True) -> Iterator[None]:
+    """Within, no thread of the process checks memory."""
     global _unlimited
-    before, _unlimited = _unlimited, really or _unlimited
+    before, _unlimited = _unlimited, enabled or _unlimited
     try:
         yield
     finally:
@@ -57,15 +56,15 @@ def unlimited(really: bool = True) -> Iterator[None]:
 
 
 def require(estimate: Estimate, what: str, remedy: str) -> None:
-    """Refuse what the memory would not hold; where there is none to ask, nothing is.
+    """Check that an allocation fits in free memory; pass if that is unknown.
 
     Args:
-      estimate: of what is to be taken beyond what is held already.
-      what: is to take it, for the message.
+      estimate: memory to be allocated beyond what is in use.
+      what: name of what allocates it, for the message.
       remedy: what to change, for the message.
 
     Raises:
-      CapacityError: with the numbers.
+      CapacityError: if it does not fit; with the numbers.
     """
     if _unlimited or estimate.total < _SMALL:
         return
@@ -73,17 +72,16 @@ def require(estimate: Estimate, what: str, remedy: str) -> None:
     if free is not None and estimate.total > free:
         raise CapacityError(
             f"{what} would take about {estimate} of memory, and {size_text(free)} is "
-            f"free; {remedy}, or go on all the same with --ignore-memory (in Python: "
-            "gsjax.runtime.memory.unlimited())"
+            f"free; {remedy}, or pass --ignore-memory to try it all the same (in "
+            "Python: gsjax.runtime.memory.unlimited())"
         )
 
 
 def available() -> int | None:
-    """Bytes that JAX's device can still give this process; None if nobody says.
+    """Return the bytes that JAX's device can still allocate; None if unknown.
 
-    On a CPU the least of what the system says it can give without swapping, and of
-    what is left in each control group that the process is in; and what the process
-    itself has freed and kept. On other devices what their allocator may still take.
+    On a CPU this is the memory available without swapping, limited by each control
+    group of the process, plus what the process has freed and kept.
     """
     import jax
 
@@ -99,24 +97,23 @@ def available() -> int | None:
 
 
 def system_available(root: Path = ROOT) -> int | None:
-    """Bytes that Linux, and the control groups of this process, can still give.
+    """Return the bytes that Linux and the control groups of this process leave.
 
     Args:
-      root: under which /proc and /sys lie.
+      root: folder that contains /proc and /sys.
     """
-    found = [*_of_meminfo(root / "proc/meminfo"), *_of_groups(root)]
+    found = [*_meminfo_available(root / "proc/meminfo"), *_groups_available(root)]
     return max(0, min(found)) if found else None
 
 
-def _of_meminfo(path: Path) -> Iterator[int]:
-    for line in text_of(path).splitlines():
+def _meminfo_available(path: Path) -> Iterator[int]:
+    for line in read_system_file(path).splitlines():
         words = line.split()
         if words[:1] == ["MemAvailable:"] and words[1].isdigit():
             yield int(words[1]) * 1024
 
 
-def _of_groups(root: Path) -> Iterator[int]:
-    """What is left in each control group of the process, of either version."""
+def _groups_available(root: Path) -> Iterator[int]:
     for version, folder in control_groups("memory", root):
         if version == 2:
             names = ("memory.max", "memory.current", "inactive_file")
@@ -126,18 +123,18 @@ def _of_groups(root: Path) -> Iterator[int]:
                 "memory.usage_in_bytes",
                 "total_inactive_file",
             )
-        yield from _of_group(folder, *names)
+        yield from _group_available(folder, *names)
 
 
-def _of_group(folder: Path, limit: str, used: str, cache: str) -> Iterator[int]:
-    numbers = [text_of(folder / name).strip() for name in (limit, used)]
-    if not all(number.isdigit() for number in numbers):  # "max", or not there
+def _group_available(folder: Path, limit: str, used: str, cache: str) -> Iterator[int]:
+    numbers = [read_system_file(folder / name).strip() for name in (limit, used)]
+    if not all(number.isdigit() for number in numbers):  # "max", or missing
         return
     most, taken = map(int, numbers)
-    for line in text_of(folder / "memory.stat").splitlines():
+    for line in read_system_file(folder / "memory.stat").splitlines():
         name, _, value = line.partition(" ")
         if name == cache and value.isdigit():
-            taken -= int(value)  # files read long ago, dropped when room is needed
+            taken -= int(value)  # cached files, dropped on demand
     yield most - max(taken, 0)
 
 
@@ -152,7 +149,7 @@ class _Mallinfo2(ctypes.Structure):
 
 
 def _kept() -> int:
-    """Bytes that were freed in this process and not given back; see `keep_memory`."""
+    """Return the bytes that this process freed and kept; see `keep_memory`."""
     try:
         mallinfo = ctypes.CDLL(None).mallinfo2
     except (AttributeError, OSError, TypeError):  # older glibc, musl, macOS, Windows

@@ -1,11 +1,12 @@
-"""Numbers that a caller passes: of the type wanted, or an error that names them.
+"""Checks of the numbers that a caller passes.
 
-NumPy's count as Python's do, and become these: a `numpy.float64` in a program of
-float32 would widen all it touches, where a Python float does not.
+NumPy's numbers become Python's: a `numpy.float64` in a float32 program would promote
+everything it touches, and a Python float does not.
 """
 
 import math
 import operator
+import re
 from dataclasses import fields
 from functools import cache
 from numbers import Real
@@ -17,11 +18,11 @@ import numpy as np
 from gsjax.errors import InputError
 
 
-def whole(name: str, value: Any) -> int:
-    """``value`` as an int.
+def as_int(name: str, value: Any) -> int:
+    """Return an integer as an int.
 
     Raises:
-      InputError: if it is no whole number; ``name`` says which.
+      InputError: if ``value`` is not an integer; ``name`` is that of the argument.
     """
     if not isinstance(value, (bool, np.bool_)):
         try:
@@ -29,45 +30,41 @@ def whole(name: str, value: Any) -> int:
         except TypeError:
             if isinstance(value, Real) and float(value).is_integer():
                 return int(float(value))
-    raise InputError(f"{name} = {value!r}: a whole number is wanted")
+    raise InputError(f"{name}: expected a whole number, got {value!r}")
 
 
-def number(name: str, value: Any) -> float:
-    """``value`` as a float.
+def as_float(name: str, value: Any) -> float:
+    """Return a real number as a float.
 
     Raises:
-      InputError: if it is no real number, or not finite, which files of settings
-        cannot hold; ``name`` says which.
+      InputError: if ``value`` is not a finite real number, as JSON cannot store it;
+        ``name`` is that of the argument.
     """
     if isinstance(value, Real) and not isinstance(value, bool):
         value = float(value)
         if math.isfinite(value):
             return value
-    raise InputError(f"{name} = {value!r}: a finite number is wanted")
+    raise InputError(f"{name}: expected a finite number, got {value!r}")
 
 
-def _flag(name: str, value: Any) -> bool:
+def _as_bool(name: str, value: Any) -> bool:
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
-    raise InputError(f"{name} = {value!r}: True or False is wanted")
+    raise InputError(f"{name}: expected True or False, got {value!r}")
 
 
-_KINDS = {int: whole, float: number, bool: _flag}
+_CONVERT = {int: as_int, float: as_float, bool: _as_bool}
+_hints = cache(get_type_hints)
 
 
-@cache
-def _hints(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind)
+def convert_fields(settings: Any) -> None:
+    """Convert numbers and flags of a frozen dataclass to their annotated types in
+    place.
 
-
-def settle(settings: Any) -> None:
-    """Bring the numbers of a frozen dataclass to the types of its fields, in place.
-
-    For `__post_init__`. Fields that are neither a number nor a flag, nor one of these
-    or None, stay as they are.
+    For `__post_init__`. Other fields, and None where it is allowed, are left alone.
 
     Raises:
-      InputError: if one is of another kind; by class and field.
+      InputError: if a value has another type; names the class and the field.
     """
     kind = type(settings)
     hints = _hints(kind)
@@ -77,25 +74,41 @@ def settle(settings: Any) -> None:
             if value is None and NoneType in get_args(hint):
                 continue
             hint = get_args(hint)[0]
-        if hint in _KINDS:
-            settled = _KINDS[hint](f"{kind.__name__}.{name}", value)
-            object.__setattr__(settings, name, settled)
+        if hint in _CONVERT:
+            converted = _CONVERT[hint](f"{kind.__name__}.{name}", value)
+            object.__setattr__(settings, name, converted)
 
 
-def require_ranges(settings: Any, checks: dict[str, bool]) -> None:
-    """See that all of a dataclass's settings are as they should be.
+def require_ranges(settings: Any, checks: dict[str, str | tuple]) -> None:
+    """Check the values of a dataclass.
 
     Args:
       settings: the dataclass.
-      checks: whether they are, by their names; of more than one, any words.
+      checks: by field, or by "field's part": an interval such as "[1, inf)", which None
+        is always in; a tuple of choices; or whether the value is good, and the values
+        expected.
 
     Raises:
-      InputError: if one is not; by class and name, with what was found.
+      InputError: if a value is not allowed; names the class and the field.
     """
-    for name, good in checks.items():
+    for name, allowed in checks.items():
+        found = getattr(settings, name.split("'")[0], name)
+        if isinstance(allowed, str):
+            good, expected = _within(found, allowed), f"a number in {allowed}"
+        elif isinstance(allowed[0], bool):
+            good, expected = allowed
+        else:
+            good, expected = found in allowed, f"one of {', '.join(map(str, allowed))}"
         if not good:
-            found = getattr(settings, name.split("'")[0], name)
-            raise InputError(
-                f"{type(settings).__name__}.{name} = {found!r} is out of range; see "
-                "its documentation"
-            )
+            where = f"{type(settings).__name__}.{name}"
+            raise InputError(f"{where}: expected {expected}, got {found!r}")
+
+
+def _within(value: float | None, interval: str) -> bool:
+    match = re.fullmatch(r"([\[(])(.+), (.+)([\])])", interval)
+    assert match is not None, interval
+    opening, low, high, closing = match.groups()
+    return value is None or (
+        (float(low) <= value if opening == "[" else float(low) < value)
+        and (value <= float(high) if closing == "]" else value < float(high))
+    )

@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from gsjax.runtime.compilation_cache import remove_oldest, remove_truncated
-from gsjax.runtime.machine import ROOT, text_of, usable_cores
+from gsjax.runtime.machine import ROOT, read_system_file, usable_cores
 
 # Memory that one iteration of a loop may touch for XLA to compile the loop as a kernel.
 KERNEL_BYTES = 131_072
@@ -118,8 +118,8 @@ def warn_if_unprepared() -> None:
 
 
 def compile_loops_as_kernels() -> None:
-    """Let XLA's CPU backend compile a loop as one single-threaded kernel if an iteration
-    touches at most `KERNEL_BYTES`; XLA's default is 1 kB.
+    """Let XLA's CPU backend compile a loop as one single-threaded kernel if an
+    iteration touches at most `KERNEL_BYTES`; XLA's default is 1 kB.
 
     An image is then composited by one such loop. Adds an option to ``XLA_FLAGS``, which
     XLA reads when JAX starts and which are part of the key of cached programs, so they
@@ -220,7 +220,7 @@ def restart_with_large_pages(root: Path = ROOT) -> None:
     """
     name = "glibc.malloc.hugetlb"
     known = os.environ.get("GLIBC_TUNABLES", "")
-    choice = text_of(root / "sys/kernel/mm/transparent_hugepage/enabled")
+    choice = read_system_file(root / "sys/kernel/mm/transparent_hugepage/enabled")
     if "[madvise]" not in choice or name in known or not sys.executable:
         return
     interactive = len(sys.orig_argv) < 2 or sys.argv[0] in ("", "-")

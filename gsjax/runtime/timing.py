@@ -1,4 +1,4 @@
-"""How long something takes, and on what machine."""
+"""Run times, and the machine they were measured on."""
 
 import platform
 import time
@@ -14,24 +14,18 @@ from gsjax.runtime.machine import usable_cores
 
 
 def time_ms(function: Callable[[], Any], repeats: int = 9) -> list[float]:
-    """Milliseconds of each of ``repeats`` calls, after one that is not counted."""
+    """Return the milliseconds of each of ``repeats`` calls, after one warm-up call."""
     jax.block_until_ready(function())
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(function())
-        times.append(1e3 * (time.perf_counter() - start))
-    return times
+    return [_time_ms(function) for _ in range(repeats)]
 
 
 def interleaved(
     functions: Mapping[str, Callable[[], Any]], repeats: int = 9
 ) -> dict[str, float]:
-    """Median ms of each function, all taken in turn, in a new order each round: A B C
-    C A B …
+    """Return the median milliseconds of each function, called in turn.
 
-    So that a drift of a shared machine, and what one leaves in the caches for the next,
-    fall on all of them and ratios hold.
+    Every round calls all functions in a new order, so that drift of a shared machine
+    and the contents of caches affect all of them alike.
     """
     for function in functions.values():
         jax.block_until_ready(function())
@@ -40,14 +34,18 @@ def interleaved(
     for _ in range(repeats):
         for place in rng.permutation(len(calls)):
             name, function = calls[place]
-            start = time.perf_counter()
-            jax.block_until_ready(function())
-            times[name].append(1e3 * (time.perf_counter() - start))
+            times[name].append(_time_ms(function))
     return {name: float(np.median(t)) for name, t in times.items()}
 
 
+def _time_ms(function: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    jax.block_until_ready(function())
+    return 1e3 * (time.perf_counter() - start)
+
+
 def machine() -> dict[str, str]:
-    """What the numbers were measured on."""
+    """Return the date, processor, devices and versions, to store beside timings."""
     cpu = platform.processor()
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()

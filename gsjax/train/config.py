@@ -10,7 +10,7 @@ from gsjax.densify.schedule import EditSchedule
 from gsjax.densify.types import Strategy
 from gsjax.errors import InputError
 from gsjax.raster.types import RasterConfig
-from gsjax.runtime.settings import number, require_ranges, settle
+from gsjax.runtime.settings import as_float, convert_fields, require_ranges
 from gsjax.train.optimiser import Rates
 
 STRATEGIES = ("adaptive", "mcmc")
@@ -34,7 +34,7 @@ class Level:
     divisor: int
 
     def __post_init__(self):
-        settle(self)
+        convert_fields(self)
 
 
 # Compile faster: a run grows its capacities itself, so one size suffices; and few
@@ -116,18 +116,13 @@ class TrainConfig:
     raster: RasterConfig = _RASTER
 
     def __post_init__(self):
-        settle(self)
+        convert_fields(self)
         choices = {
             "strategy": STRATEGIES,
             "background": BACKGROUNDS,
             "initial": INITIALS,
         }
-        for name, known in choices.items():
-            if getattr(self, name) not in known:
-                raise InputError(
-                    f"TrainConfig.{name}: expected one of {', '.join(known)}, got "
-                    f"{getattr(self, name)!r}"
-                )
+        require_ranges(self, choices)
         if self.raster is _RASTER or self.raster is _ACCURATE:
             default = _ACCURATE if self.refine_poses else _RASTER
             object.__setattr__(self, "raster", default)
@@ -135,32 +130,36 @@ class TrainConfig:
         object.__setattr__(self, "rates", rates)
         first, last = rates.means
         settings = self.strategy_settings
+        levels = bool(self.levels) and self.levels[0].start == 0
+        levels &= all(a.start < b.start for a, b in pairwise(self.levels))
+        levels &= all(level.divisor >= 1 for level in self.levels)
+        means = first == last >= 0 or min(first, last) > 0
+        positive = all(0 <= rate < math.inf for rate in (first, last, *rates[1:]))
+        cooling_from = 0 <= rates.cooling_from < 1
+        opacity, scale = 0 < settings.initial_opacity < 1, settings.initial_scale > 0
         checks = {
-            "steps": 1 <= self.steps < 2**31 - 1,
-            "seed": 0 <= self.seed < 2**31,
-            "batch": self.batch >= 1,
-            "max_size": self.max_size is None or self.max_size >= 8,
-            "levels": bool(self.levels)
-            and self.levels[0].start == 0
-            and all(a.start < b.start for a, b in pairwise(self.levels))
-            and all(level.divisor >= 1 for level in self.levels),
-            "sh_degree": 0 <= self.sh_degree <= 4,
-            "sh_every": self.sh_every >= 1,
-            "ssim_weight": 0 <= self.ssim_weight <= 1,
-            "rates' means": first == last >= 0 or min(first, last) > 0,
-            "rates' cooling": 0 < rates.cooling <= 1,
-            "rates' cooling_from": 0 <= rates.cooling_from < 1,
-            "rates": all(0 <= rate < math.inf for rate in (first, last, *rates[1:])),
-            "pose_rate": 0 <= self.pose_rate < math.inf,
-            "intrinsics_rate": 0 <= self.intrinsics_rate < math.inf,
-            "exposure_rate": 0 <= self.exposure_rate < math.inf,
-            "initial_count": self.initial_count >= 1,
-            "dense_count": self.dense_count >= 0,
-            f"{self.strategy}'s initial_opacity": 0 < settings.initial_opacity < 1,
-            f"{self.strategy}'s initial_scale": settings.initial_scale > 0,
-            "max_initial": self.max_initial >= 1,
-            "every_eval": self.every_eval >= 0,
-            "every_checkpoint": self.every_checkpoint >= 0,
+            "steps": f"[1, {2**31 - 1})",
+            "seed": f"[0, {2**31})",
+            "batch": "[1, inf)",
+            "max_size": "[8, inf)",
+            "levels": (levels, "increasing starts from 0 and divisors ≥ 1"),
+            "sh_degree": "[0, 4]",
+            "sh_every": "[1, inf)",
+            "ssim_weight": "[0, 1]",
+            "rates' means": (means, "two positive numbers, or equal ones"),
+            "rates' cooling": (0 < rates.cooling <= 1, "cooling in (0, 1]"),
+            "rates' cooling_from": (cooling_from, "cooling_from in [0, 1)"),
+            "rates": (positive, "numbers ≥ 0"),
+            "pose_rate": "[0, inf)",
+            "intrinsics_rate": "[0, inf)",
+            "exposure_rate": "[0, inf)",
+            "initial_count": "[1, inf)",
+            "dense_count": "[0, inf)",
+            f"{self.strategy}'s initial_opacity": (opacity, "a number in (0, 1)"),
+            f"{self.strategy}'s initial_scale": (scale, "a number in (0, inf)"),
+            "max_initial": "[1, inf)",
+            "every_eval": "[0, inf)",
+            "every_checkpoint": "[0, inf)",
         }
         require_ranges(self, checks)
 
@@ -214,10 +213,10 @@ def _as_floats(rates: Rates) -> Rates:
       InputError: if one is not a number.
     """
     first, last = rates.means
-    means = number("Rates.means", first), number("Rates.means", last)
+    means = as_float("Rates.means", first), as_float("Rates.means", last)
     rest = rates._asdict()
     del rest["means"]
-    return Rates(means, **{k: number(f"Rates.{k}", v) for k, v in rest.items()})
+    return Rates(means, **{k: as_float(f"Rates.{k}", v) for k, v in rest.items()})
 
 
 def scaled(config: TrainConfig, steps: int) -> TrainConfig:

@@ -34,7 +34,7 @@ from gsjax.plots.contact_sheets import (
 from gsjax.plots.figures import Series, curves
 from gsjax.raster.exact import render_exact
 from gsjax.raster.types import RasterConfig, Render
-from gsjax.runtime.settings import whole
+from gsjax.runtime.settings import as_int
 from gsjax.train.loop import Progress
 from gsjax.train.state import TrainState
 from gsjax.viewer.pictures import MIME_TYPES, MIN_SIZE, Movie, Picture
@@ -64,7 +64,7 @@ def picture(
       InputError: if a value is not a picture, there is none, the number of captions
         differs, or the zoom is below 1.
     """
-    if whole("zoom", zoom) < 1:
+    if as_int("zoom", zoom) < 1:
         raise InputError(f"zoom: expected an integer of at least 1, got {zoom}")
     cells = [cell for value in values for cell in _cells(value)]
     if captions is not None:
@@ -160,7 +160,7 @@ def live(
     Raises:
       InputError: if ``every`` is below 1.
     """
-    if whole("every", every) < 1:
+    if as_int("every", every) < 1:
         raise InputError(f"every: expected at least 1 step, got {every}")
     fixed = config or RasterConfig(num_size_buckets=1)
     fixed = fixed.replace(outputs=("rgb", "depth"), absgrad=False)

@@ -5,7 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsjax.math.numerics import exp_negative, held, near_one, once, safe_normalize
+from gsjax.math.numerics import (
+    exp_negative,
+    materialize,
+    materialize_mask,
+    near_one,
+    safe_normalize,
+)
 from gsjax.math.rotations import covariance, quaternion_to_matrix, times_covariance
 
 pytestmark = pytest.mark.as_users
@@ -129,8 +135,8 @@ def test_slopes_of_a_rotation_by_what_is_zero():
 def test_what_is_worked_out_once_stays_as_it_is():
     values = jnp.float32([3e38, -1e-37, 1 / 3, 0.0, -0.0, np.inf, 5.0])
     mask = jnp.asarray([True, True, True, True, True, True, False])
-    assert np.array_equal(jax.jit(held)(mask), mask)
-    (found,) = jax.jit(lambda v: once((v,), mask))(values)
+    assert np.array_equal(jax.jit(materialize_mask)(mask), mask)
+    (found,) = jax.jit(lambda v: materialize((v,), mask))(values)
     assert found.dtype == values.dtype
     assert np.array_equal(found[mask].view(np.int32), values[mask].view(np.int32))
 
@@ -142,7 +148,7 @@ def test_what_is_worked_out_once_has_the_slope_of_what_it_is(double):
         mask = values > -2.5
 
         def total(values):
-            return jnp.sum(jnp.where(mask, once((jnp.sin(values),), mask)[0], 0))
+            return jnp.sum(jnp.where(mask, materialize((jnp.sin(values),), mask)[0], 0))
 
         expected = np.where(mask, jnp.cos(values), 0)
         assert np.array_equal(jax.jit(jax.grad(total))(values), expected)
@@ -151,5 +157,5 @@ def test_what_is_worked_out_once_has_the_slope_of_what_it_is(double):
 def test_elsewhere_nothing_is_done_for_it(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     mask, values = jnp.asarray([True, False]), (jnp.ones(2), jnp.zeros(2))
-    assert held(mask) is mask
-    assert once(values, mask) is values
+    assert materialize_mask(mask) is mask
+    assert materialize(values, mask) is values

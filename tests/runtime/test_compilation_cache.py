@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsjax.runtime.compilation_cache import is_whole, remove_oldest, remove_truncated
+from gsjax.runtime.compilation_cache import is_complete, remove_oldest, remove_truncated
 
 
 def test_the_oldest_go_first(tmp_path):
@@ -44,15 +44,15 @@ def zstd_frames() -> list[bytes]:
 @pytest.mark.parametrize("frames", [zstd_frames, lambda: map(zlib.compress, texts())])
 def test_no_beginning_of_a_whole_one_is_whole(frames):
     for frame in frames():
-        assert is_whole(frame)
+        assert is_complete(frame)
         ends = {*range(min(40, len(frame))), len(frame) - 1, len(frame) // 2}
         ends |= set(range(0, len(frame), 997))
-        assert not any(is_whole(frame[:end]) for end in ends)
+        assert not any(is_complete(frame[:end]) for end in ends)
 
 
 def test_what_was_never_written_is_not_whole_and_what_is_unknown_may_be():
-    assert not is_whole(bytes(4096))
-    assert is_whole(b"LZ4 or whatever comes")
+    assert not is_complete(bytes(4096))
+    assert is_complete(b"LZ4 or whatever comes")
 
 
 def test_each_is_looked_at_once_and_others_are_left_alone(tmp_path):

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from gsjax.runtime.console import harmless, note, one_line, stopping_on_ctrl_c
+from gsjax.runtime.console import deferred_interrupt, escape_controls, note, one_line
 
 
 @pytest.fixture(autouse=True)
@@ -18,7 +18,7 @@ def _as_it_was():
 def test_nothing_is_told_that_a_terminal_would_obey(capsys):
     codes = [*range(32), *range(127, 160), *range(0x202A, 0x202F)]
     text = "".join(map(chr, codes))
-    kept = harmless(f"a{text}é∞\u200d\tb\n")
+    kept = escape_controls(f"a{text}é∞\u200d\tb\n")
     assert kept.startswith("a\\x00\\x01")
     assert kept.endswith("é∞\u200d\tb\n")
     assert [letter for letter in kept if letter in text] == ["\t", "\n", "\t", "\n"]
@@ -37,7 +37,7 @@ def test_what_is_too_long_keeps_both_its_ends():
 
 def test_once_asks_and_twice_stops(capsys):
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    with stopping_on_ctrl_c() as stopped:
+    with deferred_interrupt() as stopped:
         assert not stopped()
         signal.raise_signal(signal.SIGINT)
         assert stopped()
@@ -50,7 +50,7 @@ def test_once_asks_and_twice_stops(capsys):
 def test_what_ignores_it_goes_on(capsys):
     """As a shell script starts what it puts in the background."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with stopping_on_ctrl_c() as stopped:
+    with deferred_interrupt() as stopped:
         for _ in range(2):
             signal.raise_signal(signal.SIGINT)
         assert not stopped()
@@ -62,7 +62,7 @@ def test_a_handler_that_python_does_not_know_stays(monkeypatch):
     before = signal.getsignal(signal.SIGINT)
     with monkeypatch.context() as patched:
         patched.setattr(signal, "getsignal", lambda _: None)
-        with stopping_on_ctrl_c() as stopped:
+        with deferred_interrupt() as stopped:
             assert not stopped()
     assert signal.getsignal(signal.SIGINT) is before
 
@@ -71,7 +71,7 @@ def test_off_the_main_thread_nothing_changes():
     before, found = signal.getsignal(signal.SIGINT), []
 
     def work():
-        with stopping_on_ctrl_c() as stopped:
+        with deferred_interrupt() as stopped:
             found.append((stopped(), signal.getsignal(signal.SIGINT)))
 
     thread = threading.Thread(target=work)

@@ -99,7 +99,7 @@ def test_each_is_one_kernel_that_copies_nothing_in_a_turn(in_a_process):
     for program in programs:
         inside, entry = program.split("ENTRY")
         assert "xla_cpu_small_call" in entry
-        assert not loops.has_loop_by_turns(program)
+        assert not loops.has_interpreted_loop(program)
         padded = SIZE + 3  # of counts: a multiple of four
         assert not re.search(rf"\[({SIZE}|{padded})[^ ]* copy\(", inside)
 

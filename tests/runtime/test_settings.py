@@ -29,7 +29,7 @@ def test_whole_numbers(value):
     "value", [7.5, np.nan, np.inf, "7", None, True, np.True_, [7], 7j], ids=repr
 )
 def test_no_whole_numbers(value):
-    with pytest.raises(InputError, match=r"^x = .*: a whole number is wanted"):
+    with pytest.raises(InputError, match=r"^x: expected a whole number"):
         whole("x", value)
 
 
@@ -46,7 +46,7 @@ def test_numbers(value):
     "value", [np.nan, -np.inf, "0.5", None, True, [0.5], 0.5j], ids=repr
 )
 def test_no_numbers(value):
-    with pytest.raises(InputError, match=r"^x = .*: a finite number is wanted"):
+    with pytest.raises(InputError, match=r"^x: expected a finite number"):
         number("x", value)
 
 
@@ -73,7 +73,7 @@ def test_numbers_of_numpy_become_those_of_python(kind):
         (RasterConfig, "tile_size", True, "a whole number"),
         (RasterConfig, "pair_capacity", "100", "a whole number"),
         (RasterConfig, "visible_capacity", 10.5, "a whole number"),
-        (RasterConfig, "stop", "0", "a finite number"),
+        (RasterConfig, "transmittance_min", "0", "a finite number"),
         (RasterConfig, "dilation", None, "a finite number"),
         (RasterConfig, "antialias", 1, "True or False"),
         (RasterConfig, "absgrad", "yes", "True or False"),
