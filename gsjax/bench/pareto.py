@@ -7,6 +7,7 @@ pixels, including the worst of every point, the error is compared with its bound
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.bench import pixelwise
-from gsjax.cameras.camera import Camera
 from gsjax.gaussians import Gaussians, with_sh_degree
 from gsjax.math.numerics import in_float64
 from gsjax.planning.types import Plan
@@ -23,33 +23,22 @@ from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig
 from gsjax.runtime.console import progress
 from gsjax.runtime.devices import on_cpu
-from gsjax.runtime.machine import all_of, usable_cores
+from gsjax.runtime.machine import usable_cores
 from gsjax.runtime.timing import interleaved
 from gsjax.synthetic.stress_scenes import StressScene
 
-_EXACT = RasterConfig.accurate(
-    alpha_min=1e-9,
-    alpha_max=1 - 1e-12,
-    transmittance_min=1e-9,
-    outputs=("rgb",),
-    num_size_buckets=1,
-    devices=1,
-)
-_CUTOFFS = {"1/255": 1 / 255, "1/1024": 1 / 1024, "1e-4": 1e-4}
+_CUTOFFS = {"alpha_min": 1e-9, "alpha_max": 1 - 1e-12, "transmittance_min": 1e-9}
+_COMMON: dict[str, Any] = {"outputs": ("rgb",), "num_size_buckets": 1}
+_EXACT = RasterConfig.accurate(**_CUTOFFS, **_COMMON, devices=1)
+_CAPACITIES = ("pair_capacity", "visible_capacity")
 _PIXELS = 48  # random pixels to compare with bounds
 _LEAST = 1e-30
-_BETTER = 0.05  # relative improvement that is worth more time
 
 
 class Point(NamedTuple):
-    """One point of the plot.
+    """One point of the plot: the setting that changes, and its value as text.
 
-    Attributes:
-      knob: the setting that changes.
-      value: its value, as text.
-      config: all points.
-      degree: SH degree; None keeps that of the scene.
-      double: use float64.
+    A ``degree`` of None keeps the SH degree of the scene; ``double`` uses float64.
     """
 
     knob: str
@@ -60,40 +49,40 @@ class Point(NamedTuple):
 
 
 class _Program(NamedTuple):
-    """Compiled calls of one point, and their results."""
+    """Compiled calls of one point, their rgb and their gradient."""
 
     forward: Any
     gradient: Any
     rgb: np.ndarray
-    grads: list[np.ndarray]
+    grads: np.ndarray
 
 
 def make_points(gaussians: Gaussians, plan: Plan | None = None) -> list[Point]:
     """Return the presets, `RasterConfig.accurate` with one change each, and a plan."""
-    common: dict[str, Any] = {"outputs": ("rgb",), "num_size_buckets": 1}
-    base = RasterConfig.accurate(**common)
+    base = RasterConfig.accurate(**_COMMON)
     # The bound of the rule "before" is ε / (1 − alpha_max): it needs a low alpha_max.
     before = base.replace(transmittance_min=1e-4, stop_rule="before", alpha_max=0.99)
     changes = [
-        *(("cut", text, {"alpha_min": value}) for text, value in _CUTOFFS.items()),
-        *(("stop after", t, {"transmittance_min": float(t)}) for t in ("1e-2", "1e-3")),
+        ("cut", "1/255", {"alpha_min": 1 / 255}),
+        ("cut", "1/1024", {"alpha_min": 1 / 1024}),
+        ("cut", "1e-4", {"alpha_min": 1e-4}),
+        ("stop after", "1e-2", {"transmittance_min": 1e-2}),
+        ("stop after", "1e-3", {"transmittance_min": 1e-3}),
+        ("tile", "4", {"tile_size": 4}),
+        ("tile", "16", {"tile_size": 16}),
+        ("chunk", "64", {"chunk_size": 64}),
     ]
-    sizes = [("tile", 4, "tile_size"), ("tile", 16, "tile_size")]
-    sizes.append(("chunk", 64, "chunk_size"))
     found = [
-        Point("compat", "", RasterConfig.compat(**common)),
+        Point("compat", "", RasterConfig.compat(**_COMMON)),
         Point("accurate", "", base),
-        Point("fast", "", RasterConfig.fast(**common)),
+        Point("fast", "", RasterConfig.fast(**_COMMON)),
         *(Point(knob, text, base.replace(**change)) for knob, text, change in changes),
         Point("stop before", "1e-4", before),
         *(Point("SH degree", str(d), base, d) for d in range(gaussians.sh_degree)),
-        *(Point(knob, str(n), base.replace(**{name: n})) for knob, n, name in sizes),
         Point("dtype", "float64", base, double=True),
     ]
     if plan is not None:
-        config = plan.config.replace(
-            **common, pair_capacity=None, visible_capacity=None
-        )
+        config = plan.config.replace(**_COMMON, **dict.fromkeys(_CAPACITIES))
         found.append(Point("plan", "", config, plan.gaussians.sh_degree))
     return found
 
@@ -117,7 +106,8 @@ def measure_points(
     others = rng.integers(0, shape[1::-1], (_PIXELS, 2))
     pixels = np.unique(np.concatenate([np.asarray(worst), others]), axis=0)
     bounds, gap = _bounds(scene, points, pixels, exact.rgb)
-    ms = [_times(programs, points, name, repeats) for name in ("forward", "gradient")]
+    ms = _times(programs, points, repeats)
+    size = max(float(np.linalg.norm(exact.grads)), _LEAST)
     rows = []
     for index, (point, program) in enumerate(zip(points, programs)):
         at = errors[index][pixels[:, 1], pixels[:, 0]]
@@ -128,11 +118,11 @@ def measure_points(
                 "scene": scene.name,
                 "knob": point.knob,
                 "value": point.value,
-                "forward ms": ms[0][index],
-                "gradient ms": ms[1][index],
+                "forward ms": ms[f"forward {index}"],
+                "gradient ms": ms[f"gradient {index}"],
                 "max": float(errors[index].max()),
                 "psnr": -10 * np.log10(max(mean, _LEAST)),
-                "gradient": _relative(program.grads, exact.grads),
+                "gradient": float(np.linalg.norm(program.grads - exact.grads)) / size,
                 "at worst": float(at[nearest]),
                 "bound": float(bounds[index][nearest]),
                 "inside": bool((at <= bounds[index]).all()) and gap < 1e-5,
@@ -145,53 +135,34 @@ def _compile_all(
     scene: StressScene, points: Sequence[Point], weights: np.ndarray
 ) -> list[_Program]:
     """Return the program of the exact image and that of each point, all compiled."""
-    exact = Point("exact", "", _EXACT, double=True)
-    known: dict[tuple, RasterConfig] = {}
-
-    def ready(point: Point) -> _Program:
-        program = _compile(scene, point, weights, known)
-        if point is not exact:
-            with jax.enable_x64(point.double):
-                jax.block_until_ready(program.forward())
-        return program
-
-    every = [exact, *points]
+    ready = partial(_compile, scene, weights, {})
+    every = [Point("exact", "", _EXACT, double=True), *points]
     if on_cpu():
         # Compilations and programs would compete for the cores.
         return [ready(point) for point in progress(every, "points")]
     with ThreadPoolExecutor(usable_cores()) as pool:
-        return all_of(pool, ready, every)
-
-
-def _fitted(
-    point: Point, gaussians: Gaussians, camera: Camera, known: dict[tuple, RasterConfig]
-) -> RasterConfig:
-    """Return the config of a point with capacities that fit, unless it has its own.
-
-    ``known`` keeps them for points of equal sizes.
-    """
-    config = point.config
-    if config.pair_capacity is not None:
-        return config
-    sizes = config.alpha_min, config.tile_size, config.chunk_size, point.double
-    if sizes not in known:
-        known[sizes] = exact_config(gaussians, camera, config)
-    return config.replace(
-        pair_capacity=known[sizes].pair_capacity,
-        visible_capacity=known[sizes].visible_capacity,
-    )
+        return list(pool.map(ready, every))
 
 
 def _compile(
-    scene: StressScene, point: Point, weights: np.ndarray, known: dict
+    scene: StressScene, weights: np.ndarray, known: dict, point: Point
 ) -> _Program:
-    """Compile the calls of a point, and run its gradient once."""
+    """Compile the calls of a point with capacities that fit, unless it has its own.
+
+    ``known`` keeps the capacities for points of equal sizes.
+    """
     with jax.enable_x64(point.double):
         gaussians, camera = scene.gaussians, scene.camera
         if point.double:
             gaussians, camera = in_float64((gaussians, camera))
         degree = gaussians.sh_degree if point.degree is None else point.degree
-        config = _fitted(point, gaussians, camera, known)
+        config = point.config
+        if config.pair_capacity is None:
+            sizes = config.alpha_min, config.tile_size, config.chunk_size, point.double
+            if sizes not in known:
+                known[sizes] = exact_config(gaussians, camera, config)
+            fitted = {n: getattr(known[sizes], n) for n in _CAPACITIES}
+            config = config.replace(**fitted)
         params = gaussians.params
         background = jnp.asarray(scene.background, params.means.dtype)
         by_rgb = jnp.asarray(weights, params.means.dtype)
@@ -206,30 +177,32 @@ def _compile(
 
         forward = jax.jit(image)
         gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))
+        if point.config is not _EXACT:  # its time does not count
+            jax.block_until_ready(forward(params))
         (_, rgb), grads = gradient(params, by_rgb)
         return _Program(
-            lambda: forward(params),
-            lambda: gradient(params, by_rgb),
+            partial(forward, params),
+            partial(gradient, params, by_rgb),
             np.asarray(rgb, np.float64),
-            [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(grads)],
+            np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(grads)]),
         )
 
 
 def _times(
-    programs: Sequence[_Program], points: Sequence[Point], name: str, repeats: int
-) -> list[float]:
-    """Return the median ms of each, in turn; float64 apart, as another mode of JAX."""
-    out = [0.0] * len(programs)
+    programs: Sequence[_Program], points: Sequence[Point], repeats: int
+) -> dict[str, float]:
+    """Return the median ms of each call; float64 apart, as another mode of JAX."""
+    ms = {}
     for double in (False, True):
-        chosen = {
-            str(i): getattr(program, name)
-            for i, (program, point) in enumerate(zip(programs, points))
+        calls = {
+            f"{name} {index}": getattr(program, name)
+            for index, (program, point) in enumerate(zip(programs, points))
+            for name in ("forward", "gradient")
             if point.double == double
         }
         with jax.enable_x64(double):
-            for index, ms in interleaved(chosen, repeats).items():
-                out[int(index)] = ms
-    return out
+            ms |= interleaved(calls, repeats)
+    return ms
 
 
 def _bounds(
@@ -245,22 +218,11 @@ def _bounds(
         gap = np.abs(found.rgb - exact[pixels[:, 1], pixels[:, 0]]).max()
         bounds = [
             pixelwise.error_bound(
-                found,
-                gaussians,
-                camera,
-                point.config,
-                degree=gaussians.sh_degree if point.degree is None else point.degree,
-                dtype="float64" if point.double else "float32",
+                found, gaussians, camera, point.config, point.degree, point.double
             )
             for point in points
         ]
     return bounds, float(gap)
-
-
-def _relative(found: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> float:
-    """Return the relative L2 error of all gradients together."""
-    off = sum(np.sum((a - b) ** 2) for a, b in zip(found, exact))
-    return float(np.sqrt(off / max(sum(np.sum(b**2) for b in exact), 1e-300)))
 
 
 def time_stages(scene: StressScene, repeats: int = 5) -> dict[str, float]:
@@ -277,15 +239,13 @@ def time_stages(scene: StressScene, repeats: int = 5) -> dict[str, float]:
         gaussians = scene.gaussians.replace(params=params)  # pyright: ignore
         return render(gaussians, scene.camera, config, background)
 
-    def total(params):
-        return jnp.sum(jnp.asarray(image(params).rgb))
-
     functions = {
-        "lists": jax.jit(lambda params: image(params).demand),
-        "forward": jax.jit(lambda params: image(params)[:3]),
-        "gradient": jax.jit(jax.value_and_grad(total)),
+        "lists": lambda params: image(params).demand,
+        "forward": lambda params: image(params)[:3],
+        "gradient": jax.value_and_grad(lambda params: jnp.sum(image(params).rgb)),  # pyright: ignore
     }
-    ms = interleaved({n: lambda f=f: f(params) for n, f in functions.items()}, repeats)
+    calls = {n: partial(jax.jit(f), params) for n, f in functions.items()}
+    ms = interleaved(calls, repeats)
     return {
         "lists": ms["lists"],
         "composite": ms["forward"] - ms["lists"],
@@ -305,7 +265,7 @@ def front(
     order = sorted(range(len(rows)), key=lambda i: (rows[i][time], rows[i][error]))
     best, kept = float("inf"), []
     for index in order:
-        if rows[index][error] < (1 - _BETTER) * best:
+        if rows[index][error] < 0.95 * best:
             best = rows[index][error]
             kept.append(index)
     return kept

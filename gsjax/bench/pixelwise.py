@@ -10,27 +10,23 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from scipy.special import expit
 
 from gsjax.cameras.camera import Camera
 from gsjax.gaussians import Gaussians, with_sh_degree
 from gsjax.raster.reference import reference_colors, reference_project
 from gsjax.raster.types import RasterConfig
 
-# Largest rounding error relative to the largest colour.
-ROUNDING = {"float32": 1e-4, "float64": 1e-9}
+# Largest rounding error relative to the largest colour, by the use of float64.
+_ROUNDING = {False: 1e-4, True: 1e-9}
 _SEEN = 1e-14
 
 
 class Dense(NamedTuple):
-    """All splats at some pixels.
+    """All splats at some pixels: slots [N], α [N, P] without cutoffs, colours [N, 3].
 
-    Attributes:
-      order: [N] their slots.
-      alpha: [N, P] without cutoffs.
-      colors: [N, 3].
-      spread: [P] colour range there, of the channel where it is largest.
-      largest: [P] largest absolute colour there, including the background.
-      rgb: [P, 3] image.
+    ``spread`` [P] is the colour range there, of the channel where it is largest;
+    ``largest`` [P] the largest absolute colour, with the background; ``rgb`` [P, 3].
     """
 
     order: np.ndarray
@@ -55,8 +51,7 @@ def composite_dense(
     order = np.flatnonzero(seen)[np.argsort(depth[seen], kind="stable")]
     colors = np.asarray(jax.jit(reference_colors)(gaussians, camera))[order]
     inverse = np.linalg.inv(cov2d[order])
-    logits = np.asarray(gaussians.params.logit_opacities, np.float64)[order]
-    opacity = 1 / (1 + np.exp(-logits))
+    opacity = expit(np.asarray(gaussians.params.logit_opacities, np.float64)[order])
     alpha = np.empty((len(order), len(pixels)))
     for index, pixel in enumerate(np.asarray(pixels) + 0.5):
         offset = pixel - means2d[order]
@@ -86,18 +81,16 @@ def error_bound(
     gaussians: Gaussians,
     camera: Camera,
     config: RasterConfig,
-    *,
-    degree: int,
-    dtype: str,
+    degree: int | None = None,
+    double: bool = True,
 ) -> np.ndarray:
     """Bound the error of a channel at the pixels, [P]: the sum over all settings.
 
     Args:
-      found: the splats at the pixels.
-      gaussians, camera: as for `composite_dense`.
+      found: result of `composite_dense` for ``gaussians`` and ``camera``.
       config: its cutoffs count, see `gsjax.planning.bounds`.
-      degree: SH degree that is rendered.
-      dtype: "float32" or "float64"; for the rounding, see `ROUNDING`.
+      degree: SH degree that is rendered; None for that of the scene.
+      double: rendered in float64, whose rounding is less.
     """
     alpha, spread = found.alpha, found.spread
     capped = np.minimum(alpha, config.alpha_max)
@@ -112,16 +105,10 @@ def error_bound(
         most = threshold / np.maximum(1 - kept.max(axis=0), 1e-16)
     by_stop = np.where(left <= threshold * (1 + 1e-3), np.minimum(most, 1), 0)
     total = spread * (by_alpha_max + by_alpha_min + by_stop)
-    total = total + ROUNDING[dtype] * found.largest
-    if degree < gaussians.sh_degree:
-        total = total + _band_change(found, gaussians, camera, degree)
-    return total
-
-
-def _band_change(
-    found: Dense, gaussians: Gaussians, camera: Camera, degree: int
-) -> np.ndarray:
-    """Return Σ w_i |change of the colour| of the channel where it is largest, [P]."""
+    total = total + _ROUNDING[double] * found.largest
+    if degree is None or degree >= gaussians.sh_degree:
+        return total
+    # Σ w_i |change of the colour| of the channel where it is largest.
     fewer = jax.jit(reference_colors)(with_sh_degree(gaussians, degree), camera)
     change = np.abs(np.asarray(fewer)[found.order] - found.colors)
-    return (_weights(found.alpha)[0].T @ change).max(axis=1)
+    return total + (_weights(alpha)[0].T @ change).max(axis=1)

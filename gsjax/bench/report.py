@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from gsjax.bench.pareto import front
-from gsjax.plots import figures
+from gsjax.plots.figures import figure_pixels, new_chart, plain
 
 if typing.TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.text import Annotation
 
 _LEAST = 1e-8  # smaller errors are drawn here
-_SIZE = (860, 1120)
-_SMALL = 7  # points
 
 
 def table(rows: Sequence[dict], on_front: Sequence[int]) -> str:
@@ -25,18 +21,18 @@ def table(rows: Sequence[dict], on_front: Sequence[int]) -> str:
 
     The share is that of the pixel where the error comes nearest to its bound.
     """
-    head = (
+    lines = [
         f"  {'':<18}{'forward':>9}{'gradient':>9}{'max':>11}{'PSNR':>8}"
-        f"{'gradient':>10}{'of bound':>10}"
-    )
-    units = f"  {'':<18}{'ms':>9}{'ms':>9}{'/255':>11}{'dB':>8}{'rel. L2':>10}{'%':>10}"
-    lines = [head, units]
+        f"{'gradient':>10}{'of bound':>10}",
+        f"  {'':<18}{'ms':>9}{'ms':>9}{'/255':>11}{'dB':>8}{'rel. L2':>10}{'%':>10}",
+    ]
     for index, row in enumerate(rows):
         mark = "*" if index in on_front else " "
         outside = "" if row["inside"] else "  OUTSIDE"
         share = row["at worst"] / max(row["bound"], _LEAST)
         lines.append(
-            f"{mark} {_label(row):<18}{row['forward ms']:9.2f}{row['gradient ms']:9.2f}"
+            f"{mark} {row['knob'] + ' ' + row['value']:<18}"
+            f"{row['forward ms']:9.2f}{row['gradient ms']:9.2f}"
             f"{255 * row['max']:11.4g}{row['psnr']:8.1f}{row['gradient']:10.2g}"
             f"{100 * share:10.2g}{outside}"
         )
@@ -54,7 +50,7 @@ def front_picture(
     elsewhere: Sequence[tuple[str, Sequence[dict]]] = (),
 ) -> np.ndarray:
     """Return the pixels [H, W, 3] uint8 of `front_figure`."""
-    return figures.figure_pixels(front_figure(rows, name, elsewhere))
+    return figure_pixels(front_figure(rows, name, elsewhere))
 
 
 def front_figure(
@@ -69,90 +65,38 @@ def front_figure(
       name: of the scene.
       elsewhere: (device, rows) of other devices; only their fronts are drawn.
     """
-    figure, axes = figures.new_chart(_SIZE, rows=2)
+    figure, axes = new_chart((860, 1120), rows=2)
     knobs = list(dict.fromkeys(row["knob"] for row in rows))
     for each, time, error, title in (
         (axes[0], "forward ms", "max", "forward, largest error of rgb"),
         (axes[1], "gradient ms", "gradient", "value and gradient, relative L2"),
     ):
-        each.set(xscale="log", yscale="log")
+        each.set(xscale="log", yscale="log", xlabel="ms", ylabel="error")
         each.margins(0.1)
-        figures.label_axes(each, f"{name}: {title}", "ms", "error")
-        _draw(each, rows, front(rows, time, error), knobs, (time, error))
-        for device, others in elsewhere:
-            best = front(others, time, error)
-            some = [others[i] for i in best]
-            _draw(each, some, range(len(some)), knobs, (time, error), f"{device}: ")
-    figure.draw_without_rendering()  # places the axes
-    figure.set_layout_engine("none")
-    for each in axes:
-        _place_labels(each)
+        each.set_title(f"{plain(name)}: {title}")
+        for index, knob in enumerate(knobs):
+            some = [row for row in rows if row["knob"] == knob]
+            x, y = _points(some, time, error)
+            color, marker = f"C{index % 10}", "os^Dv*P"[index % 7]
+            each.scatter(x, y, label=plain(knob), color=color, marker=marker)
+            for row, at in zip(some, zip(x, y)):
+                each.annotate(
+                    plain(row["value"]), at, fontsize=7, color=color,
+                    textcoords="offset points", xytext=(5, 3),
+                )  # fmt: skip
+        for index, (device, found) in enumerate([("front", rows), *elsewhere]):
+            best = [found[i] for i in front(found, time, error)]
+            each.step(
+                *_points(best, time, error), where="post", label=plain(device),
+                linestyle=("-", "--", ":", "-.")[index % 4], color="gray", zorder=1,
+                marker="." if index else "",
+            )  # fmt: skip
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
     return figure
 
 
-def _label(row: dict) -> str:
-    return f"{row['knob']} {row['value']}".strip()
-
-
-def _draw(
-    axes: Axes,
-    rows: Sequence[dict],
-    on_front: Sequence[int],
-    knobs: Sequence[str],
-    keys: tuple[str, str],
-    prefix: str = "",
-) -> None:
-    """Draw labelled dots, and the front as the steps that it has."""
-    x, y = (np.asarray([row[key] for row in rows], float) for key in keys)
-    y = np.maximum(y, _LEAST)
-    axes.plot(x[on_front], y[on_front], drawstyle="steps-post", color=figures.FRAME)
-    for row, at in zip(rows, zip(x, y)):
-        index = knobs.index(row["knob"]) if row["knob"] in knobs else len(knobs)
-        color = figures.COLORS[index % len(figures.COLORS)]
-        axes.plot(*at, "o", color=color, markersize=4)
-        axes.annotate(
-            figures.printable(prefix + _label(row)), at, color=color, fontsize=_SMALL,
-            textcoords="offset points", xytext=(0, 0), va="center",
-        )  # fmt: skip
-
-
-def _offsets(width: float) -> Iterator[tuple[float, float]]:
-    """Yield offsets in px: right and left of a dot, then ever further up and down."""
-    for step in range(60):
-        for y in dict.fromkeys((10 * step, -10 * step)):
-            yield 8, y
-            yield -8 - width, y
-
-
-def _place_labels(axes: Axes) -> None:
-    """Move the labels apart, clear of dots and within the axes where there is room."""
-    from matplotlib.transforms import Bbox
-
-    labels: list[Annotation] = list(axes.texts)  # type: ignore
-    labels.sort(key=lambda label: -label.xy[1])
-    dots = axes.transData.transform([label.xy for label in labels])
-    taken = [Bbox([dot - 5, dot + 5]) for dot in dots]
-    frame, to_points = axes.get_window_extent(), 72 / figures.DPI
-    for label, dot in zip(labels, dots):
-        size = label.get_window_extent().size
-        boxes = []
-        for offset in _offsets(size[0]):
-            low = dot + offset - (0, size[1] / 2)
-            box = Bbox([low, low + size])
-            if frame.containsx(box.x0) and frame.containsx(box.x1):
-                boxes.append((box, offset))
-        free = [
-            one for one in boxes
-            if frame.containsy(one[0].y0) and frame.containsy(one[0].y1)
-            and not any(one[0].overlaps(other) for other in taken)
-        ]  # fmt: skip
-        box, offset = (free or boxes or [(Bbox([dot, dot + size]), (0, 0))])[0]
-        taken.append(box)
-        label.set_position(np.multiply(offset, to_points).tolist())
-        if abs(offset[1]) > 12:
-            near = offset[0] if offset[0] > 0 else offset[0] + size[0]
-            axes.annotate(
-                "", label.xy, np.multiply((near, offset[1]), to_points).tolist(),
-                textcoords="offset points",
-                arrowprops={"arrowstyle": "-", "color": label.get_color(), "lw": 0.5},
-            )  # fmt: skip
+def _points(rows: Sequence[dict], time: str, error: str) -> np.ndarray:
+    """Return times and errors to draw, [2, P]."""
+    points = np.reshape([(row[time], row[error]) for row in rows], (-1, 2))
+    return np.maximum(points, (0, _LEAST)).T

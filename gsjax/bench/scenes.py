@@ -5,11 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from gsjax.cameras.camera import Camera, look_at, make_camera, resize_camera
-from gsjax.data.transforms import (
-    CameraEntry,
-    load_near_transforms,
-    load_transforms,
-)
+from gsjax.data.transforms import load_near_transforms, load_transforms
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.runs.folder import load_settings, load_split, run_files, with_refined_cameras
@@ -34,34 +30,36 @@ def open_bench_scene(
       InputError: if it cannot be read, or holds no Gaussian or no camera.
     """
     path = Path(name)
-    if name in STRESS_SCENES and not path.exists():
-        scene = STRESS_SCENES[name]()
-        if cameras is None:
-            return scene._replace(camera=_sized(scene.camera, size))
-        entries = load_transforms(cameras, size=size)
-        return scene._replace(camera=_first(cameras, entries))
-    if not path.exists():
+    built_in = name in STRESS_SCENES and not path.exists()
+    if not (built_in or path.exists()):
         raise InputError(
             f"{name}: expected a run, a .ply, a .spz, or one of "
             f"{', '.join(STRESS_SCENES)}; no such file exists"
         )
     origin = camera = None
-    if cameras is not None:
+    if cameras is not None and built_in:
+        camera = load_transforms(cameras, size=size)[0].camera
+    elif cameras is not None:
         entries, origin = load_near_transforms(cameras, size=size)
-        camera = _first(cameras, entries)
-    elif is_run(path):
+        camera = entries[0].camera
+    elif not built_in and is_run(path):
         settings = load_settings(path)
         split = with_refined_cameras(load_split(settings), run_files(path))
         origin = split.dataset.origin
-        max_size = settings.config.max_size
-        entries = view_entries(split.views("train"), max_size=max_size)
-        camera = _sized(entries[0].camera, size)
-    source = open_scene_source(path, origin=origin)
-    gaussians = source.load()
-    if camera is None:
-        camera = facing_camera(gaussians, *(size or _SIZE))
-    red, green, blue = source.background
-    return StressScene(path.stem, gaussians, camera, (red, green, blue))
+        views = split.views("train")
+        camera = view_entries(views, max_size=settings.config.max_size)[0].camera
+    if built_in:
+        scene = STRESS_SCENES[name]()
+    else:
+        source = open_scene_source(path, origin=origin)
+        gaussians = source.load()
+        camera = camera or facing_camera(gaussians, *(size or _SIZE))
+        red, green, blue = source.background
+        scene = StressScene(path.stem, gaussians, camera, (red, green, blue))
+    camera = camera or scene.camera
+    if size is not None and size != (camera.width, camera.height):
+        camera = resize_camera(camera, *size)
+    return scene._replace(camera=camera)
 
 
 def facing_camera(gaussians: Gaussians, width: int, height: int) -> Camera:
@@ -73,9 +71,7 @@ def facing_camera(gaussians: Gaussians, width: int, height: int) -> Camera:
     means = np.asarray(gaussians.params.means, np.float64)
     means = means[np.asarray(gaussians.active) & np.isfinite(means).all(axis=1)]
     if not len(means):
-        raise InputError(
-            "scene: expected an active Gaussian with a finite mean, got none"
-        )
+        raise InputError("scene: expected an active Gaussian of finite mean, got none")
     centre = np.median(means, axis=0)
     radius = np.percentile(np.linalg.norm(means - centre, axis=1), 95)
     eye = centre + np.asarray([0.3, 0.25, 1.0]) * max(float(radius), 1e-6) * 1.85
@@ -83,13 +79,3 @@ def facing_camera(gaussians: Gaussians, width: int, height: int) -> Camera:
     K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
     viewmat = look_at(eye, centre, (0, 1, 0))
     return make_camera(viewmat=viewmat, K=K, width=width, height=height)
-
-
-def _first(path: Path, entries: list[CameraEntry]) -> Camera:
-    if not entries:
-        raise InputError(f"{path}: expected at least one camera, got none")
-    return entries[0].camera
-
-
-def _sized(camera: Camera, size: tuple[int, int] | None) -> Camera:
-    return camera if size is None else resize_camera(camera, *size)

@@ -55,6 +55,7 @@ def new_chart(size: tuple[int, int], rows: int = 1) -> tuple[Figure, list[Axes]]
     axes = list(figure.subplots(rows, squeeze=False)[:, 0])
     for each in axes:
         each.grid(alpha=0.3)
+        each.tick_params(which="both", labelsize=8)
         each.spines[["top", "right"]].set_visible(False)
     return figure, axes
 
