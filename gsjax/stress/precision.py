@@ -10,13 +10,11 @@ import numpy as np
 from gsjax.cameras.camera import Camera, look_at
 from gsjax.data.rebase import rebase
 from gsjax.data.types import Dataset, View
-from gsjax.gaussians import Gaussians, num_active
+from gsjax.gaussians import Gaussians
 from gsjax.math.numerics import in_float64
 from gsjax.math.rotations import quaternion_to_matrix
-from gsjax.raster.primitives.ellipsoid import ELLIPSOID
-from gsjax.raster.types import Inputs
 from gsjax.stress import scenes
-from gsjax.stress.needles import projected
+from gsjax.stress.needles import projected_means
 from gsjax.stress.scenes import COMPAT, FIELDS, FOCAL, SIZE, SLOTS, camera_of, scene_of
 from gsjax.stress.types import Measurement, StressCase
 
@@ -114,7 +112,7 @@ def distant_world(offset: float, _full: bool) -> Measurement:
         fields = scenes.gaussian_fields(np.zeros((SLOTS, 3)), 0.05, 0.5)
         fields["means"] = dataset.points.astype(np.float32)
         camera = camera_of(view.viewmat, centre=(view.K[0, 2], view.K[1, 2]))
-        return scenes.to_float64(projected(scene_of(fields), camera)[0])
+        return projected_means(scene_of(fields), camera)
 
     dataset = distant_dataset(offset)
     near, rebased, plain = rebase(dataset), 0.0, 0.0
@@ -130,9 +128,7 @@ def distant_world(offset: float, _full: bool) -> Measurement:
 
 def _smooth_sum(gaussians: Gaussians, camera: Camera, weights) -> jax.Array:
     """Return a smooth scalar that depends on every output of the projection."""
-    order = jnp.arange(SLOTS)
-    inputs, count = Inputs(gaussians, camera), num_active(gaussians)
-    footprint, splat, channels = ELLIPSOID.project(inputs, COMPAT, order, count)
+    footprint, splat, channels = scenes.project_slots(gaussians, camera)
     inv_sx, slope, inv_sy, _ = splat.shape
     parts = (splat.u, splat.v, jnp.log(inv_sx), slope, jnp.log(inv_sy))
     rows = jnp.stack([*parts, jnp.log(footprint.var_y), *channels.colors])
@@ -182,16 +178,6 @@ def projection_gradient(full: bool) -> Measurement:
     return Measurement(worst, f"{_DIRECTIONS} directions")
 
 
-@scenes.with_numpy
-@jax.jit
-def _covariances(gaussians: Gaussians, camera: Camera) -> tuple[jax.Array, ...]:
-    """Return xx, xy, yy of the projected covariances, and whether each is drawn."""
-    inputs, count = Inputs(gaussians, camera), num_active(gaussians)
-    out = ELLIPSOID.project(inputs, COMPAT, jnp.arange(SLOTS), count).footprint
-    xx = 1 / jnp.square(out.inv_sx)
-    return xx, xx * out.slope, out.var_y, out.reach > 0
-
-
 def linearisation_limits(_full: bool) -> Measurement:
     """Measure the error of covariances beyond the image, relative to their trace.
 
@@ -203,7 +189,9 @@ def linearisation_limits(_full: bool) -> Measurement:
     points = scenes.frustum_points(np.random.default_rng(0), spread=2.5)
     fields = scenes.gaussian_fields(points, (0.3, 0.1, 0.05), 0.5, np.eye(4))
     scene = scene_of(fields)
-    xx, xy, yy, drawn = _covariances(scene, camera)
+    out = scenes.projected(scene, camera).footprint
+    xx, drawn = 1 / np.square(out.inv_sx), out.reach > 0
+    found = np.stack([xx, xx * out.slope, out.var_y], 1)
     means, scales = (scenes.to_float64(fields[n]) for n in ("means", "log_scales"))
     rotations = scenes.to_float64(quaternion_to_matrix(scene.params.quats))
     K, z = scenes.to_float64(camera.K), means[:, 2]
@@ -217,7 +205,7 @@ def linearisation_limits(_full: bool) -> Measurement:
     half = jacobian @ rotations * np.exp(scales)[:, None]
     wanted = half @ half.transpose(0, 2, 1) + COMPAT.dilation * np.eye(2)
     trace = np.trace(wanted, axis1=1, axis2=2)
-    errors = np.stack([xx, xy, yy], 1) - wanted[:, (0, 0, 1), (0, 1, 1)]
+    errors = found - wanted[:, (0, 0, 1), (0, 1, 1)]
     error = float(np.max(np.abs(errors[drawn]) / trace[drawn, None]))
     count = int(np.sum(beyond & drawn))
     return Measurement(

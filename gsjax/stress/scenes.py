@@ -14,12 +14,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.cameras.camera import Camera, look_at, make_camera
-from gsjax.gaussians import GaussianParams, Gaussians, make_gaussians, select
+from gsjax.gaussians import (
+    GaussianParams,
+    Gaussians,
+    make_gaussians,
+    num_active,
+    select,
+)
 from gsjax.math.numerics import in_float64
 from gsjax.math.sh import num_bases
+from gsjax.raster.primitives.ellipsoid import ELLIPSOID
 from gsjax.raster.reference import reference_render
 from gsjax.raster.render import render
-from gsjax.raster.types import RasterConfig, Render
+from gsjax.raster.types import Inputs, RasterConfig, Render
 
 Array = jax.Array
 SLOTS, SIZE, FOCAL = 128, 32, 40.0
@@ -216,6 +223,15 @@ def render_and_gradients(
     weights = loss_weights() if weights is None else weights
     given = to_float32(background), to_float32(weights)  # one dtype, one program
     return _render_and_gradients(gaussians, camera, *given, config=config)
+
+
+def project_slots(gaussians: Gaussians, camera: Camera, config: RasterConfig = COMPAT):
+    """Return the footprints, splats and channels of all slots, in slot order."""
+    inputs, count = Inputs(gaussians, camera), num_active(gaussians)
+    return ELLIPSOID.project(inputs, config, jnp.arange(SLOTS), count)
+
+
+projected = with_numpy(jax.jit(project_slots, static_argnames="config"))
 
 
 def _hide_inactive(params: GaussianParams, active: Array) -> Gaussians:
