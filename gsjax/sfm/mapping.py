@@ -178,15 +178,7 @@ def map_incrementally(
     options.triangulation.random_seed = seed
     if start is not None:
         options.mapper.abs_pose_min_num_inliers = _MIN_INLIERS_EXTENDED
-    registered = 0
-
-    def initial_pair():
-        nonlocal registered
-        registered = 2
-
-    def next_image():
-        nonlocal registered
-        registered += 1
+    registered: list[None] = []  # one entry an image; callbacks have no arguments
 
     def work(token):
         return pycolmap.incremental_mapping(
@@ -195,15 +187,17 @@ def map_incrementally(
             models,
             options=options,
             input_path="" if start is None else start,
-            initial_image_pair_callback=initial_pair,
-            next_image_callback=next_image,
+            initial_image_pair_callback=lambda: registered.extend([None, None]),
+            next_image_callback=lambda: registered.append(None),
             cancellation_token=token,
         )
 
     models.mkdir()
-    found = run_cancellable(
-        work, lambda: f"mapping: {registered} images registered", progress
-    )
+
+    def status():
+        return f"mapping: {len(registered)} images registered"
+
+    found = run_cancellable(work, status, progress)
     for model in found.values():
         deregister_implausible(model, options.mapper)
     usable = [model for model in found.values() if model.num_reg_images() > 1]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsjax.data.decode import captured_stderr, decode, warn_of_damage
+from gsjax.data.decode import decode, warn_of_damage
 from gsjax.data.image_files import (
     SUFFIXES,
     check_name,
@@ -20,7 +20,7 @@ from gsjax.data.image_files import (
     natural_order,
 )
 from gsjax.errors import InputError
-from gsjax.io.images import encode_png, opencv, shrink
+from gsjax.io.images import captured_stderr, encode_png, opencv, shrink
 from gsjax.runtime.files import opened, write_file
 from gsjax.sfm.mapping import ImageRecord, exif_camera
 

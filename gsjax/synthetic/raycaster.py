@@ -14,11 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.cameras.camera import look_at, make_camera
-from gsjax.data.transforms import CameraEntry
-from gsjax.data.transforms_writer import transforms_json
+from gsjax.data.transforms import CameraEntry, transforms_json
 from gsjax.errors import InputError
 from gsjax.io import images
-from gsjax.runtime.files import make_folder, refuse_existing, write_file
+from gsjax.runtime.files import make_folder, reject_existing, write_file
 from gsjax.synthetic import albedo
 from gsjax.synthetic.shapes import Solid, box, disc, dot, sphere, torus
 
@@ -156,7 +155,7 @@ def write_demo_dataset(
     names = [f"images/photo_{index:03d}" for index in range(len(viewmats))]
     photos = [folder / f"{name}.png" for name in names]
     cameras, points = folder / "transforms.json", folder / "points.ply"
-    refuse_existing([*photos, cameras, points], overwrite)
+    reject_existing([*photos, cameras, points], overwrite)
     images.opencv()
     make_folder(folder / "images")
     entries = []
@@ -341,9 +340,7 @@ def _points_ply(points: np.ndarray, colors: np.ndarray) -> bytes:
     kinds = [(name, "<f4") for name in "xyz"]
     kinds += [(name, "u1") for name in ("red", "green", "blue")]
     rows = np.empty(len(points), kinds)
-    for name, column in zip("xyz", points.T):
-        rows[name] = column
-    for name, column in zip(("red", "green", "blue"), colors.T):
+    for (name, _), column in zip(kinds, [*points.T, *colors.T]):
         rows[name] = column
     names = {"<f4": "float", "u1": "uchar"}
     properties = [f"property {names[kind]} {name}" for name, kind in kinds]
