@@ -23,8 +23,8 @@ from gsjax.init.gaussians import init_gaussians
 from gsjax.io.point_cloud import read_point_cloud
 from gsjax.runs.checkpoint import load_checkpoint, save_checkpoint
 from gsjax.runs.folder import RunSettings, load_settings, save_settings
+from gsjax.runs.info import describe_run
 from gsjax.runs.refined_cameras import load_cameras, save_cameras
-from gsjax.runs.run_info import describe_run
 from gsjax.train.config import TrainConfig
 from gsjax.train.state import init_state
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from gsjax.cli.common import HeavyCommand, check_suffix, start_jax
+from gsjax.cli.common import HeavyCommand, check_output, start_jax
 from gsjax.cli.options import Budget, OptionalSize, integer
 from gsjax.runtime.console import note, say
 
@@ -38,7 +38,8 @@ class BenchCommand(HeavyCommand):
     """Replace existing files."""
 
     def run(self) -> int:
-        check_suffix("--plot", self.plot, ".png")
+        check_output("--plot", self.plot, self.overwrite, ".png")
+        check_output("--json", self.json, self.overwrite)
         start_jax()
         from gsjax.bench.pareto import front, make_points, measure_points, time_stages
         from gsjax.bench.report import front_picture, table
@@ -48,22 +49,17 @@ class BenchCommand(HeavyCommand):
         from gsjax.runtime import files
         from gsjax.runtime.timing import machine
 
-        outputs = [path for path in (self.json, self.plot) if path is not None]
-        files.refuse_existing(outputs, self.overwrite)
         scene = open_bench_scene(self.scene, cameras=self.cameras, size=self.size)
         planned = None
         if self.budget is not None:
+            behind = scene.background
             planned = plan(
-                scene.gaussians,
-                scene.camera,
-                budget=self.budget,
-                background=scene.background,
+                scene.gaussians, scene.camera, budget=self.budget, background=behind
             )
             for line in planned.lines():
                 note(line)
-        rows = measure_points(
-            scene, make_points(scene.gaussians, planned), self.repeats
-        )
+        points = make_points(scene.gaussians, planned)
+        rows = measure_points(scene, points, self.repeats)
         parts = time_stages(scene, self.repeats)
         where = machine()
         facts = ", ".join(f"{name} {value}" for name, value in where.items())
@@ -79,8 +75,6 @@ class BenchCommand(HeavyCommand):
             picture = front_picture(rows, scene.name)
             files.write_file(self.plot, images.encode_png(picture))
         bad = [f"{row['knob']} {row['value']}" for row in rows if not row["inside"]]
-        if bad:
-            note(f"errors above the theoretical bound: {', '.join(bad)}")
-        else:
-            note(f"all {len(rows)} errors are within the theoretical bound")
+        within = f"all {len(rows)} errors are within the theoretical bound"
+        note(f"errors above the theoretical bound: {', '.join(bad)}" if bad else within)
         return 1 if bad else 0

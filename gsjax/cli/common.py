@@ -14,6 +14,8 @@ from typing import Annotated
 
 from gsjax.cli.options import WITH_DEFAULT
 from gsjax.errors import GsjaxError
+from gsjax.runtime.console import decibels, say
+from gsjax.runtime.files import reject_existing
 
 
 class UsageError(GsjaxError):
@@ -47,14 +49,29 @@ class HeavyCommand(Command):
     """Continue even if the estimated memory exceeds what is available."""
 
 
-def check_suffix(option: str, path: Path | None, *suffixes: str) -> None:
-    """Check the suffix of an output file, if it is given.
+def check_output(
+    option: str, path: Path | None, overwrite: bool, *suffixes: str
+) -> None:
+    """Check the name of an output file, if it is given; no ``suffixes`` allow all.
 
     Raises:
-      UsageError: if it is not one of ``suffixes``.
+      UsageError: if its suffix is not one of ``suffixes``.
+      InputError: if it exists and ``overwrite`` is not set.
     """
-    if path is not None and path.suffix.lower() not in suffixes:
+    if path is None:
+        return
+    if suffixes and path.suffix.lower() not in suffixes:
         raise UsageError(f"{option} {path}: expected a name ending in {suffixes[0]}")
+    reject_existing([path], overwrite, f"another name with {option}")
+
+
+def say_result(result) -> None:
+    """Print size, time and quality of a finished run, a `RunResult`."""
+    line = f"{result.gaussians:,} Gaussians, {result.seconds:.0f} s"
+    if (summary := result.summary) is not None:
+        quality = f"PSNR {decibels(summary.psnr)}, SSIM {summary.ssim:.4f}"
+        line += f"; {summary.views} held-out views: {quality}"
+    say(line)
 
 
 def view_hint(run: Path) -> str:

@@ -10,11 +10,12 @@ from gsjax.cli.common import (
     HeavyCommand,
     UsageError,
     command_line,
+    say_result,
     start_jax,
     view_hint,
 )
 from gsjax.cli.options import Size, integer
-from gsjax.runtime.console import decibels, note, say
+from gsjax.runtime.console import note, say
 
 
 @dataclass(kw_only=True)
@@ -48,15 +49,10 @@ class DemoCommand(HeavyCommand):
             again = command_line("train", files.dataset, "-o", files.run, "--resume")
             note(f"stopped after step {result.step}; resume with {again}")
             return 130
-        summary, written = result.summary, result.files
-        assert summary is not None, "some views are held out"
+        written = result.files
         for path in (written.splat, written.preview, written.curves, files.turntable):
             say(str(path))
-        say(
-            f"{result.gaussians:,} Gaussians, {result.seconds:.0f} s; "
-            f"{summary.views} held-out views: PSNR {decibels(summary.psnr)}, "
-            f"SSIM {summary.ssim:.4f}"
-        )
+        say_result(result)
         views = ("--path", "test", "-o", self.out / "views")
         opaque = (self.out / "scene.ply", "--min-opacity", "0.01")
         note("done; next, try")

@@ -39,13 +39,10 @@ class EvalCommand(HeavyCommand):
             say(json.dumps(report, indent=2))
             return 0
         for each in report["each"]:
-            if each["ssim"] is None:
-                say(f"{each['name']}  fully masked")
-                continue
-            say(
-                f"{each['name']}  PSNR {decibels(each['psnr'])}  "
-                f"SSIM {each['ssim']:.4f}"
-            )
+            text = "fully masked"
+            if each["ssim"] is not None:
+                text = f"PSNR {decibels(each['psnr'])}  SSIM {each['ssim']:.4f}"
+            say(f"{each['name']}  {text}")
         say(
             f"{summary.views} {self.views} views: PSNR {decibels(summary.psnr)}, "
             f"SSIM {summary.ssim:.4f}, LPIPS {summary.lpips}"

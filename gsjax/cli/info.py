@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from gsjax.cli.common import HeavyCommand, check_suffix, start_jax
+from gsjax.cli.common import HeavyCommand, check_output, start_jax
 from gsjax.runtime.console import say
+from gsjax.runtime.files import make_folder, write_file
 
 
 @dataclass(kw_only=True)
@@ -25,20 +26,13 @@ class InfoCommand(HeavyCommand):
     """Replace an existing plot."""
 
     def run(self) -> int:
-        from gsjax.runtime import files
-
-        if self.plot is not None:
-            check_suffix("--plot", self.plot, ".png")
-            files.refuse_existing(
-                [self.plot], self.overwrite, "another name with --plot"
-            )
+        check_output("--plot", self.plot, self.overwrite, ".png")
         start_jax()
         from gsjax.io import images
         from gsjax.io.formats import load
         from gsjax.plots.figures import histograms
         from gsjax.runs.folder import run_files
-        from gsjax.runs.run_info import describe_run, run_text
-        from gsjax.runs.scene_info import describe, info_text
+        from gsjax.runs.info import describe, describe_run, info_text, run_text
         from gsjax.runs.scene_source import is_run, splat_file
 
         report: dict[str, Any] = {"path": str(self.scene)}
@@ -56,10 +50,10 @@ class InfoCommand(HeavyCommand):
             report |= facts
             texts.append(info_text(str(splat), facts))
             if self.plot is not None:
-                files.make_folder(self.plot.parent)
+                make_folder(self.plot.parent)
                 named = self.scene.resolve() if "run" in report else splat
                 plot = histograms(gaussians, title=named.name)
-                files.write_file(self.plot, images.encode_png(plot))
+                write_file(self.plot, images.encode_png(plot))
                 report["plot"] = str(self.plot)
                 texts.append(str(self.plot))
         say(json.dumps(report, indent=2) if self.json else "\n".join(texts))

@@ -74,7 +74,7 @@ def _run(argv: list[str]) -> int:
 def _result(argv: list[str]) -> int:
     with _exit_on_ctrl_c():
         if argv == ["--version"]:
-            from gsjax.cli.doctor_checks import version
+            from gsjax.cli.doctor import version
 
             print(f"gsjax {version('gsjax')}")
             return 0

@@ -11,11 +11,8 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from tyro.conf import arg
-from tyro.constructors import (
-    ConstructorRegistry,
-    PrimitiveConstructorSpec,
-    PrimitiveTypeInfo,
-)
+from tyro.constructors import ConstructorRegistry, PrimitiveTypeInfo
+from tyro.constructors import PrimitiveConstructorSpec as OptionSpec
 
 T = TypeVar("T")
 IMAGE_KINDS = ("rgb", "alpha", "depth")
@@ -25,7 +22,7 @@ _NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,2})?"
 
 def option(
     metavar: str, parse: Callable[[str], T], show: Callable[[T], str] = str
-) -> PrimitiveConstructorSpec[T | None]:
+) -> OptionSpec[T | None]:
     """Return a tyro constructor that calls ``parse`` with one argument.
 
     Args:
@@ -33,7 +30,7 @@ def option(
       parse: returns the value, or raises `ValueError`.
       show: returns the argument of a default.
     """
-    return PrimitiveConstructorSpec(
+    return OptionSpec(
         nargs=1,
         metavar=metavar,
         instance_from_str=lambda words: parse(words[0]),
@@ -42,7 +39,7 @@ def option(
     )
 
 
-def integer(least: int, most: int = 2**31 - 2) -> PrimitiveConstructorSpec[int | None]:
+def integer(least: int, most: int = 2**31 - 2) -> OptionSpec[int | None]:
     """Return the type of a whole number from ``least`` to ``most``."""
 
     def parse(text: str) -> int:
@@ -57,7 +54,7 @@ def integer(least: int, most: int = 2**31 - 2) -> PrimitiveConstructorSpec[int |
     return option("INT", parse)
 
 
-def real(least: float, below: float) -> PrimitiveConstructorSpec[float | None]:
+def real(least: float, below: float) -> OptionSpec[float | None]:
     """Return the type of a number of at least ``least`` and below ``below``."""
 
     def parse(text: str) -> float:
@@ -66,9 +63,8 @@ def real(least: float, below: float) -> PrimitiveConstructorSpec[float | None]:
         except ValueError:
             raise ValueError(f"expected a number, got {text!r}") from None
         if not least <= value < below:
-            raise ValueError(
-                f"expected at least {least:g} and below {below:g}, got {value:g}"
-            )
+            limits = f"at least {least:g} and below {below:g}"
+            raise ValueError(f"expected {limits}, got {value:g}")
         return value
 
     return option("FLOAT", parse)
@@ -82,7 +78,7 @@ def suggestion(word: str, names: Iterable[str]) -> str:
 
 
 @REGISTRY.primitive_rule
-def _choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+def _choice(info: PrimitiveTypeInfo) -> OptionSpec | None:
     """Parse `Literal` types, also optional ones."""
     optional = info.type_origin in (Union, UnionType)
     kinds = [k for k in get_args(info.type) if k is not NoneType]
@@ -102,40 +98,26 @@ def _choice(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     return spec
 
 
-def parse_size(text: str) -> tuple[int, int]:
-    """Return width and height of a size like ``800x600``.
-
-    Raises:
-      ValueError: if it is malformed.
-    """
+def _size(text: str) -> tuple[int, int]:
+    """Return width and height of a size like ``800x600``."""
     match = re.fullmatch(r"([0-9]{1,6})[x×X]([0-9]{1,6})", text)
-    if match is None or min(int(match[1]), int(match[2])) < 1:
-        raise ValueError(
-            f"expected WIDTHxHEIGHT in pixels, each 1 to 999999, got {text!r}"
-        )
-    return int(match[1]), int(match[2])
+    width, height = map(int, match.groups()) if match else (0, 0)
+    if min(width, height) < 1:
+        raise ValueError(f"expected WIDTHxHEIGHT in px, each 1 to 999999, got {text!r}")
+    return width, height
 
 
-def parse_kinds(text: str) -> tuple[str, ...]:
-    """Return the kinds of image in a list like ``rgb,depth``, each once.
-
-    Raises:
-      ValueError: if one is unknown.
-    """
+def _kinds(text: str) -> tuple[str, ...]:
+    """Return the kinds of image in a list like ``rgb,depth``, each once."""
     kinds = tuple(dict.fromkeys(text.split(",")))
     if not set(kinds) <= set(IMAGE_KINDS):
-        raise ValueError(
-            f"expected {', '.join(IMAGE_KINDS)}, or several with commas, got {text!r}"
-        )
+        expected = f"{', '.join(IMAGE_KINDS)}, or several with commas"
+        raise ValueError(f"expected {expected}, got {text!r}")
     return kinds
 
 
-def parse_color(text: str) -> tuple[float, ...]:
-    """Return the RGB values of a colour like ``1,0.5,0``.
-
-    Raises:
-      ValueError: if it is malformed.
-    """
+def _color(text: str) -> tuple[float, ...]:
+    """Return the RGB values of a colour like ``1,0.5,0``."""
     parts = text.split(",")
     good = len(parts) == 3 and all(re.fullmatch(f"[+]?{_NUMBER}", p) for p in parts)
     if not good or not all(float(part) <= 1 for part in parts):
@@ -152,16 +134,14 @@ def parse_budget(text: str) -> float:
     match = re.fullmatch(rf"({_NUMBER})(?:/({_NUMBER}))?", text)
     parts = [float(part or 1) for part in match.groups()] if match else [0.0]
     if min(parts) <= 0 or parts[0] >= parts[1]:
-        raise ValueError(
-            f"expected an error above 0 and below 1, like 1/255, got {text!r}"
-        )
+        raise ValueError(f"expected above 0 and below 1, like 1/255, got {text!r}")
     return parts[0] / parts[1]
 
 
-Size = Annotated[tuple[int, int], option("WxH", parse_size, "{0[0]}x{0[1]}".format)]
-OptionalSize = Annotated[tuple[int, int] | None, option("WxH", parse_size)]
-Kinds = Annotated[tuple[str, ...], option("KINDS", parse_kinds, ",".join)]
-Color = Annotated[tuple[float, ...] | None, option("R,G,B", parse_color)]
+Size = Annotated[tuple[int, int], option("WxH", _size, "{0[0]}x{0[1]}".format)]
+OptionalSize = Annotated[tuple[int, int] | None, option("WxH", _size)]
+Kinds = Annotated[tuple[str, ...], option("KINDS", _kinds, ",".join)]
+Color = Annotated[tuple[float, ...] | None, option("R,G,B", _color)]
 Budget = Annotated[float | None, option("ERROR", parse_budget)]
 
 

@@ -11,8 +11,7 @@ from gsjax.cli.options import Budget, Color, Kinds, OptionalSize, integer, real
 from gsjax.runtime.console import note, say
 
 _MOVIES = (".gif", ".webp", ".webm")
-_OTHER_MOVIES = (".mp4", ".mov", ".m4v", ".avi", ".mkv")
-_IMAGES = (".png", ".jpg", ".jpeg")
+_REJECTED = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".png", ".jpg", ".jpeg")
 
 
 @dataclass(kw_only=True)
@@ -67,13 +66,10 @@ class RenderCommand(HeavyCommand):
         from gsjax.runs.views import render_images
 
         entries, origin = self._entries(path)
+        raster = RASTER_PRESETS[self.preset]() if self.preset else None
         source = open_scene_source(
-            self.scene,
-            origin=origin,
-            raster=RASTER_PRESETS[self.preset]() if self.preset else None,
-            background=self.background,
-        )
-        source = source._replace(budget=self.budget)
+            self.scene, origin=origin, raster=raster, background=self.background
+        )._replace(budget=self.budget)
         if movie:
             rate = self.fps or 24.0
             count = render_movie(
@@ -95,19 +91,16 @@ class RenderCommand(HeavyCommand):
         from gsjax.cameras.camera import resize_camera
         from gsjax.data.dataset import load_dataset
         from gsjax.data.transforms import load_near_transforms
-        from gsjax.runs.folder import (
-            SplitDataset,
-            load_settings,
-            load_split,
-            run_files,
-            with_refined_cameras,
-        )
+        from gsjax.runs import folder as run_folder
+        from gsjax.runs.folder import SplitDataset
         from gsjax.runs.trajectories import CAMERA_PATHS, path_entries, view_entries
 
         max_size = None
         if self.cameras is None:
-            settings = load_settings(self.scene)
-            split = with_refined_cameras(load_split(settings), run_files(self.scene))
+            settings = run_folder.load_settings(self.scene)
+            split = run_folder.with_refined_cameras(
+                run_folder.load_split(settings), run_folder.run_files(self.scene)
+            )
             max_size = settings.config.max_size
         elif self.cameras.is_dir():
             dataset = load_dataset(self.cameras, poses_only=True)
@@ -131,43 +124,29 @@ class RenderCommand(HeavyCommand):
         return entries, dataset.origin
 
     def _resolve_path(self) -> str:
-        """Return --path or its default.
-
-        Raises:
-          UsageError: if options exclude each other.
-        """
+        """Return --path or its default; reject options that exclude each other."""
         from gsjax.runs.scene_source import is_run
 
         from_file = self.cameras is not None and not self.cameras.is_dir()
         if from_file and self.path is not None:
             raise UsageError("--cameras FILE and --path exclude each other")
         if not is_run(self.scene) and self.cameras is None:
-            raise UsageError(
-                f"{self.scene}: a file has no cameras; pass --cameras with a "
-                "transforms.json or the folder of a dataset"
-            )
+            remedy = "pass --cameras with a transforms.json or the folder of a dataset"
+            raise UsageError(f"{self.scene}: a file has no cameras; {remedy}")
         path = self.path or ("orbit" if self.cameras is None else "train")
         if self.frames is not None and (from_file or path in ("test", "train")):
             raise UsageError("--frames goes with orbit, spiral and interpolate")
         return path
 
     def _is_movie(self) -> bool:
-        """Return whether the output is a movie.
-
-        Raises:
-          UsageError: if options exclude each other.
-        """
-        suffix, movies = self.out.suffix.lower(), ", ".join(_MOVIES)
-        movie = suffix in _MOVIES
-        if suffix in (*_OTHER_MOVIES, *_IMAGES):
-            raise UsageError(
-                f"-o {self.out}: expected a folder for images, or a movie: {movies}"
-            )
+        """Return whether the output is a movie; reject options that do not fit it."""
+        movie = (suffix := self.out.suffix.lower()) in _MOVIES
+        if suffix in _REJECTED:
+            fault = f"expected a folder for images, or a movie: {', '.join(_MOVIES)}"
+            raise UsageError(f"-o {self.out}: {fault}")
         if movie and (len(self.what) > 1 or self.npy):
-            raise UsageError(
-                f"-o {self.out}: a movie shows one kind of --what, without --npy; pass "
-                "a folder for several"
-            )
+            fault = "a movie shows one kind of --what, without --npy; pass a folder"
+            raise UsageError(f"-o {self.out}: {fault}")
         if self.fps is not None and not movie:
             raise UsageError("--fps goes with a movie")
         return movie

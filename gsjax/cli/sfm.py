@@ -42,13 +42,10 @@ class SfmCommand(Command):
 
     def run(self) -> int:
         if 0 < self.max_size < 64:
-            raise UsageError(
-                f"--max-size: expected 0 or at least 64, got {self.max_size}"
-            )
+            fault = f"expected 0 or at least 64, got {self.max_size}"
+            raise UsageError(f"--max-size: {fault}")
         if self.frames is not None and self.source.is_dir():
-            raise UsageError(
-                f"--frames goes with a video, but {self.source} is a folder"
-            )
+            raise UsageError(f"--frames goes with a video; {self.source} is a folder")
         from gsjax.errors import SfmError
         from gsjax.sfm.reconstruction import SfmSettings, run_sfm
 
@@ -63,9 +60,7 @@ class SfmCommand(Command):
         report = run_sfm(
             self.source, self.out, settings, overwrite=self.overwrite, progress=note
         )
-        lines = {
-            name: f"registered, {n} points" for name, n in report.registered.items()
-        }
+        lines = {n: f"registered, {m} points" for n, m in report.registered.items()}
         lines |= {n: f"not registered: {why}" for n, why in report.unregistered.items()}
         for name in sorted(lines):
             say(f"{name}  {lines[name]}")

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsjax.cli.common import Command, UsageError, start_jax
+from gsjax.cli.common import Command, UsageError, check_output, start_jax
 from gsjax.cli.options import suggestion
 from gsjax.runtime.console import note, say
+from gsjax.runtime.files import make_folder, write_json
 
 
 @dataclass(kw_only=True)
@@ -27,13 +28,9 @@ class StressCommand(Command):
 
     def run(self) -> int:
         start_jax()
-        from gsjax.runtime import files
         from gsjax.stress import run as stress
 
-        if self.json is not None:
-            files.refuse_existing(
-                [self.json], self.overwrite, "another name with --json"
-            )
+        check_output("--json", self.json, self.overwrite)
         if self.markdown is not None:
             if self.only:
                 raise UsageError("--markdown and --only exclude each other")
@@ -51,8 +48,8 @@ class StressCommand(Command):
         say(stress.summary(results))
         report = stress.as_json(results, self.full)
         if self.json is not None:
-            files.make_folder(self.json.parent)
-            files.write_json(self.json, report)
+            make_folder(self.json.parent)
+            write_json(self.json, report)
             note(f"{self.json} written")
         if self.markdown is not None:
             stress.put_between_marks(self.markdown, stress.markdown(report))

@@ -10,11 +10,12 @@ from gsjax.cli.common import (
     HeavyCommand,
     UsageError,
     command_line,
+    say_result,
     start_jax,
     view_hint,
 )
 from gsjax.cli.options import integer
-from gsjax.runtime.console import decibels, note, say
+from gsjax.runtime.console import note, say
 
 # Options that do not change the settings of a run.
 _NOT_SETTINGS = {
@@ -117,7 +118,7 @@ class TrainCommand(HeavyCommand):
             raise
 
     def _train_with_viewer(self) -> int:
-        from gsjax.viewer.live import LiveViewer
+        from gsjax.viewer.server import LiveViewer
 
         viewer = LiveViewer(port=self.viewer_port or 8080)
         try:
@@ -134,13 +135,7 @@ class TrainCommand(HeavyCommand):
             note(f"stopped after step {result.step}; resume with --resume")
             return 130
         say(str(result.files.splat))
-        line = f"{result.gaussians:,} Gaussians, {result.seconds:.0f} s"
-        if result.summary is not None:
-            line += (
-                f"; {result.summary.views} held-out views: "
-                f"PSNR {decibels(result.summary.psnr)}, SSIM {result.summary.ssim:.4f}"
-            )
-        say(line)
+        say_result(result)
         say(str(result.files.preview))
         movie = ("--path", "interpolate", "-o", self.out / "flight.webm")
         note("next: view it, render a movie, see its statistics")
@@ -158,10 +153,8 @@ class TrainCommand(HeavyCommand):
             self._check_same_settings(settings)
             moved = settings.dataset != self.dataset.resolve()
             if moved and settings.dataset.exists():
-                raise UsageError(
-                    f"{self.out} was trained on {settings.dataset}; pass that dataset "
-                    "to --resume it"
-                )
+                fault = f"was trained on {settings.dataset}; pass that to --resume it"
+                raise UsageError(f"{self.out} {fault}")
             dataset = self.dataset.resolve() if moved else None
             return resume_run(self.out, dataset=dataset, watch=watch)
         if self.resume:
@@ -184,8 +177,8 @@ class TrainCommand(HeavyCommand):
         # Defaults were resolved when the run started.
         if self.initial is None or self._is_initial_scene(settings.start):
             mine = self._settings(settings.start)
-            config = mine.config.replace(initial=settings.config.initial)
-            mine = replace(mine, config=config)
+            initial = settings.config.initial
+            mine = replace(mine, config=mine.config.replace(initial=initial))
         else:
             mine = self._settings(self._initial_scene())
         if self.test_every is None:
@@ -223,23 +216,19 @@ class TrainCommand(HeavyCommand):
             )
         splat = splat_file(given).resolve()
         if splat == run_files(self.out).splat.resolve():
-            raise UsageError(
-                f"--initial {given}: is the scene of the run in {self.out}; pass "
-                "another folder with -o"
+            fault = (
+                f"is the scene of the run in {self.out}; pass another folder with -o"
             )
+            raise UsageError(f"--initial {given}: {fault}")
         if not is_run(given):
             return splat
         if load_settings(given).config.raster.antialias != self.antialias:
-            change = "leave out" if self.antialias else "pass"
-            raise UsageError(
-                f"--initial {given}: --antialias differs from that run; {change} "
-                "--antialias"
-            )
+            change = f"{'leave out' if self.antialias else 'pass'} --antialias"
+            fault = f"--antialias differs from that run; {change}"
+            raise UsageError(f"--initial {given}: {fault}")
         if run_files(given).cameras.exists():
-            note(
-                f"warning: {given} has refined cameras; this run starts from those of "
-                "the dataset"
-            )
+            text = "has refined cameras; this run starts from those of the dataset"
+            note(f"warning: {given} {text}")
         return splat
 
     def _settings(self, start: Path | None):

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.cli.common import HeavyCommand, check_suffix, start_jax
+from gsjax.cli.common import HeavyCommand, check_output, start_jax
 from gsjax.cli.options import integer, real
 from gsjax.runtime.console import note, say
 
@@ -44,15 +44,10 @@ class ViewCommand(HeavyCommand):
     """Replace an existing page."""
 
     def run(self) -> int:
-        from gsjax.runtime import files
         from gsjax.viewer.viser_server import require_viser
 
         require_viser()
-        if self.html is not None:
-            check_suffix("--html", self.html, ".html", ".htm")
-            files.refuse_existing(
-                [self.html], self.overwrite, "another name with --html"
-            )
+        check_output("--html", self.html, self.overwrite, ".html", ".htm")
         start_jax()
         from gsjax.runs.scene_source import RASTER_PRESETS
         from gsjax.viewer.opening import load_content

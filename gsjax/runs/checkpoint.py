@@ -51,16 +51,13 @@ class Checkpoint(NamedTuple):
 
 
 def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Path:
-    """Write the state, then remove all but the latest two checkpoints.
+    """Write the state to a new file; remove all but the latest two checkpoints.
 
     Args:
       folder: created if missing.
       state: state of the run.
       meta: JSON values to store: ``pair_capacity``, ``seconds`` of training, and
         optionally the number of ``devices``.
-
-    Returns:
-      The file.
 
     Raises:
       InputError: if writing fails; earlier checkpoints are kept.
@@ -93,16 +90,13 @@ def latest_step(folder: Path) -> int | None:
 
 
 def _files(folder: Path) -> list[Path]:
-    paths = sorted(folder.glob("step_*.npz"))
-    return [path for path in paths if re.fullmatch(r"step_\d{9}\.npz", path.name)]
+    return sorted(folder.glob(f"step_{'[0-9]' * 9}.npz"))
 
 
 def load_latest(folder: Path, steps: int | None = None) -> Checkpoint:
     """Return the latest readable checkpoint; warn about each unreadable later one.
 
-    Args:
-      folder: folder of the checkpoints.
-      steps: number of steps of the whole run, see `load_checkpoint`.
+    ``steps`` is the number of steps of the whole run, see `load_checkpoint`.
 
     Raises:
       InputError: if no checkpoint is readable.
@@ -122,12 +116,7 @@ def load_latest(folder: Path, steps: int | None = None) -> Checkpoint:
 
 
 def load_checkpoint(path: Path, steps: int | None = None) -> Checkpoint:
-    """Read and check one file.
-
-    Args:
-      path: the file.
-      steps: number of steps of the whole run, which bounds the step of the file; None
-        for no bound.
+    """Read and check one file, whose step is at most ``steps`` if given.
 
     Raises:
       InputError: if the file is damaged, truncated or no checkpoint, or holds values
@@ -152,11 +141,9 @@ def load_checkpoint(path: Path, steps: int | None = None) -> Checkpoint:
         "pair_capacity": lambda value: type(value) is int and 0 <= value < 2**30,
         "seconds": lambda value: type(value) in (int, float) and 0 <= value < math.inf,
         "arrays": lambda value: value == sorted(arrays),
-        "devices": lambda value: type(value) is int and value >= 1,
+        "devices": lambda value: value is None or (type(value) is int and value >= 1),
     }
     meta = meta if isinstance(meta, dict) else {}
-    if "devices" not in meta:  # older checkpoints lack it
-        del checks["devices"]
     for key, valid in checks.items():
         if not valid(meta.get(key)):
             found = repr(meta.get(key, "missing"))[:80]
@@ -189,10 +176,7 @@ def _step_fault(
 
 
 def _value_fault(arrays: dict[str, np.ndarray]) -> str | None:
-    """Return the first non-finite number or negative square, or None.
-
-    Inactive slots may hold anything.
-    """
+    """Return the first non-finite number or negative square of active slots."""
     active = arrays.get(".gaussians.active", np.ones(0, bool))
     if active.dtype != bool or active.ndim != 1 or (active.view(np.uint8) > 1).any():
         return ".gaussians.active: expected a list of booleans"
@@ -251,11 +235,7 @@ def _damaged(path: Path, error: Exception, where: str = "") -> InputError:
 
 
 def restore(checkpoint: Checkpoint, template: TrainState) -> TrainState:
-    """Return the state that a checkpoint holds.
-
-    Args:
-      checkpoint: see `load_checkpoint`.
-      template: a state of the same settings and capacity.
+    """Return the state of a checkpoint; ``template`` has its settings and capacity.
 
     Raises:
       InputError: if the checkpoint was written under other settings.

@@ -1,8 +1,8 @@
 """Training settings as JSON, and JSON values checked against type annotations."""
 
-import json
+import copy
 import math
-from dataclasses import asdict, fields
+from dataclasses import fields
 from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -15,26 +15,18 @@ from gsjax.train.config import Level, TrainConfig
 from gsjax.train.optimiser import Rates
 
 _MAX_INTEGER = 1 << 63
-_RENAMED = {"stop": "transmittance_min"}  # settings of RasterConfig in older runs
+_MALFORMED = (ValueError, TypeError, LookupError, AttributeError, RecursionError)
 
 
-def config_to_json(config: TrainConfig) -> str:
-    """Return the settings as the JSON text of `config.json`."""
-    return json.dumps(asdict(config), indent=2) + "\n"
-
-
-def config_from_json(text: str) -> TrainConfig:
-    """Return the settings of a JSON text.
+def config_from_json(data: Any) -> TrainConfig:
+    """Return the settings of the JSON value of `dataclasses.asdict`.
 
     Raises:
-      InputError: if the text is malformed or of an incompatible version.
+      InputError: if it is malformed or of an incompatible version.
     """
     try:
-        return _config(json.loads(text))
-    except (
-        *(ValueError, TypeError, KeyError, AttributeError, IndexError),
-        RecursionError,
-    ) as error:
+        return _config(copy.deepcopy(data))
+    except _MALFORMED as error:
         raise InputError(
             f"not the settings of a training run: {error}; train again, or use the "
             "version of gsjax that wrote them"
@@ -58,9 +50,8 @@ def _config(data: Any) -> TrainConfig:
             data[name] = kind(**data[name])
     if "raster" in data:
         raster = data["raster"]
-        for old, new in _RENAMED.items():
-            if old in raster and hasattr(RasterConfig, new):
-                raster[new] = raster.pop(old)
+        if "stop" in raster:  # its name in older runs
+            raster["transmittance_min"] = raster.pop("stop")
         check_types(RasterConfig, raster)
         outputs = tuple(raster.pop("outputs", ("rgb",)))
         data["raster"] = RasterConfig(outputs=outputs, **raster)
@@ -81,10 +72,11 @@ def check_types(kind: type, data: dict[str, Any]) -> None:
         raise ValueError(f"expected an object, got {repr(data)[:80]}")
     for name, hint in get_type_hints(kind).items():
         if name in data and not _has_type(data[name], hint):
-            expected = getattr(hint, "__name__", str(hint))
-            raise ValueError(
-                f"{name}: expected {expected}, got {repr(data[name])[:80]}"
+            expected, found = (
+                getattr(hint, "__name__", str(hint)),
+                repr(data[name])[:80],
             )
+            raise ValueError(f"{name}: expected {expected}, got {found}")
 
 
 def _has_type(value, hint) -> bool:

@@ -14,7 +14,7 @@ from gsjax.runs.run import RunResult, start_run
 from gsjax.runs.scene_source import open_scene_source
 from gsjax.runs.trajectories import path_entries, render_movie
 from gsjax.runtime.console import note
-from gsjax.runtime.files import refuse_existing
+from gsjax.runtime.files import reject_existing
 from gsjax.synthetic.raycaster import DemoDatasetSettings, write_demo_dataset
 from gsjax.train.config import TrainConfig, preset, scaled
 
@@ -81,7 +81,7 @@ def run_demo(
     files = demo_files(folder)
     photos = files.dataset / "transforms.json"
     outputs = [photos, run_files(files.run).config, files.turntable]
-    refuse_existing(outputs, overwrite, "another folder with -o")
+    reject_existing(outputs, overwrite, "another folder with -o")
     size = f"{settings.width} × {settings.height} px"
     note(f"rendering {settings.photos} photographs of {size}")
     dataset_settings = DemoDatasetSettings(
@@ -96,16 +96,9 @@ def run_demo(
     run = RunSettings(dataset=files.dataset, config=config)
     result = start_run(run, files.run, overwrite=overwrite)
     if result.finished:
-        _render_turntable(files, run, overwrite)
+        dataset = load_split(run).dataset
+        source = open_scene_source(files.run, origin=dataset.origin)
+        entries = path_entries(dataset, camera_paths.orbit, frames=_TURN_FRAMES)
+        fps = _TURN_FRAMES / _TURN_SECONDS
+        render_movie(source, entries, files.turntable, fps=fps, overwrite=overwrite)
     return files, result
-
-
-def _render_turntable(files: DemoFiles, run: RunSettings, overwrite: bool) -> None:
-    dataset = load_split(run).dataset
-    render_movie(
-        open_scene_source(files.run, origin=dataset.origin),
-        path_entries(dataset, camera_paths.orbit, frames=_TURN_FRAMES),
-        files.turntable,
-        fps=_TURN_FRAMES / _TURN_SECONDS,
-        overwrite=overwrite,
-    )

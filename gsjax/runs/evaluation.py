@@ -13,16 +13,8 @@ from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.io import images
 from gsjax.plots.contact_sheets import SheetRow, comparison
-from gsjax.runs.folder import (
-    RunFiles,
-    background_color,
-    load_scene,
-    load_settings,
-    load_split,
-    require_splat,
-    run_files,
-    with_refined_cameras,
-)
+from gsjax.runs import folder as run_folder
+from gsjax.runs.folder import RunFiles
 from gsjax.runs.refined_cameras import refine_photos
 from gsjax.runtime.files import finite_or_none, make_folder, write_file, write_json
 from gsjax.train.config import TrainConfig
@@ -30,7 +22,7 @@ from gsjax.train.evaluation import Summary, ViewResult, evaluate, summarise
 from gsjax.train.health import has_valid_pixels
 from gsjax.train.loop import subset
 
-_PREVIEWED = 4
+PREVIEWED = 4  # views in a preview
 
 
 def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
@@ -43,16 +35,17 @@ def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
     Raises:
       InputError: if the folder is no run, or has no such view with a visible pixel.
     """
-    settings, files = load_settings(folder), run_files(folder, which)
-    given = load_split(settings)
-    split = with_refined_cameras(given, files)
+    settings = run_folder.load_settings(folder)
+    files = run_folder.run_files(folder, which)
+    given = run_folder.load_split(settings)
+    split = run_folder.with_refined_cameras(given, files)
     chosen = split.test if which == "test" else split.train
     if not chosen:
         other = "train" if which == "test" else "test"
-        raise InputError(
-            f"{folder}: the run has no {which} views; pass --views {other}"
-        )
-    gaussians = load_scene(require_splat(folder), split.dataset.origin)
+        fault = f"the run has no {which} views; pass --views {other}"
+        raise InputError(f"{folder}: {fault}")
+    splat = run_folder.require_splat(folder)
+    gaussians = run_folder.load_scene(splat, split.dataset.origin)
     dataset = subset(split.dataset, chosen)
     before = subset(given.dataset, chosen).views
     photos = load_photos(before, settings.config.max_size)
@@ -69,12 +62,9 @@ def evaluate_views(
     gaussians: Gaussians, dataset: Dataset, photos: list[Photo], config: TrainConfig
 ) -> Iterator[ViewResult]:
     """Evaluate all views of ``dataset`` with the render settings of a run."""
+    background = run_folder.background_color(config)
     return evaluate(
-        gaussians,
-        dataset.views,
-        photos,
-        config=config.raster,
-        background=background_color(config),
+        gaussians, dataset.views, photos, config=config.raster, background=background
     )
 
 
@@ -100,6 +90,16 @@ def write_evaluation(
         write_file(path, images.encode_png(images.to_8_bit(result.render)))
         results.append(result)
     summary = summarise(results)
+    # PSNR of a view is null without errors; both are null if every pixel is masked.
+    each = [
+        {
+            "name": result.name,
+            "psnr": finite_or_none(result.psnr),
+            "ssim": finite_or_none(result.ssim),
+            "size": result.depth.shape[::-1],
+        }
+        for result in results
+    ]
     content = {
         "which": which,
         **summary._asdict(),
@@ -107,46 +107,20 @@ def write_evaluation(
         "ssim": finite_or_none(summary.ssim),
         "seconds": round(time.perf_counter() - start, 3),
         "gaussians": int(np.sum(gaussians.active)),
-        "each": [_record(result) for result in results],
+        "each": each,
     }
     write_json(files.eval, content)
-    _write_preview(files, results)
+    write_preview(files, results)
     return summary
 
 
-def _record(result: ViewResult) -> dict:
-    """Return one view as JSON.
-
-    PSNR is null if the render equals the photograph; both metrics are null if every
-    pixel is masked.
-    """
-    return {
-        "name": result.name,
-        "psnr": finite_or_none(result.psnr),
-        "ssim": finite_or_none(result.ssim),
-        "size": result.depth.shape[::-1],
-    }
-
-
-def write_preview(
-    files: RunFiles,
-    config: TrainConfig,
-    gaussians: Gaussians,
-    dataset: Dataset,
-    photos: list[Photo],
-) -> None:
-    """Write only the preview, of the first views of ``dataset``.
+def write_preview(files: RunFiles, results: list[ViewResult]) -> None:
+    """Write the preview of some of the evaluated views.
 
     Raises:
       InputError: if it cannot be written.
     """
-    few = subset(dataset, range(min(_PREVIEWED, len(dataset.views))))
-    results = evaluate_views(gaussians, few, photos[: len(few.views)], config)
-    _write_preview(files, list(results))
-
-
-def _write_preview(files: RunFiles, results: list[ViewResult]) -> None:
-    few = np.unique(np.linspace(0, len(results) - 1, _PREVIEWED).astype(int))
+    few = np.unique(np.linspace(0, len(results) - 1, PREVIEWED).astype(int))
     rows = [
         SheetRow(results[i].name, results[i].truth, results[i].render, results[i].depth)
         for i in few

@@ -12,7 +12,7 @@ from gsjax.io.formats import load, save
 from gsjax.io.spz import write_spz
 from gsjax.runs.folder import load_settings
 from gsjax.runs.scene_source import is_run, splat_file
-from gsjax.runtime.files import make_folder, refuse_existing
+from gsjax.runtime.files import make_folder, reject_existing
 
 
 def export_scene(
@@ -39,7 +39,7 @@ def export_scene(
       InputError: if a file cannot be read or written, or exists without ``overwrite``,
         or no Gaussian reaches ``min_opacity``.
     """
-    refuse_existing([out], overwrite)
+    reject_existing([out], overwrite)
     path = splat_file(source)
     with jax.enable_x64(True):  # keeps float64 files exact
         gaussians, found = _load_opaque(path, min_opacity)

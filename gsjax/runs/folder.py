@@ -15,9 +15,8 @@ Evaluating the training views adds eval_train.json, renders_train/ and
 preview_train.png.
 """
 
-import json
 import shlex
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,7 +30,7 @@ from gsjax.data.types import Dataset, View
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.io.formats import load, save
-from gsjax.runs.config_json import check_types, config_from_json, config_to_json
+from gsjax.runs.config_json import check_types, config_from_json
 from gsjax.runs.history import read_metrics
 from gsjax.runs.refined_cameras import load_cameras
 from gsjax.runtime.files import read_json, write_json
@@ -156,12 +155,11 @@ def with_views(settings: RunSettings, split: SplitDataset) -> RunSettings:
 
 
 def _check_same_views(then: RunSettings, now: RunSettings) -> None:
-    names = {"trained on": (then.trained, now.trained),
-             "held out": (then.held_out, now.held_out)}  # fmt: skip
     differences = []
-    for role, (old, new) in names.items():
-        changes = [f"+{name}" for name in sorted(set(new) - set(old))]
-        changes += [f"-{name}" for name in sorted(set(old) - set(new))]
+    for role, field_name in (("trained on", "trained"), ("held out", "held_out")):
+        old, new = (set(getattr(each, field_name)) for each in (then, now))
+        changes = [f"+{name}" for name in sorted(new - old)]
+        changes += [f"-{name}" for name in sorted(old - new)]
         if changes:
             few = changes[:5] + ["…"] * (len(changes) > 5)
             differences.append(f"{' '.join(few)} ({role})")
@@ -211,14 +209,11 @@ def load_settings(folder: Path) -> RunSettings:
             rest["every"] = None  # older versions wrote their default
         for name in ("test_images", "trained", "held_out"):
             rest[name] = tuple(rest.get(name, ()))
-        config = config_from_json(json.dumps(data["train"]))
-        return RunSettings(config=config, **rest)
-    except KeyError as error:
-        raise InputError(
-            f"{path}: damaged: {error} is missing; pass {expected}"
-        ) from error
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{path}: damaged: {error}; pass {expected}") from error
+        return RunSettings(config=config_from_json(data["train"]), **rest)
+    except (KeyError, ValueError, TypeError) as error:
+        missing = " is missing" * isinstance(error, KeyError)
+        message = f"{path}: damaged: {error}{missing}; pass {expected}"
+        raise InputError(message) from error
 
 
 def _why_not_a_run(path: Path) -> str:
@@ -244,8 +239,7 @@ def save_settings(folder: Path, settings: RunSettings) -> None:
     for name in ("dataset", "start"):
         if data[name] is not None:
             data[name] = str(data[name].resolve())
-    train = json.loads(config_to_json(settings.config))
-    content = {"format": _FORMAT, **data, "train": train}
+    content = {"format": _FORMAT, **data, "train": asdict(settings.config)}
     write_json(run_files(folder).config, content, indent=2)
 
 
@@ -258,12 +252,16 @@ def save_scene(
       InputError: as `gsjax.save`.
     """
     if not np.any(dataset.origin):
-        save(path, gaussians, overwrite=overwrite)
-        return
+        return save(path, gaussians, overwrite=overwrite)
     with jax.enable_x64(True):
-        means = np.asarray(gaussians.params.means, np.float64) + dataset.origin
-        params = gaussians.params.replace(means=means)  # pyright: ignore
-        save(path, gaussians.replace(params=params), overwrite=overwrite)  # pyright: ignore
+        save(path, _moved(gaussians, dataset.origin), overwrite=overwrite)
+
+
+def _moved(gaussians: Gaussians, offset: np.ndarray) -> Gaussians:
+    """Add an offset [3] to the means, in float64."""
+    means = np.asarray(gaussians.params.means, np.float64) + offset
+    params = gaussians.params.replace(means=means)  # pyright: ignore
+    return gaussians.replace(params=params)  # pyright: ignore
 
 
 def require_splat(folder: Path) -> Path:
@@ -280,8 +278,7 @@ def require_splat(folder: Path) -> Path:
         words = ["gsjax", "train", settings.dataset, "-o", folder, "--resume"]
         raise InputError(
             f"{folder}: no scene yet, at step {done:,} of {settings.config.steps:,}; "
-            "wait until the run ends or, if it was stopped, resume it: "
-            f"{shlex.join(map(str, words))}"
+            f"wait until the run ends, or resume it: {shlex.join(map(str, words))}"
         )
     return files.splat
 
@@ -297,8 +294,6 @@ def load_scene(path: Path, origin: np.ndarray) -> Gaussians:
     if not np.any(origin):
         return load(path)
     with jax.enable_x64(True):
-        wide = load(path)
-        means = np.asarray(wide.params.means, np.float64) - origin
-        params = wide.params.replace(means=means)  # pyright: ignore
-    narrow = jax.tree.map(lambda a: np.asarray(a, np.float32), params)
+        wide = _moved(load(path), -origin)
+    narrow = jax.tree.map(lambda a: np.asarray(a, np.float32), wide.params)
     return jax.tree.map(jnp.asarray, wide.replace(params=narrow))  # pyright: ignore

@@ -77,7 +77,6 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
             f"{path}: {len(malformed)} of {len(records) + len(malformed)} lines are "
             f"malformed and skipped, the first is line {malformed[0]}; train again for "
             "a complete log",
-            UserWarning,
             stacklevel=2,
         )
     return records
@@ -92,12 +91,10 @@ def _parse(line: bytes) -> dict[str, Any] | None:
     if not isinstance(record, dict):
         return None
     psnr = record.get("psnr", "missing")  # null if it is not finite
-    values = [record.get(key) for key in _REQUIRED] + [0 if psnr is None else psnr]
-    return record if all(map(_is_number, values)) else None
-
-
-def _is_number(value) -> bool:
-    return type(value) in (int, float) and abs(value) < 1e300
+    values: list[Any] = [record.get(key) for key in _REQUIRED]
+    values.append(0 if psnr is None else psnr)
+    good = all(type(v) in (int, float) and abs(v) < 1e300 for v in values)
+    return record if good else None
 
 
 def truncate_log(path: Path, steps: int) -> None:

@@ -12,14 +12,8 @@ import numpy as np
 from gsjax.data.extent import has_points
 from gsjax.data.types import Photo
 from gsjax.errors import InputError
-from gsjax.runs.folder import (
-    RunSettings,
-    SplitDataset,
-    load_scene,
-    load_settings,
-    run_files,
-    with_views,
-)
+from gsjax.runs import folder as run_folder
+from gsjax.runs.folder import RunSettings, SplitDataset
 from gsjax.runs.session import Session
 from gsjax.runtime.console import note
 from gsjax.train.health import check_in_view
@@ -53,7 +47,7 @@ def load_initial_state(settings: RunSettings, split: SplitDataset) -> TrainState
     if path is None:
         return None
     dataset = subset(split.dataset, split.train)
-    gaussians = load_scene(path, dataset.origin)
+    gaussians = run_folder.load_scene(path, dataset.origin)
     active = np.asarray(gaussians.active)
     check_state_memory(int(active.sum()), config)
     note(f"starting from the scene of {path}")
@@ -67,16 +61,17 @@ def load_initial_state(settings: RunSettings, split: SplitDataset) -> TrainState
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     check_in_view(dataset, np.asarray(gaussians.params.means)[active], str(path))
-    warn_of_trained_views(path, with_views(settings, split).held_out)
+    warn_of_trained_views(path, run_folder.with_views(settings, split).held_out)
     return state
 
 
 def warn_of_trained_views(start: Path, held_out: tuple[str, ...]) -> None:
     """Warn if the run that made the scene ``start`` trained on held-out views."""
     folder = start.parent
-    if run_files(folder).splat != start or not run_files(folder).config.exists():
+    files = run_folder.run_files(folder)
+    if files.splat != start or not files.config.exists():
         return
-    trained = set(load_settings(folder).trained) & set(held_out)
+    trained = set(run_folder.load_settings(folder).trained) & set(held_out)
     if trained:
         note(
             f"warning: {folder} was trained on {len(trained)} of the {len(held_out)} "

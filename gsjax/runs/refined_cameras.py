@@ -37,16 +37,14 @@ def refine_dataset(
       extent: extent of the training views.
     """
     rows = {index: row for row, index in enumerate(trained)}
-    shared = CameraRefinement(intrinsics=refinement.intrinsics)
     with jax.enable_x64(True):
-        wide, wide_shared = jax.tree.map(
-            lambda a: jnp.asarray(np.asarray(a, np.float64)), (refinement, shared)
+        wide = jax.tree.map(
+            lambda a: jnp.asarray(np.asarray(a, np.float64)), refinement
         )
+        shared = CameraRefinement(intrinsics=wide.intrinsics)
         views = [
-            _refine(view, wide, rows[index], extent)
-            if index in rows
-            else _refine(view, wide_shared, 0, extent)
-            for index, view in enumerate(dataset.views)
+            _refine(view, wide if i in rows else shared, rows.get(i, 0), extent)
+            for i, view in enumerate(dataset.views)
         ]
     return replace(dataset, views=tuple(views))
 

@@ -14,32 +14,18 @@ from gsjax.data.photos import load_photos
 from gsjax.data.types import Dataset, Photo
 from gsjax.errors import DivergedError, InputError
 from gsjax.raster.tile_render import device_count
+from gsjax.runs import folder as run_folder
 from gsjax.runs.checkpoint import latest_step, load_latest, restore
-from gsjax.runs.folder import (
-    RunFiles,
-    RunSettings,
-    load_settings,
-    load_split,
-    run_files,
-    save_settings,
-    with_views,
-)
+from gsjax.runs.folder import RunFiles, RunSettings
 from gsjax.runs.history import plot_curves, read_metrics, truncate_log
 from gsjax.runs.initialisation import (
     first_state,
     load_initial_state,
     resolve_initialisation,
 )
-from gsjax.runs.session import (
-    ResumePoint,
-    Session,
-    evaluate,
-    resume_hint,
-    save_result,
-    session_hooks,
-)
+from gsjax.runs.session import ResumePoint, Session, resume_hint
 from gsjax.runtime.console import note
-from gsjax.runtime.files import alone_in, make_folder, writing
+from gsjax.runtime.files import locked_folder, make_folder, writing
 from gsjax.train.config import TrainConfig
 from gsjax.train.evaluation import Summary
 from gsjax.train.initialisation import empty_state
@@ -101,33 +87,32 @@ def start_run(
     dataset = settings.dataset.resolve()
     if folder.resolve() == (dataset if dataset.is_dir() else dataset.parent):
         raise InputError(f"{folder}: is the dataset's own folder; pass another with -o")
-    split = load_split(settings)
-    settings = resolve_initialisation(with_views(settings, split), split)
+    split = run_folder.load_split(settings)
+    settings = resolve_initialisation(run_folder.with_views(settings, split), split)
     start = ResumePoint(load_initial_state(settings, split))
-    session = Session(settings.config, split, run_files(folder), start)
-    photos = _load_training_photos(session)
-    state = start.state or first_state(session, photos)
+    session = Session(settings.config, split, run_folder.run_files(folder), start)
+    photos, state = _load_photos_and_state(session)
     make_folder(folder)
-    with alone_in(folder):
+    with locked_folder(folder):
         # Checked again: another process may have written here meanwhile.
         for path in _files_to_replace(folder, overwrite):
-            _remove(path)
-        save_settings(folder, settings)
+            with writing(path, "removed"):  # the target of a link stays
+                folders = path.is_dir() and not path.is_symlink()
+                shutil.rmtree(path) if folders else path.unlink()
+        run_folder.save_settings(folder, settings)
         return _train(session, photos, state, watch)
 
 
 def _files_to_replace(folder: Path, overwrite: bool) -> list[Path]:
-    """Return the files of the run in ``folder``, config.json last.
-
-    If removing them fails midway, the folder is still a run.
+    """Return the files of the run in ``folder``, config.json, which marks it, last.
 
     Raises:
       InputError: if there are any without ``overwrite``, or they are not a run's.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file; pass a folder with -o")
-    files = run_files(folder)
-    names = dict.fromkeys((*files, *run_files(folder, "train")))
+    files = run_folder.run_files(folder)
+    names = dict.fromkeys((*files, *run_folder.run_files(folder, "train")))
     found = [path for path in names if path.exists() or path.is_symlink()]
     if found and not overwrite:
         raise InputError(
@@ -135,17 +120,8 @@ def _files_to_replace(folder: Path, overwrite: bool) -> list[Path]:
             "or another folder with -o"
         )
     if found:
-        load_settings(folder)  # raises if the folder is not a run
+        run_folder.load_settings(folder)  # raises if the folder is not a run
     return sorted(found, key=lambda path: path == files.config)
-
-
-def _remove(path: Path) -> None:
-    """Remove a file, folder or link; the target of a link stays."""
-    with writing(path, "removed"):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
 
 
 def resume_run(
@@ -164,24 +140,30 @@ def resume_run(
       InputError: if the folder is not a run, its files are damaged, another process
         trains in it, or the dataset holds other views.
     """
-    with alone_in(folder):
-        return _resume(folder, dataset, watch)
+    with locked_folder(folder):
+        session = _resumed_session(folder, dataset)
+        return _train(session, *_load_photos_and_state(session), watch)
 
 
-def _resume(folder: Path, dataset: Path | None, watch: Watch | None) -> RunResult:
-    settings, files = load_settings(folder), run_files(folder)
+def _resumed_session(folder: Path, dataset: Path | None) -> Session:
+    settings, files = run_folder.load_settings(folder), run_folder.run_files(folder)
     if dataset is not None:
         settings = replace(settings, dataset=dataset)
-    split = load_split(settings)
+    split = run_folder.load_split(settings)
     if dataset is not None:
-        save_settings(folder, settings)
+        run_folder.save_settings(folder, settings)
         note(f"the run's dataset is now {dataset}")
     if any(files.checkpoints.glob("*.npz")):
         training = subset(split.dataset, split.train)
         start = _last_checkpoint(files, settings.config, training)
         if start.step < settings.config.steps:
             note(f"resuming from step {start.step:,}")
-            _note_device_change(start.devices, settings.config)
+            now, before = device_count(settings.config.raster), start.devices
+            if before not in (None, now):  # sums per device then round differently
+                note(
+                    f"{now} devices (cores) instead of {before}: the result is equal "
+                    "up to rounding, not bit-equal"
+                )
         else:
             note(
                 f"the run finished before, at step {start.step:,}: only its results "
@@ -189,10 +171,7 @@ def _resume(folder: Path, dataset: Path | None, watch: Watch | None) -> RunResul
             )
     else:
         start = ResumePoint(load_initial_state(settings, split))
-    session = Session(settings.config, split, files, start)
-    photos = _load_training_photos(session)
-    state = start.state or first_state(session, photos)
-    return _train(session, photos, state, watch)
+    return Session(settings.config, split, files, start)
 
 
 def _last_checkpoint(
@@ -210,49 +189,37 @@ def _last_checkpoint(
     )
 
 
-def _note_device_change(before: int | None, config: TrainConfig) -> None:
-    """Report another number of devices: sums per device then round differently."""
-    now = device_count(config.raster)
-    if before not in (None, now):
-        note(
-            f"{now} devices (cores) instead of {before}: the result is equal up to "
-            "rounding, not bit-equal"
-        )
-
-
-def _load_training_photos(session: Session) -> list[Photo]:
-    """Check the memory for training, then load the photographs."""
+def _load_photos_and_state(session: Session) -> tuple[list[Photo], TrainState]:
+    """Check the memory for training; return the photographs and the state to start."""
     config, split = session.config, session.split
     note(
         f"{len(split.dataset.views)} views ({len(split.test)} held out), "
         f"{len(split.dataset.points):,} points; loading the photographs"
     )
-    check_memory(session.dataset, config, session.resume_point.state)
-    return load_photos(session.dataset.views, config.max_size)
+    state = session.resume_point.state
+    check_memory(session.dataset, config, state)
+    photos = load_photos(session.dataset.views, config.max_size)
+    return photos, state or first_state(session, photos)
 
 
 def _train(
     session: Session, photos: list[Photo], state: TrainState, watch: Watch | None
 ) -> RunResult:
+    """Fit and save; after an error, write the scene of the last checkpoint."""
     try:
         return _fit_and_save(session, photos, state, watch)
     except Exception as error:
-        _save_last_checkpoint(session, error)
+        files = session.files
+        with suppress(Exception):  # the first error is the one to report
+            start = _last_checkpoint(files, session.config, session.dataset)
+            assert start.state is not None
+            session.save_result(start.state)
+            note(f"the scene of step {start.step} is kept: {files.splat}")
+        if not isinstance(error, DivergedError):  # resuming would diverge again
+            note(resume_hint(files))
+        elif latest_step(files.checkpoints) is None:
+            note("no checkpoint was written (--checkpoint-every): nothing is kept")
         raise
-
-
-def _save_last_checkpoint(session: Session, error: Exception) -> None:
-    """Write the scene of the last checkpoint after an error."""
-    files = session.files
-    with suppress(Exception):  # the first error is the one to report
-        start = _last_checkpoint(files, session.config, session.dataset)
-        assert start.state is not None
-        save_result(session, start.state)
-        note(f"the scene of step {start.step} is kept: {files.splat}")
-    if not isinstance(error, DivergedError):  # resuming would diverge again
-        note(resume_hint(files))
-    elif latest_step(files.checkpoints) is None:
-        note("no checkpoint was written before (--checkpoint-every): nothing is kept")
 
 
 def _fit_and_save(
@@ -263,16 +230,12 @@ def _fit_and_save(
     truncate_log(files.metrics, start.step)
     # The last step is evaluated again, also if the run had finished.
     truncate_log(files.held_out, min(start.step, config.steps - 1))
-    with session_hooks(session) as hooks:
+    with session.hooks() as hooks:
         if watch is not None:
             hooks.state = watch(dataset, photos, config)
+        capacity = start.pair_capacity
         result = fit(
-            dataset,
-            photos,
-            config,
-            state=state,
-            pair_capacity=start.pair_capacity,
-            hooks=hooks,
+            dataset, photos, config, state=state, pair_capacity=capacity, hooks=hooks
         )
         gaussians = int(np.sum(result.gaussians.active))
         if result.dropped:
@@ -282,17 +245,11 @@ def _fit_and_save(
             )
         # Inside the hooks, so that Ctrl-C does not interrupt saving.
         session.save(result.state, result.pair_capacity, result.progress)
-        save_result(session, result.state)
+        session.save_result(result.state)
         finished = int(result.state.step) >= config.steps and not hooks.stop()
-    summary = evaluate(session, result, photos) if finished else None
+    summary = session.evaluate(result, photos) if finished else None
     session.measured.write()
     metrics, held_out = (read_metrics(p) for p in (files.metrics, files.held_out))
     plot_curves(files.curves, metrics, len(photos), held_out)
-    return RunResult(
-        files=files,
-        finished=finished,
-        step=int(result.state.step),
-        seconds=session.seconds(result.progress),
-        gaussians=gaussians,
-        summary=summary,
-    )
+    step, seconds = int(result.state.step), session.seconds(result.progress)
+    return RunResult(files, finished, step, seconds, gaussians, summary)

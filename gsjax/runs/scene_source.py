@@ -9,12 +9,7 @@ import numpy as np
 
 from gsjax.gaussians import Gaussians
 from gsjax.raster.types import RasterConfig
-from gsjax.runs.folder import (
-    background_color,
-    load_scene,
-    load_settings,
-    require_splat,
-)
+from gsjax.runs import folder as run_folder
 
 # Render settings by their names on the command line.
 RASTER_PRESETS = {
@@ -62,8 +57,8 @@ def splat_file(path: Path) -> Path:
     """
     if not is_run(path):
         return path
-    load_settings(path)
-    return require_splat(path)
+    run_folder.load_settings(path)
+    return run_folder.require_splat(path)
 
 
 def open_scene_source(
@@ -88,10 +83,12 @@ def open_scene_source(
     """
     config, behind = RasterConfig.compat(), (0.0, 0.0, 0.0)
     if is_run(path):
-        trained = load_settings(path).config
-        config, behind = free_view_config(trained.raster), background_color(trained)
+        trained = run_folder.load_settings(path).config
+        config, behind = trained.raster, run_folder.background_color(trained)
+        config = free_view_config(config)
     if raster is not None:  # opacities are learnt for one value of antialias
         config = raster.replace(antialias=config.antialias)
     splat = splat_file(path)
-    reader = partial(load_scene, splat, np.zeros(3) if origin is None else origin)
+    origin = np.zeros(3) if origin is None else origin
+    reader = partial(run_folder.load_scene, splat, origin)
     return SceneSource(reader, config, behind if background is None else background)

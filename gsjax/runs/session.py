@@ -12,12 +12,17 @@ from gsjax.data.types import Dataset, Photo
 from gsjax.errors import InputError
 from gsjax.raster.tile_render import device_count
 from gsjax.runs.checkpoint import latest_step, save_checkpoint
-from gsjax.runs.evaluation import evaluate_views, write_evaluation, write_preview
+from gsjax.runs.evaluation import (
+    PREVIEWED,
+    evaluate_views,
+    write_evaluation,
+    write_preview,
+)
 from gsjax.runs.folder import RunFiles, SplitDataset, save_scene
 from gsjax.runs.history import JsonlLog
 from gsjax.runs.refined_cameras import refine_dataset, refine_photos, save_cameras
 from gsjax.runs.report import Reporter
-from gsjax.runtime.console import decibels, note, stopping_on_ctrl_c
+from gsjax.runtime.console import decibels, deferred_interrupt, note
 from gsjax.runtime.files import remove_leftovers
 from gsjax.train.config import TrainConfig
 from gsjax.train.evaluation import Summary, summarise
@@ -96,11 +101,10 @@ class Session:
 
     def held_out(self, cameras: Dataset) -> tuple[Dataset, list[Photo]]:
         """Return the held-out views with the given cameras, and their photographs."""
-        given = subset(self.split.dataset, self.split.test)
-        dataset = subset(cameras, self.split.test)
+        given, dataset = self.split.views("test"), subset(cameras, self.split.test)
         if self._held_out is None:
-            self._held_out = load_photos(given.views, self.config.max_size)
-        return dataset, refine_photos(self._held_out, given.views, dataset.views)
+            self._held_out = load_photos(given, self.config.max_size)
+        return dataset, refine_photos(self._held_out, given, dataset.views)
 
     def log_held_out(self, state: TrainState, summary: Summary, seconds: float) -> None:
         """Log the metrics of the held-out views."""
@@ -113,93 +117,75 @@ class Session:
         }
         self.measured.add(record)
 
+    def save_result(self, state: TrainState) -> None:
+        """Write the current scene, and its cameras if they are refined."""
+        files, dataset = self.files, self.split.dataset
+        save_scene(files.splat, state.gaussians, dataset, overwrite=True)
+        if (cameras := self.cameras(state)) is not dataset:
+            save_cameras(files.cameras, cameras)
 
-@contextmanager
-def session_hooks(session: Session) -> Iterator[Hooks]:
-    """Return the hooks that report, log and checkpoint a run; flush the logs at exit.
+    def evaluate(self, result: FitResult, photos: list[Photo]) -> Summary | None:
+        """Evaluate the held-out views; without any, write only the preview."""
+        config, split, files = self.config, self.split, self.files
+        cameras, scene = self.cameras(result.state), result.gaussians
+        dataset, held_out = self.held_out(cameras)
+        if not any(map(has_valid_pixels, held_out)):
+            if held_out:
+                note(
+                    "warning: all held-out views are fully masked; nothing is evaluated"
+                )
+            dataset = subset(cameras, split.train[:PREVIEWED])
+            given = self.dataset.views[:PREVIEWED]
+            few = refine_photos(photos[:PREVIEWED], given, dataset.views)
+            write_preview(files, list(evaluate_views(scene, dataset, few, config)))
+            return None
+        summary = write_evaluation(files, config, scene, dataset, held_out, "test")
+        if config.every_eval:
+            self.log_held_out(result.state, summary, self.seconds(result.progress))
+        return summary
 
-    Inside the context, Ctrl-C stops the run after the current step.
-    """
-    config = session.config
-    reporter = Reporter(config, session.resume_point.step)
+    @contextmanager
+    def hooks(self) -> Iterator[Hooks]:
+        """Return the hooks that report, log and save a run; flush the logs at exit.
 
-    def step(progress: Progress) -> None:
-        reporter.step(progress)
-        record = progress.record()
-        record["seconds"] = round(session.seconds(progress), 3)
-        session.metrics.add(record)
+        Inside the context, Ctrl-C stops the run after the current step.
+        """
+        reporter = Reporter(self.config, self.resume_point.step)
 
-    def checkpoint(state: TrainState, pair_capacity: int, progress: Progress) -> None:
+        def step(progress: Progress) -> None:
+            reporter.step(progress)
+            record = progress.record()
+            record["seconds"] = round(self.seconds(progress), 3)
+            self.metrics.add(record)
+
+        def checkpoint(
+            state: TrainState, pair_capacity: int, progress: Progress
+        ) -> None:
+            try:
+                self.save(state, pair_capacity, progress)
+            except InputError as error:
+                # A full disk costs the checkpoint, not the run; older ones are kept.
+                note(f"warning: {error}; continuing without this checkpoint")
+
+        def measure(state: TrainState, progress: Progress) -> None:
+            dataset, photos = self.held_out(self.cameras(state))
+            if any(map(has_valid_pixels, photos)):
+                results = evaluate_views(state.gaussians, dataset, photos, self.config)
+                summary = summarise(list(results))
+                self.log_held_out(state, summary, self.seconds(progress))
+                note(
+                    f"step {int(state.step)}: {len(photos)} held-out views: PSNR "
+                    f"{decibels(summary.psnr)}, SSIM {summary.ssim:.4f}"
+                )
+
         try:
-            session.save(state, pair_capacity, progress)
-        except InputError as error:
-            # A full disk costs the checkpoint, not the run; older ones are kept.
-            note(f"warning: {error}; continuing without this checkpoint")
-
-    def measure(state: TrainState, progress: Progress) -> None:
-        dataset, photos = session.held_out(session.cameras(state))
-        if any(map(has_valid_pixels, photos)):
-            results = evaluate_views(state.gaussians, dataset, photos, config)
-            summary = summarise(list(results))
-            session.log_held_out(state, summary, session.seconds(progress))
-            note(
-                f"step {int(state.step)}: {len(photos)} held-out views: PSNR "
-                f"{decibels(summary.psnr)}, SSIM {summary.ssim:.4f}"
-            )
-
-    try:
-        with stopping_on_ctrl_c() as stopped:
-            yield Hooks(
-                step=step,
-                phase=note,
-                checkpoint=checkpoint,
-                measure=measure,
-                stop=stopped,
-            )
-    finally:
-        reporter.close()
-        for log in (session.metrics, session.measured):
-            with suppress(InputError):  # the next file to be saved reports it
-                log.write()
-
-
-def save_result(session: Session, state: TrainState) -> None:
-    """Write the current scene, and its cameras if they are refined."""
-    files, dataset = session.files, session.split.dataset
-    save_scene(files.splat, state.gaussians, dataset, overwrite=True)
-    cameras = session.cameras(state)
-    if cameras is not dataset:
-        save_cameras(files.cameras, cameras)
-
-
-def _can_evaluate(session: Session) -> bool:
-    if not session.split.test:
-        return False
-    _, photos = session.held_out(session.split.dataset)
-    if any(map(has_valid_pixels, photos)):
-        return True
-    note("warning: all held-out views are fully masked; nothing is evaluated")
-    return False
-
-
-def evaluate(
-    session: Session, result: FitResult, photos: list[Photo]
-) -> Summary | None:
-    """Evaluate the held-out views; without any, write only the preview."""
-    config, split, files = session.config, session.split, session.files
-    cameras = session.cameras(result.state)
-    if not _can_evaluate(session):
-        dataset = subset(cameras, split.train)
-        photos = refine_photos(photos, session.dataset.views, dataset.views)
-        write_preview(files, config, result.gaussians, dataset, photos)
-        return None
-    dataset, held_out = session.held_out(cameras)
-    summary = write_evaluation(
-        files, config, result.gaussians, dataset, held_out, "test"
-    )
-    if config.every_eval:
-        session.log_held_out(result.state, summary, session.seconds(result.progress))
-    return summary
+            with deferred_interrupt() as stopped:
+                yield Hooks(step, note, checkpoint, measure=measure, stop=stopped)
+        finally:
+            reporter.close()
+            for log in (self.metrics, self.measured):
+                with suppress(InputError):  # the next file to be saved reports it
+                    log.write()
 
 
 def resume_hint(files: RunFiles) -> str:

@@ -65,13 +65,10 @@ def view_entries(
     names = [PurePosixPath(n) for n in short_names([view.name for view in views])]
     folder = posixpath.commonpath([str(n.parent) for n in names]) if names else ""
     flat = ["_".join(name.relative_to(folder).parts) for name in names]
-    unique = len({name.casefold() for name in flat}) == len(flat)
-    entries = []
-    for index, (name, view) in enumerate(zip(flat, views)):
-        name = name if unique else f"{index:05d}_{name}"
-        scaled = _at_photo_size(view, max_size)
-        entries.append(_entry(name, scaled.viewmat, scaled, view.near))
-    return entries
+    if len({name.casefold() for name in flat}) < len(flat):
+        flat = [f"{index:05d}_{name}" for index, name in enumerate(flat)]
+    scaled = [_at_photo_size(view, max_size) for view in views]
+    return [_entry(n, view.viewmat, view, view.near) for n, view in zip(flat, scaled)]
 
 
 def path_entries(
@@ -208,5 +205,5 @@ def depth_limits(
     depths = np.concatenate(seen)
     if not len(depths):
         return 0.0, 0.0
-    near, far = np.percentile(depths, (1, 99))
-    return float(near), float(far)
+    near, far = np.percentile(depths, (1, 99)).tolist()
+    return near, far

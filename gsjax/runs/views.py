@@ -19,7 +19,7 @@ from gsjax.raster.types import RasterConfig, Render
 from gsjax.runs.scene_source import SceneSource
 from gsjax.runtime.console import note, progress, say
 from gsjax.runtime.devices import replicate
-from gsjax.runtime.files import make_folder, refuse_existing, write_file
+from gsjax.runtime.files import make_folder, reject_existing, write_file
 from gsjax.runtime.memory import available, size_text
 
 _MARGIN = 1.5  # spare capacity for views with more pairs than the first
@@ -140,12 +140,11 @@ def _note_memory(gaussians: Gaussians, camera: Camera, config: RasterConfig) -> 
 
 
 def _targets(folder: Path, name: str, kinds: Sequence[str], npy: bool) -> list[_Target]:
-    out = []
-    for place, kind in enumerate(kinds):
-        stem = f"{name}.{kind}" if place else name
-        array = folder / f"{stem}.npy" if npy else None
-        out.append(_Target(kind, folder / f"{stem}.png", array))
-    return out
+    stems = [f"{name}.{kind}" if place else name for place, kind in enumerate(kinds)]
+    return [
+        _Target(kind, folder / f"{stem}.png", folder / f"{stem}.npy" if npy else None)
+        for kind, stem in zip(kinds, stems)
+    ]
 
 
 def _check_paths(targets: list[list[_Target]], overwrite: bool) -> None:
@@ -160,7 +159,7 @@ def _check_paths(targets: list[list[_Target]], overwrite: bool) -> None:
                 "camera file, or render one kind of image at a time"
             )
         seen.add(str(path).casefold())
-    refuse_existing(paths, overwrite, "another folder with -o")
+    reject_existing(paths, overwrite, "another folder with -o")
 
 
 def _write(target: _Target, image: np.ndarray) -> str:

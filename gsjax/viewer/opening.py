@@ -9,25 +9,12 @@ from gsjax.data.types import Dataset, Photo, View
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.raster.types import RasterConfig
-from gsjax.runs.folder import (
-    background_color,
-    load_settings,
-    load_split,
-    run_files,
-    with_refined_cameras,
-)
-from gsjax.runs.run_info import describe_run
+from gsjax.runs import folder
+from gsjax.runs.info import describe_run
 from gsjax.runs.scene_source import free_view_config, is_run, open_scene_source
 from gsjax.runtime.console import note, one_line
 from gsjax.train.config import TrainConfig
-from gsjax.viewer.cameras import (
-    THUMBNAIL,
-    UPS,
-    Frustum,
-    frusta_of,
-    viewpoint_of_cameras,
-    viewpoint_of_gaussians,
-)
+from gsjax.viewer import cameras
 from gsjax.viewer.exact import ExactRenderer
 from gsjax.viewer.session import ViewerContent
 
@@ -63,35 +50,34 @@ def load_content(
     """
     dataset, status = None, ""
     if is_run(path):
-        settings = load_settings(path)
-        run = describe_run(path)
+        settings, run = folder.load_settings(path), describe_run(path)
         status = f"step {run['steps_done']:,} of {run['steps']:,}"
         try:
-            dataset = with_refined_cameras(
-                load_split(settings), run_files(path)
-            ).dataset
+            split, files = folder.load_split(settings), folder.run_files(path)
+            dataset = folder.with_refined_cameras(split, files).dataset
         except InputError as error:
             note(f"warning: without cameras: {one_line(error)}")
-    origin = None if dataset is None else dataset.origin
+    origin, views = (dataset.origin, dataset.views) if dataset else (None, ())
     source = open_scene_source(path, origin=origin, raster=raster)
     gaussians = source.load()
-    frusta = [] if dataset is None else frusta_of(dataset.views)
     renderer = ExactRenderer(source.config, source.background)
-    content = make_content(gaussians, renderer, frusta, up)
+    content = make_content(gaussians, renderer, cameras.frusta_of(views), up)
     content.status = status
     content.min_opacity, content.max_gaussians = min_opacity, max_gaussians
-    return LoadedContent(content, () if dataset is None else dataset.views)
+    return LoadedContent(content, views)
 
 
-def frusta_with_photos(views: Sequence[View], size: int = THUMBNAIL) -> list[Frustum]:
+def frusta_with_photos(
+    views: Sequence[View], size: int = cameras.THUMBNAIL
+) -> list[cameras.Frustum]:
     """Return cameras with photographs; without and with a warning if one is missing."""
-    drawn = {frustum.name for frustum in frusta_of(views)}
+    drawn = {frustum.name for frustum in cameras.frusta_of(views)}
     few = [view for view in views if view.name in drawn]
     try:
-        return frusta_of(few, load_photos(few, size))
+        return cameras.frusta_of(few, load_photos(few, size))
     except InputError as error:
         note(f"warning: without photographs: {one_line(error)}")
-        return frusta_of(few)
+        return cameras.frusta_of(few)
 
 
 def training_content(
@@ -104,20 +90,20 @@ def training_content(
     devices would deadlock.
     """
     raster = free_view_config(config.raster).replace(devices=1)
-    renderer = ExactRenderer(raster, background_color(config))
-    return make_content(gaussians, renderer, frusta_of(dataset.views, photos))
+    renderer = ExactRenderer(raster, folder.background_color(config))
+    return make_content(gaussians, renderer, cameras.frusta_of(dataset.views, photos))
 
 
 def make_content(
     gaussians: Gaussians,
     renderer: ExactRenderer,
-    frusta: list[Frustum],
+    frusta: list[cameras.Frustum],
     up: str | None = None,
 ) -> ViewerContent:
     """Return content with a viewpoint for it; ``up`` as in `load_content`."""
     if frusta:
-        viewpoint = viewpoint_of_cameras(frusta)
-        viewpoint = viewpoint if up is None else viewpoint._replace(up=UPS[up])
+        viewpoint = cameras.viewpoint_of_cameras(frusta)
+        viewpoint = viewpoint if up is None else viewpoint._replace(up=cameras.UPS[up])
     else:
-        viewpoint = viewpoint_of_gaussians(gaussians, UPS[up or "-y"])
+        viewpoint = cameras.viewpoint_of_gaussians(gaussians, cameras.UPS[up or "-y"])
     return ViewerContent(gaussians, renderer, viewpoint, frusta)

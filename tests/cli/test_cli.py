@@ -17,8 +17,7 @@ import gsjax
 from gsjax.cli import main as main_module
 from gsjax.cli.main import main
 from gsjax.cli.parsing import COMMANDS
-from gsjax.data.transforms import CameraEntry, load_transforms
-from gsjax.data.transforms_writer import transforms_json
+from gsjax.data.transforms import CameraEntry, load_transforms, transforms_json
 from gsjax.raster.types import Demand, Render
 from gsjax.synthetic.torus_knot import torus_knot_scene
 
@@ -161,7 +160,7 @@ ERRORS = [
     (3, "info TMP/bad.ply", "end_header"),
     (3, "info a.ksplat", "expected a suffix of .ply, .spz"),
     (3, "render SCENE/scene.ply -o TMP/o --cameras TMP/bad.json", "not JSON"),
-    (3, "RENDER -o TMP/bad.ply/o", "cannot be made a folder"),
+    (3, "RENDER -o TMP/bad.ply/o", "bad.ply/o: cannot be "),
     (2, "xyz", "unknown command 'xyz' (choose demo, sfm, "),
     (2, "rendr x", "(did you mean render?); see gsjax --help"),
     (2, "--verison", "(did you mean --version?)"),
@@ -414,7 +413,7 @@ def test_info(scene, tmp_path, capsys):
 def test_doctor(capsys, monkeypatch):
     assert main(["doctor"]) == 0
     assert re.search(r"render .*: ok$", capsys.readouterr().out, re.M)
-    checks = "gsjax.cli.doctor_checks.render_error"
+    checks = "gsjax.cli.doctor.render_error"
     monkeypatch.setattr(checks, lambda: (float("nan"), 9))
     assert main(["doctor"]) == 1
     assert "FAILED" in capsys.readouterr().out

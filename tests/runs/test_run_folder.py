@@ -6,13 +6,13 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from hostile import HOSTILE, harmless, write_hostile
+from hostile import HOSTILE, escape_controls, write_hostile
 
 import gsjax
 from gsjax.cli.main import main
@@ -22,7 +22,7 @@ from gsjax.errors import InputError
 from gsjax.raster.types import RasterConfig
 from gsjax.runs import initialisation
 from gsjax.runs import run as run_module
-from gsjax.runs.config_json import config_from_json, config_to_json
+from gsjax.runs.config_json import config_from_json
 from gsjax.runs.evaluation import evaluate_run
 from gsjax.runs.folder import (
     RunSettings,
@@ -35,7 +35,7 @@ from gsjax.runs.folder import (
 from gsjax.runs.history import read_metrics
 from gsjax.runs.run import RunResult, resume_run, start_run
 from gsjax.runs.scene_source import open_scene_source
-from gsjax.runtime.files import alone_in
+from gsjax.runtime.files import locked_folder
 from gsjax.train.config import Level, TrainConfig, continuation_config, preset
 from gsjax.train.initialisation import initial_state
 
@@ -54,7 +54,7 @@ CONFIG = TrainConfig(
 def whole(tmp_path_factory) -> Path:
     """Return a folder with a dataset and a finished run, which no test changes."""
     folder = tmp_path_factory.mktemp("whole")
-    data = write_hostile(folder / "data", harmless())
+    data = write_hostile(folder / "data", escape_controls())
     assert start_run(RunSettings(data, CONFIG), folder / "run").finished
     return folder
 
@@ -130,7 +130,7 @@ def test_a_run_is_replaced_only_when_the_next_can_start(made, tmp_path, monkeypa
 
 def test_one_training_at_a_time_in_a_folder(made):
     before, settings = contents(made / "run"), RunSettings(made / "data", CONFIG)
-    with alone_in(made / "run"):
+    with locked_folder(made / "run"):
         for begin in (
             lambda: start_run(settings, made / "run", overwrite=True),
             lambda: resume_run(made / "run"),
@@ -139,8 +139,8 @@ def test_one_training_at_a_time_in_a_folder(made):
                 begin()
             assert contents(made / "run") == before
     program = (
-        "import sys, time, pathlib\nfrom gsjax.runtime.files import alone_in\n"
-        "with alone_in(pathlib.Path(sys.argv[1])):\n"
+        "import sys, time, pathlib\nfrom gsjax.runtime.files import locked_folder\n"
+        "with locked_folder(pathlib.Path(sys.argv[1])):\n"
         "    print('held', flush=True)\n    time.sleep(600)\n"
     )
     arguments = [sys.executable, "-c", program, str(made)]
@@ -148,11 +148,11 @@ def test_one_training_at_a_time_in_a_folder(made):
         try:
             assert other.stdout is not None
             assert other.stdout.readline() == b"held\n"
-            with pytest.raises(InputError, match="another"), alone_in(made):
+            with pytest.raises(InputError, match="another"), locked_folder(made):
                 pass
         finally:
             other.kill()
-    with alone_in(made):  # a killed process holds nothing
+    with locked_folder(made):  # a killed process holds nothing
         pass
 
 
@@ -236,7 +236,7 @@ def test_a_dataset_without_points_starts_at_random(whole, tmp_path, capsys):
     splat = (run / "splat.ply").read_bytes()
     shutil.rmtree(run / "checkpoints")
     shutil.rmtree(data)
-    write_hostile(data, replace(bare, scene=harmless().scene))
+    write_hostile(data, replace(bare, scene=escape_controls().scene))
     capsys.readouterr()
     assert resume_run(run).finished
     assert (run / "splat.ply").read_bytes() == splat
@@ -520,11 +520,11 @@ def test_renders_of_a_run_use_its_settings_with_occlusion_culling(whole):
 def test_settings_of_older_versions_are_read():
     """Their rates lack the cooling."""
     rates = CONFIG.rates._replace(cooling=0.5, cooling_from=0.3)
-    data = json.loads(config_to_json(CONFIG.replace(rates=rates)))
-    assert config_from_json(json.dumps(data)).rates == rates
+    data = json.loads(json.dumps(asdict(CONFIG.replace(rates=rates))))
+    assert config_from_json(data).rates == rates
     for wanted in (rates._replace(cooling_from=0.6), CONFIG.rates):
         del data["rates"][-1]
-        assert config_from_json(json.dumps(data)).rates == wanted
+        assert config_from_json(data).rates == wanted
     del data["rates"][-1]
     with pytest.raises(InputError, match="not the settings"):
-        config_from_json(json.dumps(data))
+        config_from_json(data)

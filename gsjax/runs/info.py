@@ -1,18 +1,92 @@
-"""Statistics of a scene, for `gsjax info`."""
+"""Statistics of a scene, and progress and quality of a run, for `gsjax info`."""
 
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.raster.memory_estimate import render_estimate
 from gsjax.raster.types import RasterConfig
+from gsjax.runs.folder import load_settings, run_files
+from gsjax.runs.history import read_metrics
+from gsjax.runtime.console import decibels
+from gsjax.runtime.files import read_json
 from gsjax.runtime.memory import size_text
 
 _PERCENTILES = (1, 25, 50, 75, 99)
 _SIZE = (1920, 1080)
 _PAIRS = 5  # tile pairs per Gaussian, typical of trained scenes
+_VIEWS = {"test": "held-out", "train": "training"}
+# Reported keys of an evaluation and their types; psnr is null if it is infinite.
+_REPORTED = {
+    "which": (str,),
+    "views": (int,),
+    "ssim": (float, int),
+    "psnr": (float, int, type(None)),
+}
+
+
+def describe_run(folder: Path) -> dict[str, Any]:
+    """Return the main settings, progress and quality of a run, ready for JSON.
+
+    ``evaluation`` is None if there is none yet.
+
+    Raises:
+      InputError: if the folder is not a run, or its files are damaged.
+    """
+    settings, files = load_settings(folder), run_files(folder)
+    config = settings.config
+    lines = read_metrics(files.metrics)
+    last = lines[-1] if lines else {"step": 0, "seconds": 0.0}
+    return {
+        "dataset": str(settings.dataset),
+        "strategy": config.strategy,
+        "steps_done": last["step"],
+        "steps": config.steps,
+        "seconds": last["seconds"],
+        "seed": config.seed,
+        "max_size": config.max_size,
+        "background": config.background,
+        "evaluation": _evaluation(files.eval),
+    }
+
+
+def _evaluation(path: Path) -> dict[str, Any] | None:
+    if not path.exists():
+        return None
+    data = read_json(path, "the eval.json of a run")
+    for key, kinds in _REPORTED.items():
+        value = data.get(key, "missing")
+        good = type(value) in kinds
+        if good and type(value) in (int, float):
+            good = abs(value) < 1e30
+        if not good or (key == "which" and value not in _VIEWS):
+            raise InputError(
+                f"{path}: damaged: {key} is {repr(value)[:80]}; write it again with "
+                "`gsjax eval`"
+            )
+    return {key: data[key] for key in _REPORTED}
+
+
+def run_text(path: str, facts: dict[str, Any]) -> str:
+    """Return `describe_run` as readable lines."""
+    rows = {
+        "dataset": facts["dataset"],
+        "strategy": facts["strategy"],
+        "steps": f"{facts['steps_done']:,} of {facts['steps']:,}",
+        "training": f"{facts['seconds']:.0f} s",
+    }
+    quality = facts["evaluation"]
+    if quality is not None:
+        which = _VIEWS[quality["which"]]
+        rows["quality"] = (
+            f"PSNR {decibels(quality['psnr'])}, SSIM {quality['ssim']:.4f} "
+            f"({quality['views']} {which} views)"
+        )
+    return _table(path, rows)
 
 
 def describe(gaussians: Gaussians) -> dict[str, Any]:
@@ -27,7 +101,9 @@ def describe(gaussians: Gaussians) -> dict[str, Any]:
     quats = np.asarray(params.quats)[active]
     logits = np.asarray(params.logit_opacities, np.float64)[active]
     logs = np.asarray(params.log_scales, np.float64)[active]
-    leaves = jax.tree.leaves(params)
+    leaves, slots = jax.tree.leaves(params), gaussians.capacity
+    pairs = min(capacity_bucket(_PAIRS * slots), 2**30 - 1)
+    config, bases = RasterConfig(pair_capacity=pairs), params.sh.shape[-2]
     zero = np.abs(quats).max(axis=1, initial=0) < np.finfo(quats.dtype).tiny
     with np.errstate(over="ignore"):
         opacities = 1 / (1 + np.exp(-logits))
@@ -44,16 +120,9 @@ def describe(gaussians: Gaussians) -> dict[str, Any]:
         "anisotropy": _percentiles(anisotropy),
         "zero_quaternions": int(zero.sum()),
         "parameter_bytes": sum(int(leaf.nbytes) for leaf in leaves),
-        "render_bytes": _render_bytes(gaussians),
+        "render_bytes": render_estimate(slots, bases, _SIZE, config).total,
         "dtype": str(params.means.dtype),
     }
-
-
-def _render_bytes(gaussians: Gaussians) -> int:
-    pairs = capacity_bucket(_PAIRS * gaussians.capacity)
-    config = RasterConfig(pair_capacity=min(pairs, 2**30 - 1))
-    bases = gaussians.params.sh.shape[-2]
-    return render_estimate(gaussians.capacity, bases, _SIZE, config).total
 
 
 def _percentiles(values: np.ndarray) -> dict[str, float | None]:
@@ -107,8 +176,13 @@ def info_text(path: str, facts: dict[str, Any]) -> str:
         "memory to render": f"about {size_text(facts['render_bytes'])} at "
         f"{_SIZE[0]} × {_SIZE[1]}",
     }
-    return "\n".join([path, *(f"  {name:<18}{value}" for name, value in rows.items())])
+    return _table(path, rows)
 
 
 def _size(count: int) -> str:
     return f"{count / 2**20:.2f} MiB" if count >= 2**20 else f"{count / 1024:.1f} KiB"
+
+
+def _table(path: str, rows: dict[str, str]) -> str:
+    lines = (f"  {name:<18}{value}" for name, value in rows.items())
+    return "\n".join([path, *lines])
