@@ -36,14 +36,14 @@ def ground(radius: float):
         odd_x, odd_y = (smooth_step(np.sin(np.pi * a / 0.52), 0.2) for a in (x, y))
         check = odd_x + odd_y - 2 * odd_x * odd_y
         drift = _waves(x, y)
-        light = _mix((0.90, 0.84, 0.72), (0.86, 0.70, 0.56), drift)
-        dark = _mix((0.24, 0.42, 0.47), (0.30, 0.33, 0.50), drift)
-        tiles = dark + (light - dark) * check
+        light = _blend((0.90, 0.84, 0.72), (0.86, 0.70, 0.56), drift)
+        dark = _blend((0.24, 0.42, 0.47), (0.30, 0.33, 0.50), drift)
+        tiles = _blend(dark, light, check)
         distance = np.hypot(x, y)
         rim = smooth_step(distance - 0.89 * radius, 0.03)
         turns = smooth_step(np.sin(24 * np.arctan2(y, x)), 0.25)
-        edge = _mix((0.16, 0.19, 0.28), (0.86, 0.52, 0.26), turns)
-        return tiles + (edge - tiles) * rim
+        edge = _blend((0.16, 0.19, 0.28), (0.86, 0.52, 0.26), turns)
+        return _blend(tiles, edge, rim)
 
     return albedo
 
@@ -51,18 +51,16 @@ def ground(radius: float):
 def bands(points: np.ndarray) -> np.ndarray:
     """Return the albedo of a sphere: wavy bands of a palette."""
     x, y, z = points / np.sqrt((points**2).sum(axis=0))
-    turn = np.arctan2(y, x)
-    level = 0.5 * z + 0.09 * np.sin(3 * turn) * (1 - z * z) + 0.5
+    level = 0.5 * z + 0.09 * np.sin(3 * np.arctan2(y, x)) * (1 - z * z) + 0.5
     thin = smooth_step(np.cos(2 * np.pi * 5 * level) - 0.8, 0.16)
-    return _onto(_palette(0.9 * level + 0.55), _CREAM, 0.85 * thin)
+    return _blend(_palette(0.9 * level + 0.55), _CREAM, 0.85 * thin)
 
 
 def rings(points: np.ndarray) -> np.ndarray:
     """Return the albedo of a small sphere: golden, with dark rings about its x axis."""
     x = points[0] / np.sqrt((points**2).sum(axis=0))
-    return _mix(
-        (0.93, 0.68, 0.22), (0.60, 0.24, 0.20), smooth_step(np.sin(8.5 * x), 0.3)
-    )
+    ring = smooth_step(np.sin(8.5 * x), 0.3)
+    return _blend((0.93, 0.68, 0.22), (0.60, 0.24, 0.20), ring)
 
 
 def helix(major: float):
@@ -73,7 +71,7 @@ def helix(major: float):
         turn = np.arctan2(y, x)
         around = np.arctan2(z, np.hypot(x, y) - major)
         stripe = smooth_step(np.sin(8 * turn + 2 * around) - 0.15, 0.25)
-        return _onto(_palette(turn / (2 * np.pi)), _CREAM, 0.8 * stripe)
+        return _blend(_palette(turn / (2 * np.pi)), _CREAM, 0.8 * stripe)
 
     return albedo
 
@@ -90,14 +88,14 @@ def crate(half: float):
         v = np.choose(face, (z, z, y))
         color = np.asarray(sides, x.dtype).T[:, face]
         lid = smooth_step(np.sin(2.6 * np.pi * (u + v)), 0.35) * (face == 2)
-        color = _onto(color, (0.42, 0.27, 0.50), lid)
+        color = _blend(color, (0.42, 0.27, 0.50), lid)
         for index, word in enumerate(("GS", "JAX")):
             found = face == index
             stroke = np.zeros_like(u)
             stroke[found] = _word(word, u[found], v[found])
-            color = _onto(color, _CREAM, stroke)
+            color = _blend(color, _CREAM, stroke)
         frame = smooth_step(np.maximum(np.abs(u), np.abs(v)) - 0.88, 0.05)
-        return _onto(color, _INK, frame)
+        return _blend(color, _INK, frame)
 
     return albedo
 
@@ -139,30 +137,17 @@ def smooth_step(x: np.ndarray, width: float) -> np.ndarray:
     return x * x * (3 - 2 * x)
 
 
-def _mix(low, high, share: np.ndarray) -> np.ndarray:
-    """Interpolate between two colours, [3, R]."""
-    low, high = (np.asarray(c, share.dtype)[:, None] for c in (low, high))
+def _blend(low, high, share: np.ndarray) -> np.ndarray:
+    """Interpolate between colours, [3] or [3, R], by ``share`` [R]."""
+    low, high = (np.asarray(c, share.dtype).reshape(3, -1) for c in (low, high))
     return low + (high - low) * share
-
-
-def _onto(color: np.ndarray, over, share: np.ndarray) -> np.ndarray:
-    """Blend one colour over ``color`` [3, R] with opacity ``share`` [R]."""
-    return color + (np.asarray(over, color.dtype)[:, None] - color) * share
 
 
 def _palette(turn: np.ndarray) -> np.ndarray:
     """Return colours [3, R] of a smooth cyclic palette: coral, amber, teal, blue."""
-    stops = np.asarray(
-        [
-            (0.89, 0.36, 0.34),
-            (0.95, 0.68, 0.27),
-            (0.16, 0.60, 0.56),
-            (0.22, 0.36, 0.68),
-        ],
-        turn.dtype,
-    )
-    place = (turn % 1) * len(stops)
-    low = place.astype(int) % len(stops)
+    red, green = (0.89, 0.95, 0.16, 0.22), (0.36, 0.68, 0.60, 0.36)
+    stops = np.asarray([red, green, (0.34, 0.27, 0.56, 0.68)], turn.dtype)
+    place = (turn % 1) * 4
+    low = place.astype(int) % 4
     share = smooth_step((place % 1) - 0.5, 0.5)
-    first, second = stops.T[:, low], stops.T[:, (low + 1) % len(stops)]
-    return first + (second - first) * share
+    return _blend(stops[:, low], stops[:, (low + 1) % 4], share)

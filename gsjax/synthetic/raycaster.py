@@ -80,10 +80,6 @@ def cast(
 def surface_points(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return noisy surface points that the cameras see, as from structure from motion.
 
-    Args:
-      count: number of points.
-      seed: seed of the sampled pixels and of the noise.
-
     Returns:
       points [M, 3] float64 with noise of σ = 0.004 in each coordinate, and their
       shaded colours [M, 3] uint8.
@@ -140,11 +136,6 @@ def write_demo_dataset(
 ) -> None:
     """Write `images/photo_000.png` …, `transforms.json` and `points.ply`.
 
-    Args:
-      folder: created if missing.
-      settings: default `DemoDatasetSettings()`.
-      overwrite: whether to replace existing files.
-
     Raises:
       InputError: if a file exists and ``overwrite`` is not set, or cannot be written.
       MissingExtraError: if OpenCV is absent.
@@ -164,8 +155,8 @@ def write_demo_dataset(
         write_file(photo, images.encode_png(images.to_8_bit(rgb)))
         camera = make_camera(viewmat=viewmat, K=K, width=size[0], height=size[1])
         entries.append(CameraEntry(name, camera))
-    cloud = _points_ply(*surface_points(settings.points, settings.seed))
-    write_file(points, cloud)
+    cloud = surface_points(settings.points, settings.seed)
+    write_file(points, _points_ply(*cloud))
     text = transforms_json(entries, ply_file_path=points.name)
     write_file(cameras, text.encode())
 
@@ -173,7 +164,6 @@ def write_demo_dataset(
 @cache
 def solids() -> tuple[Solid, ...]:
     """Return the still life, the floor first."""
-    flat = np.eye(3)
 
     def turned(degrees: float) -> np.ndarray:
         cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
@@ -182,22 +172,17 @@ def solids() -> tuple[Solid, ...]:
     upright = turned(35) @ np.asarray([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     tilted = np.asarray([[0.8, 0, 0.6], [0, 1.0, 0], [-0.6, 0, 0.8]])
 
-    def put(shape, place, axes, color):
-        return Solid(shape, np.asarray(place, float), axes, color)
-
     half, major, minor = 0.46, 0.46, 0.17
-    return (
-        put(disc(GROUND_RADIUS), (0, 0, 0), flat, albedo.ground(GROUND_RADIUS)),
-        put(sphere(0.56), (-0.85, -0.35, 0.56), tilted, albedo.bands),
-        put(box((half, half, half)), (0.1, 0.9, half), turned(24), albedo.crate(half)),
-        put(
-            torus(major, minor),
-            (0.72, -0.62, major + minor),
-            upright,
-            albedo.helix(major),
-        ),
-        put(sphere(0.24), (-0.12, -1.22, 0.24), turned(70), albedo.rings),
+    ring, ring_place = torus(major, minor), (0.72, -0.62, major + minor)
+    cube, cube_place = box((half, half, half)), (0.1, 0.9, half)
+    rows = (
+        (disc(GROUND_RADIUS), (0, 0, 0), np.eye(3), albedo.ground(GROUND_RADIUS)),
+        (sphere(0.56), (-0.85, -0.35, 0.56), tilted, albedo.bands),
+        (cube, cube_place, turned(24), albedo.crate(half)),
+        (ring, ring_place, upright, albedo.helix(major)),
+        (sphere(0.24), (-0.12, -1.22, 0.24), turned(70), albedo.rings),
     )
+    return tuple(Solid(s, np.asarray(p, float), axes, c) for s, p, axes, c in rows)
 
 
 def _image(viewmat, K, size: tuple[int, int], samples: int, background):
@@ -214,17 +199,18 @@ def _image(viewmat, K, size: tuple[int, int], samples: int, background):
         grid = (a.ravel() for a in np.meshgrid(u, v))
         # float32 takes half the time and is exact to 1e-6 of the scene.
         origin, directions = (a.astype(np.float32) for a in _rays(viewmat, K, *grid))
-        rgb = _radiance(origin, directions, background)
+        rgb = np.tile(np.asarray(background, np.float32)[:, None], directions.shape[1])
+        t, which = _first_hits(origin, directions)
+        hit = np.flatnonzero(np.isfinite(t))
+        points = origin[:, None] + t[hit] * directions.take(hit, axis=1)
+        rgb[:, hit] = _shade(points, which[hit])
         rgb = rgb.reshape(3, bottom - top, samples, width, samples).mean(axis=(2, 4))
         image[top:bottom] = np.moveaxis(rgb, 0, -1)
     return image
 
 
 def _rays(viewmat, K, u: np.ndarray, v: np.ndarray):
-    """Return origin [3] and directions [3, R] through pixels (u, v), with camera z 1.
-
-    The ray parameter of a hit is its depth.
-    """
+    """Return origin [3] and directions [3, R] of pixels (u, v); t of a hit is depth."""
     viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
     x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
     rotation = viewmat[:3, :3]
@@ -247,16 +233,6 @@ def _first_hits(origin: np.ndarray, directions: np.ndarray):
         nearer = t < first[rays]
         first[rays[nearer]], which[rays[nearer]] = t[nearer], index
     return first, which
-
-
-def _radiance(origin: np.ndarray, directions: np.ndarray, background) -> np.ndarray:
-    rgb = np.asarray(background, directions.dtype)[:, None]
-    rgb = np.tile(rgb, directions.shape[1])
-    t, which = _first_hits(origin, directions)
-    hit = np.flatnonzero(np.isfinite(t))
-    points = origin[:, None] + t[hit] * directions.take(hit, axis=1)
-    rgb[:, hit] = _shade(points, which[hit])
-    return rgb
 
 
 def _shade(points: np.ndarray, which: np.ndarray) -> np.ndarray:
@@ -290,8 +266,7 @@ def _sun_visibility(solid: Solid, points, normals, asked: np.ndarray) -> np.ndar
     """
     lit = np.ones_like(points[0])
     offset = points - solid.centre.astype(points.dtype)[:, None]
-    # Distance along the ray to the point nearest the centre.
-    ahead = -(_SUN.astype(points.dtype) @ offset)
+    ahead = -(_SUN.astype(points.dtype) @ offset)  # to the point nearest the centre
     reach = solid.shape.reach
     wide = reach + _PENUMBRA * np.maximum(ahead + reach, 0)
     aside = dot(offset, offset) - ahead * ahead
@@ -320,10 +295,7 @@ def _sun_visibility(solid: Solid, points, normals, asked: np.ndarray) -> np.ndar
 
 
 def _sky_visibility(solid: Solid, points, normals, other: np.ndarray) -> np.ndarray:
-    """Return [R] in [0, 1]: share of the sky that ``solid`` leaves visible.
-
-    A heuristic, from its distance to a point above the surface.
-    """
+    """Return [R] in [0, 1]: share of the sky left by ``solid``, from its distance."""
     height = 0.45
     above = points + height * normals
     offset = above - solid.centre.astype(points.dtype)[:, None]
@@ -339,9 +311,7 @@ def _points_ply(points: np.ndarray, colors: np.ndarray) -> bytes:
     """Return a PLY point cloud as nerfstudio writes it: xyz, red, green, blue."""
     kinds = [(name, "<f4") for name in "xyz"]
     kinds += [(name, "u1") for name in ("red", "green", "blue")]
-    rows = np.empty(len(points), kinds)
-    for (name, _), column in zip(kinds, [*points.T, *colors.T]):
-        rows[name] = column
+    rows = np.rec.fromarrays([*points.T, *colors.T], dtype=kinds)
     names = {"<f4": "float", "u1": "uchar"}
     properties = [f"property {names[kind]} {name}" for name, kind in kinds]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]

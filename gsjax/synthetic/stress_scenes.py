@@ -43,8 +43,7 @@ def needles(width: int = 240, height: int = 180, count: int = 1500) -> StressSce
     rng = np.random.default_rng(2)
     depth = rng.uniform(2, 8, count)
     along = depth * np.exp(rng.uniform(np.log(0.03), np.log(0.3), count))
-    thin = 1e-5 * depth
-    scales = np.stack([thin, along, thin], axis=1)
+    scales = np.stack([1e-5 * depth, along, 1e-5 * depth], axis=1)
     opacity = rng.uniform(0.2, 0.9, count)
     return _random_scene("needles", depth, scales, opacity, rng, (width, height))
 
@@ -60,10 +59,7 @@ def huge(width: int = 240, height: int = 180, count: int = 4000) -> StressScene:
 
 
 STRESS_SCENES: dict[str, Callable[[], StressScene]] = {
-    "knot": knot,
-    "fog": fog,
-    "needles": needles,
-    "huge": huge,
+    make.__name__: make for make in (knot, fog, needles, huge)
 }
 
 

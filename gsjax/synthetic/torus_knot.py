@@ -20,8 +20,7 @@ _C0, _C1 = 0.28209479177387814, 0.4886025119029199
 _CENTRE = np.asarray([0.0, 0.0, 1.42])
 _TUBE = 0.3
 _FLOOR_RADIUS = 4.4
-# The floor fades into it.
-BACKGROUND = (0.93, 0.945, 0.955)
+BACKGROUND = (0.93, 0.945, 0.955)  # the floor fades into it
 
 
 class SyntheticScene(NamedTuple):
@@ -54,12 +53,10 @@ def torus_knot_scene(
       width, height: image size, px.
     """
     knot = _knot(count)
-    floor = _floor(count)
-    parts = [_shaded(knot, knot), _shaded(floor, knot)]
+    parts = [_shaded(knot, knot), _shaded(_floor(count), knot)]
     fields = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
-    cameras = orbit(frames, width, height)
     gaussians = make_gaussians(**fields, capacity=None)
-    return SyntheticScene(gaussians, cameras, BACKGROUND)
+    return SyntheticScene(gaussians, orbit(frames, width, height), BACKGROUND)
 
 
 def orbit(
@@ -101,15 +98,15 @@ def _knot(count: int) -> _Surfels:
     around = 2 * np.pi * ((index * _GOLDEN) % 1)
     path, tangent, side, other = _knot_frame(t)
     normals = np.cos(around)[:, None] * side + np.sin(around)[:, None] * other
-    tilt = _rotation_x(np.radians(62))
+    cos, sin = np.cos(np.radians(62)), np.sin(np.radians(62))
+    tilt = np.asarray([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
     means = (path + _TUBE * normals) @ tilt.T + _CENTRE
     length = np.linalg.norm(tangent, axis=1).mean() * 2 * np.pi
     spacing = np.sqrt(length * 2 * np.pi * _TUBE / count)
     # Two families of helical stripes.
     stripe = smooth_step(np.cos(3 * around + 24 * t), 0.2)
     thin = smooth_step(np.cos(24 * t) - 0.9, 0.08)
-    albedo = _palette(t / (2 * np.pi))
-    albedo = albedo * (1 - 0.3 * stripe[:, None])
+    albedo = _palette(t / (2 * np.pi)) * (1 - 0.3 * stripe[:, None])
     albedo += (np.asarray([0.98, 0.95, 0.88]) - albedo) * thin[:, None]
     full = np.full(count, 1.0)
     radii, normals = 0.66 * spacing * full, normals @ tilt.T
@@ -195,11 +192,8 @@ def _sunlit(points: np.ndarray, casters: np.ndarray) -> np.ndarray:
     local = (points - _CENTRE) @ axes.T
     where = cell(local)
     offsets = np.mgrid[-1:2, -1:2].reshape(2, -1).T
-    lit = [
-        local[:, 2] > nearest[tuple((where + 0.8 * o).astype(int).T)] - 0.16
-        for o in offsets
-    ]
-    return np.mean(lit, axis=0)
+    cells_near = [tuple((where + 0.8 * o).astype(int).T) for o in offsets]
+    return np.mean([local[:, 2] > nearest[c] - 0.16 for c in cells_near], axis=0)
 
 
 def _open_sky(points: np.ndarray, normals: np.ndarray, casters: np.ndarray):
@@ -219,23 +213,11 @@ def _quats_of_normals(normals: np.ndarray) -> np.ndarray:
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
-def _rotation_x(angle: float) -> np.ndarray:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.asarray([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
-
-
 def _palette(turn: np.ndarray) -> np.ndarray:
     """Return colours [M, 3] of a cyclic palette: teal, blue, violet, coral, amber."""
-    stops = np.asarray(
-        [
-            (0.07, 0.60, 0.62),
-            (0.16, 0.38, 0.78),
-            (0.45, 0.27, 0.72),
-            (0.90, 0.34, 0.42),
-            (0.98, 0.63, 0.22),
-            (0.42, 0.68, 0.36),
-        ]
-    )
+    red = (0.07, 0.16, 0.45, 0.90, 0.98, 0.42)
+    green = (0.60, 0.38, 0.27, 0.34, 0.63, 0.68)
+    stops = np.asarray([red, green, (0.62, 0.78, 0.72, 0.42, 0.22, 0.36)]).T
     place = (turn % 1) * len(stops)
     low = place.astype(int) % len(stops)
     mix = (place % 1)[:, None]
