@@ -41,7 +41,8 @@ def parts(folder: Path) -> tuple[dict, dict]:
     slots = int(checkpoint.meta["capacity"])
     state = restore(checkpoint, empty_state(config, extent, views, slots))
     frames = make_frames(scene.views, load_photos(scene.views, config.max_size))
-    raster = config.raster.replace(pair_capacity=pairs_for(state, frames, config))
+    pairs = pairs_for(state, frames, config, config.schedule)
+    raster = config.raster.replace(pair_capacity=pairs)
     setup = make_setup(config, extent)
     strategy = setup.strategy
     raster = raster.replace(outputs=("rgb",), absgrad=strategy.absgrad)

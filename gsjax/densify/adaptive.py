@@ -122,12 +122,7 @@ class AdaptiveStats(NamedTuple):
 
 
 def adaptive(settings: AdaptiveSettings, extent: float) -> Strategy:
-    """Return adaptive density control as a strategy.
-
-    Args:
-      settings: static settings.
-      extent: scene extent in world units; see `gsjax.data.extent.scene_extent`.
-    """
+    """Return adaptive density control for a scene extent in world units."""
 
     def init(gaussians: Gaussians) -> AdaptiveStats:
         shape, dtype = gaussians.capacity, gaussians.params.means.dtype
@@ -170,9 +165,13 @@ def adaptive(settings: AdaptiveSettings, extent: float) -> Strategy:
 
 
 def _densify(
-    settings: AdaptiveSettings, extent: float, key: Array, step: Array,
-    gaussians: Gaussians, stats: AdaptiveStats,
-) -> SlotEdit:  # fmt: skip
+    settings: AdaptiveSettings,
+    extent: float,
+    key: Array,
+    step: Array,
+    gaussians: Gaussians,
+    stats: AdaptiveStats,
+) -> SlotEdit:
     """Plan which Gaussians are cloned, split and removed."""
     params, active = gaussians.params, gaussians.active
     scales = exp_log_scale(params.log_scales)

@@ -90,12 +90,7 @@ class McmcSettings:
 
 
 def mcmc(settings: McmcSettings, extent: float = USUAL_EXTENT) -> Strategy:
-    """Return MCMC density control as a strategy.
-
-    Args:
-      settings: static settings.
-      extent: scene extent in world units; see `gsjax.data.extent.scene_extent`.
-    """
+    """Return MCMC density control for a scene extent in world units."""
     unit = extent / USUAL_EXTENT
 
     def plan(key: Array, step: Array, gaussians: Gaussians, stats: tuple):
@@ -164,11 +159,8 @@ def spawn(
     `shared_opacity` and `shared_scale`.
 
     Args:
-      key: random key.
-      gaussians: N slots.
-      slots: [N] bool, the slots to fill.
-      alive: [N] bool, the Gaussians to draw from.
-      settings: of the strategy.
+      key, gaussians, settings: random key, N slots, settings of the strategy.
+      slots, alive: [N] bool, the slots to fill, and the Gaussians to draw from.
     """
     params = gaussians.params
     size = slots.shape[0]
@@ -185,10 +177,10 @@ def spawn(
     shared = shared_opacity(opacity, copies + 1)
     factor = shared_scale(opacity, shared, copies + 1)
     shared = jnp.clip(shared, settings.dead_opacity, None)
-    wider = params.log_scales + jnp.log(factor)[:, None]
+    logits = jnp.where(parents, logit(shared), params.logit_opacities)
+    widened = parents[:, None], params.log_scales + jnp.log(factor)[:, None]
     edited = params.replace(  # pyright: ignore
-        logit_opacities=jnp.where(parents, logit(shared), params.logit_opacities),
-        log_scales=jnp.where(parents[:, None], wider, params.log_scales),
+        logit_opacities=logits, log_scales=jnp.where(*widened, params.log_scales)
     )
     born = source < size
     return SlotEdit(
@@ -217,12 +209,7 @@ def shared_scale(opacity: Array, shared: Array, count: Array) -> Array:
 
     because 1/√(k+1) = 1/√π ∫ exp(−(k+1) t²) dt and the sums are then binomial and
     geometric. The integral avoids the cancellation of the alternating sum, whose terms
-    reach 1e14 at n = 51.
-
-    Args:
-      opacity: [N] opacities o before.
-      shared: [N] opacities o' after, see `shared_opacity`.
-      count: [N] numbers n.
+    reach 1e14 at n = 51. All arguments have shape [N]: o, o' and n.
     """
     step = _REACH / (_NODES - 1)
 

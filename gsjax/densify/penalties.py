@@ -17,8 +17,7 @@ def mean_penalty(
 
     Args:
       gaussians: N slots.
-      opacity_weight: weight of the mean opacity.
-      scale_weight: weight of the mean scale, in fifths of ``extent``.
+      opacity_weight, scale_weight: weights; scales are in fifths of ``extent``.
       extent: scene extent in world units.
 
     Returns:

@@ -39,12 +39,8 @@ class EditSchedule:
     def expected(self, count: int, since: int, until: int) -> int:
         """Return the number of Gaussians to expect at step ``until``.
 
-        Each edit adds at least one Gaussian if ``growth`` is above 1. If it is unknown,
-        half as many more are expected.
-
-        Args:
-          count: number of Gaussians at step ``since``.
-          since, until: steps.
+        There are ``count`` at step ``since``. Each edit adds at least one if ``growth``
+        is above 1. If it is unknown, half as many more are expected.
         """
         edits = self.edits_between(since, until)
         if self.growth is None:
@@ -58,12 +54,7 @@ class EditSchedule:
 
 
 def schedule_of(due: Callable[[Any], Any], steps: int) -> EditSchedule:
-    """Return a schedule that covers the steps at which ``due`` holds.
-
-    Args:
-      due: ``step → bool``, elementwise.
-      steps: last step of the run.
-    """
+    """Return a schedule of the steps up to ``steps`` at which ``due`` holds."""
     every_step = np.arange(steps + 1)
     found = np.flatnonzero(np.broadcast_to(np.asarray(due(every_step)), steps + 1))
     if not len(found):

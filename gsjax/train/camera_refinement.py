@@ -37,23 +37,14 @@ class CameraRefinement:
 
 def init_refinement(config: TrainConfig, views: int) -> CameraRefinement:
     """Return zero corrections of the kinds that ``config`` enables."""
+    poses, intrinsics = config.refine_poses, config.refine_intrinsics
     # Distinct arrays: a buffer can be donated only once.
     return CameraRefinement(
-        turns=jnp.zeros((views, 3)) if config.refine_poses else None,
-        shifts=jnp.zeros((views, 3)) if config.refine_poses else None,
-        intrinsics=jnp.zeros(4) if config.refine_intrinsics else None,
+        turns=jnp.zeros((views, 3)) if poses else None,
+        shifts=jnp.zeros((views, 3)) if poses else None,
+        intrinsics=jnp.zeros(4) if intrinsics else None,
         exposures=jnp.zeros((views, 3, 4)) if config.exposure else None,
     )
-
-
-def refinement_rates(config: TrainConfig) -> dict[str, float]:
-    """Return the learning rates of the corrections by label."""
-    return {
-        "turns": config.pose_rate,
-        "shifts": config.pose_rate,
-        "intrinsics": config.intrinsics_rate,
-        "exposures": config.exposure_rate,
-    }
 
 
 def refine_camera(
@@ -84,10 +75,7 @@ def refine_camera(
 
 
 def apply_exposure(
-    images: Array,
-    refinement: CameraRefinement,
-    index: Array,
-    alphas: Array | None = None,
+    images: Array, refinement: CameraRefinement, index: Array, alphas: Array | None
 ) -> Array:
     """Return renders with the exposure corrections of their photographs.
 

@@ -5,6 +5,7 @@ capacity is chosen to minimise recompilation plus the cost of idle slots.
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -35,17 +36,11 @@ _PAIRS_OF_TILE = 7
 
 
 class _Price(NamedTuple):
-    """Compile time of a program, in units of the cost of idle capacity.
+    """Compile time of a program, in idle capacity that costs as much time."""
 
-    Attributes:
-      slots: idle slots that cost as much time in one step (SH degree 2).
-      pairs: idle pairs that cost as much time in one view.
-      most: largest number of slots per Gaussian, to limit memory.
-    """
-
-    slots: float
-    pairs: float
-    most: float
+    slots: float  # in one step (SH degree 2)
+    pairs: float  # in one view
+    most: float  # largest number of slots per Gaussian, to limit memory
 
 
 _ON_CPU = _Price(13 / 1.3e-6, 22 / 0.12e-6, math.inf)  # seconds, on two cores
@@ -57,62 +52,44 @@ def _price() -> _Price:
 
 
 def pairs_for(
-    state: TrainState,
-    frames: Frames,
-    config: TrainConfig,
-    schedule: EditSchedule | None = None,
+    state: TrainState, frames: Frames, config: TrainConfig, schedule: EditSchedule
 ) -> int:
     """Return a pair capacity with a margin for these photographs.
 
     Before the first step it is estimated on the host, since counting would compile a
     program.
 
-    Args:
-      state: of the run.
-      frames: photographs of V views.
-      config: settings.
-      schedule: of the strategy; default that of ``config``.
-
     Raises:
       CapacityError: as `with_margin` and `count_demand`.
     """
-    probed = np.linspace(0, frames.count - 1, min(frames.count, _MAX_PROBED_VIEWS))
-    spheres, most = None, 1
+    gaussians, raster, least = state.gaussians, config.raster, 1
     if int(state.step) == 0:
-        spheres = as_spheres(state.gaussians)
-        tile = config.raster.tile_size
-        tiles = np.prod([-(-side // tile) for side in frames.pixels.shape[1:3]])
-        most = _PAIRS_OF_TILE * int(tiles)
-    # A fixed visible capacity, so that one program serves all views.
-    raster = config.raster.replace(visible_capacity=state.gaussians.capacity)
+        tiles = [-(-side // raster.tile_size) for side in frames.pixels.shape[1:3]]
+        least = _PAIRS_OF_TILE * int(np.prod(tiles))
+        count = partial(expected_pairs, as_spheres(gaussians), config=raster)
+    else:
+        # A fixed visible capacity, so that one program serves all views.
+        raster = raster.replace(visible_capacity=gaussians.capacity)
+        count = lambda camera: count_demand(gaussians, camera, raster).capacity  # noqa: E731
+    probed = np.linspace(0, frames.count - 1, min(frames.count, _MAX_PROBED_VIEWS))
     cameras = jax.device_get(frames.camera)  # indexing on the host compiles nothing
-    for index in np.unique(probed.astype(int)):
-        camera = jax.tree.map(lambda a, i=index: a[i], cameras)
-        if spheres is not None:
-            wanted = expected_pairs(spheres, camera, config.raster)
-        else:
-            wanted = count_demand(state.gaussians, camera, raster).capacity
-        most = max(most, int(wanted))
-    return with_margin(most, state, config, schedule)
+    wanted = [
+        int(count(jax.tree.map(lambda a, i=index: a[i], cameras)))
+        for index in np.unique(probed.astype(int))
+    ]
+    return with_margin(max(least, *wanted), state, config, schedule)
 
 
-class Spheres(NamedTuple):
-    """Isotropic Gaussians: means [N, 3], variances [N] and opacities [N]."""
-
-    means: np.ndarray
-    variances: np.ndarray
-    opacities: np.ndarray
+Spheres = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def as_spheres(gaussians: Gaussians) -> Spheres:
-    """Return the active Gaussians with their mean variances, on the host."""
+    """Return means [N, 3], mean variances [N] and opacities [N] of active Gaussians."""
     active, params = np.asarray(gaussians.active), gaussians.params
-    names = ("means", "log_scales", "logit_opacities")
-    means, scales, logits = (
-        np.asarray(getattr(params, name))[active].astype(np.float64) for name in names
-    )
+    fields = params.means, params.log_scales, params.logit_opacities
+    means, scales, logits = (np.asarray(a, float)[active] for a in fields)
     variances = np.mean(np.exp(2 * scales), 1)
-    return Spheres(means, variances, 1 / (1 + np.exp(-logits)))
+    return means, variances, 1 / (1 + np.exp(-logits))
 
 
 def expected_pairs(spheres: Spheres, camera: Camera, config: RasterConfig) -> float:
@@ -122,20 +99,15 @@ def expected_pairs(spheres: Spheres, camera: Camera, config: RasterConfig) -> fl
     squares of side c on a grid of spacing t (Santaló, "Integral Geometry and Geometric
     Probability", 1976). The pixel centres of a tile of t px span c = t − 1. Occlusion
     is ignored, and figures are clipped to the image as ellipses.
-
-    Args:
-      spheres: from `as_spheres`.
-      camera: one camera.
-      config: tile size, α threshold and dilation.
     """
     viewmat, K = np.asarray(camera.viewmat, float), np.asarray(camera.K, float)
-    points = spheres.means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    means, variances, opacities = spheres
+    points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     drawn = (points[:, 2] > camera.near) & (points[:, 2] < camera.far)
-    points = points[drawn]
-    z = points[:, 2]
+    points, z = points[drawn], points[drawn, 2]
     centre = (points @ K.T)[:, :2] / z[:, None]
-    variance = spheres.variances[drawn] * K[0, 0] * K[1, 1] / z**2
-    reach = 2 * np.log(np.maximum(spheres.opacities[drawn] / config.alpha_min, 1))
+    variance = variances[drawn] * K[0, 0] * K[1, 1] / z**2
+    reach = 2 * np.log(np.maximum(opacities[drawn] / config.alpha_min, 1))
     radius = np.sqrt(reach * (variance + config.dilation))[:, None]
     size = np.asarray([camera.width, camera.height], float)
     sides = np.clip(centre + radius, 0, size) - np.clip(centre - radius, 0, size)
@@ -146,17 +118,13 @@ def expected_pairs(spheres: Spheres, camera: Camera, config: RasterConfig) -> fl
 
 
 def with_margin(
-    wanted: int,
-    state: TrainState,
-    config: TrainConfig,
-    schedule: EditSchedule | None = None,
+    wanted: int, state: TrainState, config: TrainConfig, schedule: EditSchedule
 ) -> int:
     """Return a pair capacity of at least ``wanted``, with a margin for growth.
 
     Raises:
       CapacityError: if ``wanted`` exceeds the limit.
     """
-    schedule = schedule or config.schedule
     if wanted >= 2**30:
         raise CapacityError(
             f"pair capacity: expected at most {2**30 - 1:,} pairs in a view, got "
@@ -197,7 +165,7 @@ def _expected(
 
 
 def slots_for(
-    count: int, step: int, config: TrainConfig, schedule: EditSchedule | None = None
+    count: int, step: int, config: TrainConfig, schedule: EditSchedule
 ) -> int:
     """Return the number of slots for ``count`` Gaussians at ``step`` and some growth.
 
@@ -206,7 +174,6 @@ def slots_for(
     where p is the cost of a compilation in slots (Harris, "How Many Parts to Make at
     Once", 1913). The growth until the next recompilation is the upper limit.
     """
-    schedule = schedule or config.schedule
     price, growth = _price(), _expected(count, step, config, schedule) - count
     steps = min(_remaining_steps(step, config), schedule.stop - step)
     spare = min(growth, math.sqrt(2 * price.slots * growth / max(1, steps)))
@@ -217,16 +184,12 @@ def slots_for(
 
 
 def with_slots(
-    state: TrainState,
-    wanted: int,
-    config: TrainConfig,
-    schedule: EditSchedule | None = None,
+    state: TrainState, wanted: int, config: TrainConfig, schedule: EditSchedule
 ) -> TrainState:
     """Return the state with more slots if ``wanted`` Gaussians may soon exceed them.
 
     Slots do not grow beyond the maximum number of Gaussians, nor after the last edit.
     """
-    schedule = schedule or config.schedule
     wanted = min(wanted, schedule.max_gaussians)
     if _SLOT_MARGIN * wanted <= state.gaussians.capacity:
         return state
@@ -237,7 +200,7 @@ def with_slots(
 
 
 def with_slots_ahead(
-    state: TrainState, config: TrainConfig, schedule: EditSchedule | None = None
+    state: TrainState, config: TrainConfig, schedule: EditSchedule
 ) -> TrainState:
     """Return the state with slots for the steps ahead, when recompiling anyway."""
     slots = slots_for(_count(state), int(state.step), config, schedule)
@@ -251,10 +214,9 @@ def grow_state(state: TrainState, capacity: int) -> TrainState:
         return state
 
     def pad(array):
-        if array.ndim and array.shape[0] == slots:
-            widths = [(0, capacity - slots)] + [(0, 0)] * (array.ndim - 1)
-            return jnp.pad(array, widths)
-        return array
+        if array.shape[:1] != (slots,):
+            return array
+        return jnp.pad(array, [(0, capacity - slots), *[(0, 0)] * (array.ndim - 1)])
 
     return state.replace(
         gaussians=grow(state.gaussians, capacity),

@@ -14,8 +14,11 @@ from gsjax.runtime.settings import as_float, convert_fields, require_ranges
 from gsjax.train.optimiser import Rates
 
 STRATEGIES = ("adaptive", "mcmc")
-BACKGROUNDS = ("auto", "black", "white", "random")
-INITIALS = ("auto", "points", "dense", "random")
+_CHOICES = {
+    "strategy": STRATEGIES,
+    "background": ("auto", "black", "white", "random"),
+    "initial": ("auto", "points", "dense", "random"),
+}
 
 
 @dataclass(frozen=True)
@@ -117,12 +120,7 @@ class TrainConfig:
 
     def __post_init__(self):
         convert_fields(self)
-        choices = {
-            "strategy": STRATEGIES,
-            "background": BACKGROUNDS,
-            "initial": INITIALS,
-        }
-        require_ranges(self, choices)
+        require_ranges(self, _CHOICES)
         if self.raster is _RASTER or self.raster is _ACCURATE:
             default = _ACCURATE if self.refine_poses else _RASTER
             object.__setattr__(self, "raster", default)
@@ -136,30 +134,27 @@ class TrainConfig:
         means = first == last >= 0 or min(first, last) > 0
         positive = all(0 <= rate < math.inf for rate in (first, last, *rates[1:]))
         cooling_from = 0 <= rates.cooling_from < 1
+        positive_fields = "batch", "sh_every", "initial_count", "max_initial"
+        non_negative_fields = (
+            "pose_rate", "intrinsics_rate", "exposure_rate", "dense_count",
+            "every_eval", "every_checkpoint",
+        )  # fmt: skip
         opacity, scale = 0 < settings.initial_opacity < 1, settings.initial_scale > 0
         checks = {
             "steps": f"[1, {2**31 - 1})",
             "seed": f"[0, {2**31})",
-            "batch": "[1, inf)",
             "max_size": "[8, inf)",
             "levels": (levels, "increasing starts from 0 and divisors ≥ 1"),
             "sh_degree": "[0, 4]",
-            "sh_every": "[1, inf)",
             "ssim_weight": "[0, 1]",
             "rates' means": (means, "two positive numbers, or equal ones"),
             "rates' cooling": (0 < rates.cooling <= 1, "cooling in (0, 1]"),
             "rates' cooling_from": (cooling_from, "cooling_from in [0, 1)"),
             "rates": (positive, "numbers ≥ 0"),
-            "pose_rate": "[0, inf)",
-            "intrinsics_rate": "[0, inf)",
-            "exposure_rate": "[0, inf)",
-            "initial_count": "[1, inf)",
-            "dense_count": "[0, inf)",
             f"{self.strategy}'s initial_opacity": (opacity, "a number in (0, 1)"),
             f"{self.strategy}'s initial_scale": (scale, "a number in (0, inf)"),
-            "max_initial": "[1, inf)",
-            "every_eval": "[0, inf)",
-            "every_checkpoint": "[0, inf)",
+            **dict.fromkeys(positive_fields, "[1, inf)"),
+            **dict.fromkeys(non_negative_fields, "[0, inf)"),
         }
         require_ranges(self, checks)
 
@@ -207,11 +202,7 @@ class TrainConfig:
 
 
 def _as_floats(rates: Rates) -> Rates:
-    """Return the rates as Python floats.
-
-    Raises:
-      InputError: if one is not a number.
-    """
+    """Return the rates as Python floats."""
     first, last = rates.means
     means = as_float("Rates.means", first), as_float("Rates.means", last)
     rest = rates._asdict()
@@ -226,23 +217,20 @@ def scaled(config: TrainConfig, steps: int) -> TrainConfig:
     def some(count: int, least: int = 1) -> int:
         return max(least, round(count * ratio)) if count else count
 
-    old = config.adaptive
+    def edits(settings) -> dict[str, int]:
+        every = some(settings.every, 20)
+        return {
+            "start": some(settings.start), "stop": some(settings.stop), "every": every
+        }  # fmt: skip
+
+    reset_every = some(config.adaptive.reset_every, 20)
     return config.replace(
         steps=steps,
         sh_every=some(config.sh_every),
         adaptive=replace(
-            old,
-            start=some(old.start),
-            stop=some(old.stop),
-            every=some(old.every, 20),
-            reset_every=some(old.reset_every, 20),
+            config.adaptive, **edits(config.adaptive), reset_every=reset_every
         ),
-        mcmc=replace(
-            config.mcmc,
-            start=some(config.mcmc.start),
-            stop=some(config.mcmc.stop),
-            every=some(config.mcmc.every, 20),
-        ),
+        mcmc=replace(config.mcmc, **edits(config.mcmc)),
     )
 
 
@@ -292,26 +280,16 @@ def _fast() -> TrainConfig:
         # leave gaps (twice the rate for the scales).
         rates=Rates(_HALF, log_scales=0.01, cooling=0.1, cooling_from=0.35).times(4.0),
         # Each edit raises the loss for a while: few edits, none towards the end.
+        # Without opacity resets, only the scale penalty removes fog before few views.
         adaptive=AdaptiveSettings(
-            start=75,
-            stop=600,
-            every=75,
-            reset_every=0,
-            # Without opacity resets, only the penalty removes fog before few views.
-            scale_penalty=0.01,
-            max_gaussians=30_000,
-            initial_opacity=0.5,
-            initial_scale=0.5,
+            start=75, stop=600, every=75, reset_every=0, scale_penalty=0.01,
+            max_gaussians=30_000, initial_opacity=0.5, initial_scale=0.5,
         ),
         mcmc=McmcSettings(
-            start=75,
-            stop=975,
-            every=50,
-            growth=1.2,
-            max_gaussians=30_000,
+            start=75, stop=975, every=50, growth=1.2, max_gaussians=30_000,
             initial_scale=0.5,
         ),
-    )
+    )  # fmt: skip
 
 
 def _default() -> TrainConfig:
@@ -331,14 +309,10 @@ def _default() -> TrainConfig:
             start=200, stop=2600, every=100, reset_every=0, max_gaussians=300_000
         ),
         mcmc=McmcSettings(
-            start=200,
-            stop=3100,
-            every=100,
-            growth=1.05,
-            max_gaussians=150_000,
+            start=200, stop=3100, every=100, growth=1.05, max_gaussians=150_000,
             initial_scale=0.5,
         ),
-    )
+    )  # fmt: skip
 
 
 def _quality() -> TrainConfig:

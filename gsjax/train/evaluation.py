@@ -59,9 +59,7 @@ class Summary(NamedTuple):
     lpips: str = LPIPS_NOTE
 
 
-_scores = jax.jit(lambda image, target, weight: (
-    psnr(image, target, weight), ssim(image, target, weight)
-))  # fmt: skip
+_scores = jax.jit(lambda *arrays: (psnr(*arrays), ssim(*arrays)))
 
 
 def evaluate(
@@ -104,14 +102,11 @@ def evaluate(
     sizes = {photo.pixels.shape[:2] for photo in photos}
     height, width = np.max([(1, 1), *sizes], axis=0)
     for view, photo in zip(views, photos, strict=True):
-        camera = make_camera(
-            viewmat=view.viewmat,
-            K=photo.K,
-            width=int(width),
-            height=int(height),
-            near=view.near,
-        )
         rows, cols = photo.pixels.shape[:2]
+        camera = make_camera(
+            viewmat=view.viewmat, K=photo.K, width=int(width), height=int(height),
+            near=view.near,
+        )  # fmt: skip
         size = jnp.asarray([cols, rows]) if len(sizes) > 1 else None
         camera = camera.replace(visible_size=size)
         result = render_exact(gaussians, camera, config, jnp.asarray(behind))

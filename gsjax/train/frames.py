@@ -5,8 +5,7 @@ Axis legend: V views, H W image, B views of a step.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -19,11 +18,7 @@ from gsjax.math.numerics import to_device
 Array = jax.Array
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("pixels", "valid", "camera", "size", "time"),
-    meta_fields=(),
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Frames:
     """Photographs of all views at one resolution.
@@ -53,12 +48,8 @@ class Batch(NamedTuple):
     """Photographs of one step.
 
     Attributes:
-      pixels: [B, H, W, 3 or 4] uint8.
-      valid: [B, H, W] bool or None.
-      camera: batch of B cameras.
+      pixels, valid, camera, size, time: as in `Frames`, with B for V.
       view: [B] int32, indices of the views.
-      size: [B, 2] int32 or None, see `Frames`.
-      time: [B] or None.
       background: [3] colour behind the scene and transparent photographs; None is
         black. The training step sets it.
     """
@@ -85,14 +76,12 @@ def make_frames(
     Padding is on the right and bottom, and is not valid.
     """
     small = [_downscale(photo, divisor) for photo in photos]
-    height = max(p.pixels.shape[0] for p in small)
-    width = max(p.pixels.shape[1] for p in small)
+    size = np.asarray([p.pixels.shape[1::-1] for p in small], np.int32)
+    width, height = size.max(0).tolist()
     with_alpha = any(p.alpha is not None for p in small)
     pixels = np.zeros((len(small), height, width, 3 + with_alpha), np.uint8)
     valid = np.zeros(pixels.shape[:3], bool)
-    size = np.asarray([p.pixels.shape[1::-1] for p in small], np.int32)
-    for index, photo in enumerate(small):
-        h, w = photo.pixels.shape[:2]
+    for index, (photo, (w, h)) in enumerate(zip(small, size)):
         pixels[index, :h, :w, :3] = photo.pixels
         if with_alpha:
             pixels[index, :h, :w, 3] = 255 if photo.alpha is None else photo.alpha
@@ -104,14 +93,13 @@ def make_frames(
         height=height,
         near=np.asarray([view.near for view in views]),
     )
-    frames = Frames(
-        pixels,  # pyright: ignore
-        None if valid.all() else valid,  # pyright: ignore
-        camera,
-        None if (size == (width, height)).all() else size,  # pyright: ignore
-        np.asarray([view.time for view in views], np.float32),  # pyright: ignore
-    )
-    return to_device(frames)
+    fields: Any = {
+        "pixels": pixels,
+        "valid": None if valid.all() else valid,
+        "size": None if (size == (width, height)).all() else size,
+        "time": np.asarray([view.time for view in views], np.float32),
+    }
+    return to_device(Frames(camera=camera, **fields))
 
 
 def _downscale(photo: Photo, divisor: int) -> Photo:
@@ -145,10 +133,8 @@ def views_of_step(seed: int, step: int, batch: int, views: int) -> np.ndarray:
     It is computed on the host because XLA compiles a permutation slowly.
 
     Args:
-      seed: of the run.
-      step: number of completed steps.
-      batch: B.
-      views: number of views V.
+      seed, step: of the run; number of completed steps.
+      batch, views: numbers B and V.
     """
 
     def one(number: int) -> int:

@@ -3,7 +3,6 @@
 import warnings
 from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -43,9 +42,8 @@ def check_photos(dataset: Dataset, photos: Sequence[Photo]) -> None:
         )
     for view, photo in zip(dataset.views, photos):
         photo.require(view.name)
-    masked = [
-        v.name for v, photo in zip(dataset.views, photos) if not has_valid_pixels(photo)
-    ]
+    pairs = zip(dataset.views, photos)
+    masked = [view.name for view, photo in pairs if not has_valid_pixels(photo)]
     if len(masked) == len(photos):
         raise InputError(
             f"{dataset.source}: expected photographs with valid pixels, got "
@@ -72,25 +70,25 @@ def check_points(dataset: Dataset) -> None:
     """
     require_points(dataset)
     points, views = dataset.points, dataset.views
-    found = _depths(dataset, points[:: 1 + len(points) // _SAMPLED])
-    if not found.drawn:  # in the sample
-        found = _depths(dataset, points)
+    before, drawn, farthest = _depths(dataset, points[:: 1 + len(points) // _SAMPLED])
+    if not drawn:  # in the sample
+        before, drawn, farthest = _depths(dataset, points)
     near = max(view.near for view in views)
     unit = "points and poses may have different units"
-    if not found.before:
+    if not before:
         raise InputError(
             f"{dataset.source}: expected points in front of the cameras, got all "
             f"{len(points):,} behind all {len(views)}; {POSE_HINT}, or start from "
             "random points (--initial random)"
         )
-    if not found.drawn:
+    if not drawn:
         raise InputError(
             f"{dataset.source}: expected points beyond the near plane {near:.2g}, got "
-            f"depths of at most {found.farthest:.2g}; {unit}: fix the dataset, or "
-            "start from random points (--initial random)"
+            f"depths of at most {farthest:.2g}; {unit}: fix the dataset, or start from "
+            "random points (--initial random)"
         )
-    if found.drawn < found.before / 2:
-        share = 1 - found.drawn / found.before
+    if drawn < before / 2:
+        share = 1 - drawn / before
         warnings.warn(
             f"{dataset.source}: {share:.0%} of the points in front of a camera are "
             f"nearer than the near plane {near:.2g} and not drawn; {unit}",
@@ -100,15 +98,10 @@ def check_points(dataset: Dataset) -> None:
 
 
 def check_in_view(dataset: Dataset, means: np.ndarray, source: str) -> None:
-    """Check that a mean of the initial Gaussians is inside a view.
-
-    Args:
-      dataset: with the views.
-      means: [N, 3] in the coordinates of the dataset.
-      source: file of the Gaussians, for messages.
+    """Check that one of the initial means [N, 3] is inside a view.
 
     Raises:
-      InputError: if no mean is in any view.
+      InputError: if none is; ``source`` is the subject of the message.
     """
     for view in dataset.views:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -124,15 +117,8 @@ def check_in_view(dataset: Dataset, means: np.ndarray, source: str) -> None:
     )
 
 
-class _Depths(NamedTuple):
-    """Points in all views: number in front, number beyond near, largest depth."""
-
-    before: int
-    drawn: int
-    farthest: float
-
-
-def _depths(dataset: Dataset, points: np.ndarray) -> _Depths:
+def _depths(dataset: Dataset, points: np.ndarray) -> tuple[int, int, float]:
+    """Return over all views: points in front, points beyond near, largest depth."""
     before, drawn, farthest = 0, 0, 0.0
     for view in dataset.views:
         depth = points @ view.viewmat[2, :3] + view.viewmat[2, 3]
@@ -140,7 +126,7 @@ def _depths(dataset: Dataset, points: np.ndarray) -> _Depths:
         before += len(depth)
         drawn += int((depth > view.near).sum())
         farthest = max(farthest, depth.max(initial=0))
-    return _Depths(before, drawn, farthest)
+    return before, drawn, farthest
 
 
 class Health:
@@ -163,13 +149,19 @@ class Health:
         Raises:
           DivergedError: if too many steps failed.
         """
-        fault = self._fault(metrics)
+        fault = _fault(metrics)
         self.bad = 0 if fault is None else self.bad + 1
         lost = fault == _NOT_IN_VIEW
         self._recent.append(fault is not None and not lost)
         count, limit, span = sum(self._recent), self._limit, len(self._recent)
         if lost:
-            self._warn(metrics)
+            if not self._warned:
+                self._warned = True
+                warnings.warn(
+                    f"training step {int(metrics.step)}: {_NOT_IN_VIEW}; {POSE_HINT}",
+                    UserWarning,
+                    stacklevel=3,
+                )
             # Some views may show nothing of a scene that others show.
             count, limit, span = self.bad, _MAX_BAD_STEPS, self.bad
         if fault and count >= limit:
@@ -179,20 +171,12 @@ class Health:
                 "with lower rates (TrainConfig.rates)"
             )
 
-    def _warn(self, metrics: Metrics) -> None:
-        if not self._warned:
-            self._warned = True
-            warnings.warn(
-                f"training step {int(metrics.step)}: {_NOT_IN_VIEW}; {POSE_HINT}",
-                UserWarning,
-                stacklevel=4,
-            )
 
-    def _fault(self, metrics: Metrics) -> str | None:
-        if not metrics.finite:
-            return "the loss, its gradient or a Gaussian was not finite"
-        if metrics.psnr < 0:  # a larger error than between any two images in [0, 1]
-            return "the PSNR was below 0 dB"
-        if metrics.pairs == 0 and metrics.loss > _EMPTY_LOSS:
-            return _NOT_IN_VIEW
-        return None
+def _fault(metrics: Metrics) -> str | None:
+    if not metrics.finite:
+        return "the loss, its gradient or a Gaussian was not finite"
+    if metrics.psnr < 0:  # a larger error than between any two images in [0, 1]
+        return "the PSNR was below 0 dB"
+    if metrics.pairs == 0 and metrics.loss > _EMPTY_LOSS:
+        return _NOT_IN_VIEW
+    return None

@@ -55,11 +55,9 @@ def add_dense_points(
     too_few = len(found.points) < min(_MIN_FOUND, config.dense_count)
     if too_few and not has_points(dataset):
         return dataset
-    return replace(
-        dataset,
-        points=np.concatenate([dataset.points, found.points]),
-        colors=np.concatenate([dataset.colors, found.colors]),
-    )
+    points = np.concatenate([dataset.points, found.points])
+    colors = np.concatenate([dataset.colors, found.colors])
+    return replace(dataset, points=points, colors=colors)
 
 
 def initial_state(
@@ -124,9 +122,7 @@ def empty_state(
 ) -> TrainState:
     """Return a state of the given capacity, as a template for reading a checkpoint."""
     numbers = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1}
-    gaussians = make_gaussians(
-        **{name: np.zeros((0, count)) for name, count in numbers.items()},
-        sh=np.zeros((0, num_bases(config.sh_degree), 3)),
-        capacity=capacity,
-    )
+    fields = {name: np.zeros((0, count)) for name, count in numbers.items()}
+    sh = np.zeros((0, num_bases(config.sh_degree), 3))
+    gaussians = make_gaussians(**fields, sh=sh, capacity=capacity)
     return _jitted_state(make_setup(config, extent), gaussians, views)

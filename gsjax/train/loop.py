@@ -2,7 +2,8 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -55,11 +56,12 @@ class Progress(NamedTuple):
     def record(self) -> dict[str, float | int | bool]:
         """Return plain numbers, for a line of `metrics.jsonl`."""
         out = {k: np.asarray(v).item() for k, v in self.metrics._asdict().items()}
-        rest = {k: v for k, v in self._asdict().items() if k != "metrics"}
-        rounded = {
-            k: round(v, 3) if isinstance(v, float) else v for k, v in rest.items()
-        }
-        return {**out, **rounded}
+        rest = self._replace(
+            seconds=round(self.seconds, 3),
+            compile_seconds=round(self.compile_seconds, 3),
+        )._asdict()
+        del rest["metrics"]
+        return {**out, **rest}
 
 
 @dataclass
@@ -150,13 +152,8 @@ def fit(
         numbers or a PSNR below 0 dB; or if no Gaussian was in view for 50 steps.
     """
     check_photos(dataset, photos)
-    setup = make_setup(
-        config,
-        extent_of(dataset),
-        strategy=strategy,
-        loss_terms=loss_terms,
-        model=model,
-    )
+    parts = {"strategy": strategy, "loss_terms": loss_terms, "model": model}
+    setup = make_setup(config, extent_of(dataset), **parts)
     run = _Run(dataset, photos, setup, hooks or Hooks())
     if state is None:
         if config.initial == "dense":
@@ -165,16 +162,13 @@ def fit(
         state = initial_state(dense, config, setup=setup)
     else:
         state = _copied(state)  # steps donate their state, not that of the caller
-    own: TrainState = run.compiler.place(state)
     try:
-        return run.loop(own, pair_capacity)
+        return run.loop(run.compiler.place(state), pair_capacity)
     finally:
         run.compiler.close()
 
 
-@jax.jit
-def _copied(state: TrainState) -> TrainState:
-    return jax.tree.map(jnp.copy, state)
+_copied = jax.jit(partial(jax.tree.map, jnp.copy))
 
 
 @dataclass
@@ -185,10 +179,9 @@ class _Run:
     photos: Sequence[Photo]
     setup: Setup
     hooks: Hooks
-    start: float = field(default_factory=time.perf_counter)
-    compile_seconds: float = 0.0
 
     def __post_init__(self):
+        self.start, self.compile_seconds = time.perf_counter(), 0.0
         self.config = self.setup.config
         self.health = Health(self.config.steps)
         self.compiler = StepCompiler(self.setup, self.hooks.phase)
@@ -208,10 +201,12 @@ class _Run:
             try:
                 if finer:
                     state = with_slots_ahead(state, config, schedule)
+                begun = time.perf_counter()
                 if pairs is None or finer:
-                    pairs = self.pairs_for(state, frames)
+                    pairs = pairs_for(state, frames, config, schedule)
                 raster = config.raster.replace(pair_capacity=pairs)
                 program = self.program(state, frames, raster)
+                self.compile_seconds += time.perf_counter() - begun
                 view = views_of_step(config.seed, step, config.batch, frames.count)
                 state, metrics = program(state, frames, view)
                 if metrics.overflowed:
@@ -224,11 +219,22 @@ class _Run:
                     self.hooks.checkpoint(state, pairs or 0, progress)
                 raise
             step = int(metrics.step)
-            progress = self.progress(metrics, divisor, state)
+            progress = Progress(
+                metrics=metrics,
+                seconds=time.perf_counter() - self.start,
+                compile_seconds=self.compile_seconds,
+                compilations=len(self.compiler.by_sizes),
+                divisor=divisor,
+                capacity=state.gaussians.capacity,
+            )
             self.health.check(metrics)
             self.hooks.step(progress)
             self.hooks.state(state, progress)
-            state, pairs = self.grown(state, metrics, pairs)
+            slots = state.gaussians.capacity
+            state = with_slots(state, int(metrics.wanted), config, schedule)
+            if state.gaussians.capacity > slots:  # recompiles: with more pairs too
+                wanted = int(metrics.pair_capacity)
+                pairs = max(pairs, with_margin(wanted, state, config, schedule))
             self.report(state, pairs, progress)
             if self.hooks.stop():
                 break
@@ -236,25 +242,6 @@ class _Run:
         if step >= config.steps and frames is not None and config.prune_invisible:
             state, dropped = prune_invisible(state, frames, self.setup)
         return FitResult(state, pairs or 0, progress, dropped)
-
-    def pairs_for(self, state: TrainState, frames: Frames) -> int:
-        """Return the pair capacity for new photographs."""
-        begun = time.perf_counter()
-        pairs = pairs_for(state, frames, self.config, self.setup.schedule)
-        self.compile_seconds += time.perf_counter() - begun
-        return pairs
-
-    def grown(
-        self, state: TrainState, metrics: Metrics, pairs: int
-    ) -> tuple[TrainState, int]:
-        """Return the state with the slots that it needs, and its pair capacity."""
-        config, schedule = self.config, self.setup.schedule
-        slots = state.gaussians.capacity
-        state = with_slots(state, int(metrics.wanted), config, schedule)
-        if state.gaussians.capacity > slots:  # recompiles: with more pairs too
-            wanted = int(metrics.pair_capacity)
-            pairs = max(pairs, with_margin(wanted, state, config, schedule))
-        return state, pairs
 
     def report(self, state: TrainState, pairs: int, progress: Progress) -> None:
         """Call the hooks that are due after a step; the caller handles the last one."""
@@ -271,25 +258,11 @@ class _Run:
         if every and step % every == 0 and not self.health.bad:
             self.hooks.checkpoint(state, pairs, progress)
 
-    def progress(self, metrics: Metrics, divisor: int, state: TrainState) -> Progress:
-        """Return the progress after a step."""
-        return Progress(
-            metrics=metrics,
-            seconds=time.perf_counter() - self.start,
-            compile_seconds=self.compile_seconds,
-            compilations=len(self.compiler.by_sizes),
-            divisor=divisor,
-            capacity=state.gaussians.capacity,
-        )
-
     def program(
         self, state: TrainState, frames: Frames, raster: RasterConfig
     ) -> CompiledStep:
         """Return the compiled step for these sizes."""
-        begun = time.perf_counter()
-        step = self.compiler.step(state, frames, raster)
-        self.compile_seconds += time.perf_counter() - begun
-        return step
+        return self.compiler.step(state, frames, raster)
 
 
 def subset(dataset: Dataset, indices: Sequence[int]) -> Dataset:

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gsjax.densify.types import Strategy
 from gsjax.raster.types import Render
 from gsjax.runtime.devices import map_over_devices
 from gsjax.train import ssim_window
@@ -62,19 +61,19 @@ def evaluate_terms(
         weight = term.weight(step) if callable(term.weight) else term.weight
         return value if isinstance(weight, float) and weight == 1 else weight * value
 
-    total = None
-    for term in terms:
-        if term.start > 1:
-            shape = jax.eval_shape(lambda term=term: value_of(term))
-            value = lax.cond(
-                step >= term.start,
-                lambda term=term: value_of(term),
-                lambda shape=shape: jnp.zeros(shape.shape, shape.dtype),
-            )
-        else:
-            value = value_of(term)
-        total = value if total is None else total + value
-    assert total is not None
+    def scheduled(term: LossTerm) -> Array:
+        if term.start <= 1:
+            return value_of(term)
+        shape = jax.eval_shape(lambda: value_of(term))
+        return lax.cond(
+            step >= term.start,
+            lambda: value_of(term),
+            lambda: jnp.zeros(shape.shape, shape.dtype),
+        )
+
+    total = scheduled(terms[0])
+    for term in terms[1:]:
+        total = total + scheduled(term)
     return total
 
 
@@ -91,30 +90,6 @@ def photometric_term(ssim_weight: float = 0.2, devices: int = 1) -> LossTerm:
     return LossTerm("loss", function)
 
 
-def penalty_term(strategy: Strategy) -> LossTerm | None:
-    """Return the penalty of a strategy as a loss term, or None if it has none."""
-    penalty = strategy.penalty
-    if penalty is None:
-        return None
-    return LossTerm("penalty", lambda *inputs: penalty(inputs[2].gaussians))
-
-
-def l1(image: Array, target: Array, weight: Array | None = None) -> Array:
-    """Return the mean absolute difference [].
-
-    Args:
-      image, target: [H, W, C].
-      weight: [H, W], 0 for excluded pixels; or None.
-    """
-    image, target = mask_excluded(image, target, weight)
-    return weighted_mean(_absolute(image - target), weight)
-
-
-def _absolute(difference: Array) -> Array:
-    """Return |x| with slope 0 at 0, so that equal pixels have no gradient."""
-    return difference * lax.stop_gradient(jnp.sign(difference))
-
-
 def photometric(
     image: Array, target: Array, weight: Array | None = None, ssim_weight: float = 0.2
 ) -> Array:
@@ -123,7 +98,7 @@ def photometric(
     Args:
       image, target: [H, W, C] in [0, 1].
       weight: [H, W], 0 for excluded pixels; or None.
-      ssim_weight: λ; at 0 the SSIM is not computed.
+      ssim_weight: λ; at 0 the loss is the mean |x − y|, without SSIM.
 
     Raises:
       InputError: if an image holds integers.
@@ -157,10 +132,9 @@ def photometric_batch(
 
     def band(device: Array, *arrays: Array) -> tuple[Array, Array]:
         def cut(array: Array) -> Array:
-            padding = [(0, 0)] * array.ndim
-            padding[0] = (margin, margin + devices * rows - height)
-            start = device[0] * rows
-            wide = jnp.pad(array, padding)
+            below = margin + devices * rows - height
+            padding = [(margin, below), *[(0, 0)] * (array.ndim - 1)]
+            start, wide = device[0] * rows, jnp.pad(array, padding)
             return lax.dynamic_slice_in_dim(wide, start, rows + 2 * margin)
 
         def sums(*one: Array) -> tuple[Array, Array]:
@@ -180,7 +154,10 @@ def _pixel_loss(
 ) -> Array:
     """Return the loss [H, W, C] that `photometric` averages."""
     image, target = mask_excluded(image, target, weight)
-    loss = (1 - ssim_weight) * _absolute(image - target)
+    difference = image - target
+    # |x| with slope 0 at 0, so that equal pixels have no gradient.
+    absolute = difference * lax.stop_gradient(jnp.sign(difference))
+    loss = (1 - ssim_weight) * absolute
     if ssim_weight > 0:
         loss += ssim_weight * (1 - ssim_map(image, target))
     return loss

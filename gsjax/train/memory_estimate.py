@@ -19,6 +19,8 @@ from gsjax.train.capacity_policy import slots_for
 from gsjax.train.config import TrainConfig
 from gsjax.train.state import TrainState
 
+Size = tuple[int, int]  # width and height, px
+
 # Bytes taken by compiling a step, and by each further image size.
 _COMPILING, _COMPILING_MORE = 900_000_000, 150_000_000
 # Pairs per Gaussian before a run begins, with the margin of `capacity_policy`.
@@ -34,43 +36,28 @@ def state_bytes(slots: int, config: TrainConfig) -> int:
 
 
 def step_estimate(
-    slots: int,
-    size: tuple[int, int],
-    config: TrainConfig,
-    raster: RasterConfig,
-    frame_bytes: int,
+    slots: int, size: Size, config: TrainConfig, raster: RasterConfig, frame_bytes: int
 ) -> Estimate:
-    """Return the memory of a step beyond its state and photographs.
+    """Return the memory of a step beyond its state and photographs (frame_bytes).
 
-    Args:
-      slots: capacity of the Gaussians.
-      size: width and height of the photographs, px.
-      config: settings.
-      raster: render settings of the step, see `gsjax.train.step.step_raster`.
-      frame_bytes: bytes of the photographs on the device.
+    The render settings are those of `gsjax.train.step.step_raster`.
     """
     devices = raster.devices or jax.local_device_count()
-    inside = render_estimate(
-        slots,
-        num_bases(config.sh_degree),
-        size,
-        raster,
-        cameras=config.batch,
-        gradients=True,
-    )
+    bases, options = num_bases(config.sh_degree), {"cameras": config.batch}
+    inside = render_estimate(slots, bases, size, raster, **options, gradients=True)
     shared = (devices - 1) * (state_bytes(slots, config) + frame_bytes)
     more = {"to share them among devices": shared, "to compile": _COMPILING}
     return Estimate({**inside.parts, **more})
 
 
-def trained_sizes(dataset: Dataset, config: TrainConfig) -> list[tuple[int, int]]:
+def trained_sizes(dataset: Dataset, config: TrainConfig) -> list[Size]:
     """Return width and height, px, of each photograph at training size.
 
     Sizes are read from the file headers. If a header is damaged, which loading reports,
     the size is that of the camera.
     """
 
-    def stored(view: View) -> tuple[int, int]:
+    def stored(view: View) -> Size:
         try:
             return stored_size(view)
         except InputError:
@@ -80,7 +67,7 @@ def trained_sizes(dataset: Dataset, config: TrainConfig) -> list[tuple[int, int]
 
 
 def run_estimate(
-    sizes: Sequence[tuple[int, int]],
+    sizes: Sequence[Size],
     config: TrainConfig,
     count: int,
     slots: int,
@@ -93,8 +80,7 @@ def run_estimate(
     Args:
       sizes: of the photographs, from `trained_sizes`.
       config: settings.
-      count: number of Gaussians.
-      slots: capacity of the Gaussians.
+      count, slots: number of Gaussians, and their capacity.
       begins: whether they are the initial Gaussians.
       masked: whether any photograph has excluded pixels.
     """
@@ -108,11 +94,9 @@ def run_estimate(
         wide = config.strategy_settings.initial_scale**2 * (1e5 / count) ** (2 / 3)
         each = max(each, _PAIRS_RANDOM * size[0] * size[1] * wide)
     pairs = min(capacity_bucket(math.ceil(each * count)), 2**30 - 1)
-    raster = config.raster.replace(
-        pair_capacity=pairs,
-        outputs=("rgb",),
-        absgrad=config.strategy == "adaptive" and config.adaptive.absgrad,
-    )
+    absgrad = config.strategy == "adaptive" and config.adaptive.absgrad
+    raster = config.raster.replace(outputs=("rgb",), absgrad=absgrad)
+    raster = raster.replace(pair_capacity=pairs)
     step = step_estimate(slots, size, config, raster, frames)
     compiling = _COMPILING + _COMPILING_MORE * len(config.levels)
     # Photographs as loaded, as one array, and on the device.
@@ -128,10 +112,7 @@ def check_memory(
 ) -> None:
     """Report the memory that a run will take; reject a run that does not fit.
 
-    Args:
-      dataset: views to train on.
-      config: settings.
-      state: state to resume from; None for a new run.
+    The state is that to resume from, or None for a new run.
 
     Raises:
       CapacityError: if more memory is required than available; with the numbers.
@@ -141,18 +122,15 @@ def check_memory(
         if config.initial == "random":
             given = config.initial_count
         elif config.initial == "dense":  # random if there are no points
-            given = max(
-                given + config.dense_count, 0 if given else config.initial_count
-            )
+            random = 0 if given else config.initial_count
+            given = max(given + config.dense_count, random)
         count = max(1, min(given, config.max_initial, config.max_gaussians))
-        slots = slots_for(count, 0, config)
+        slots = slots_for(count, 0, config, config.schedule)
     else:
         count, slots = int(np.sum(state.gaussians.active)), state.gaussians.capacity
     sizes = trained_sizes(dataset, config)
     # Undistortion leaves pixels without content, which are excluded as if masked.
-    masked = any(
-        view.mask is not None or view.lens is not None for view in dataset.views
-    )
+    masked = any(v.mask is not None or v.lens is not None for v in dataset.views)
     now = run_estimate(sizes, config, count, slots, begins=state is None, masked=masked)
     most = max(config.max_gaussians, count)
     then = run_estimate(sizes, config, most, capacity_bucket(most), masked=masked).total
@@ -176,7 +154,8 @@ def check_state_memory(count: int, config: TrainConfig) -> None:
     Raises:
       CapacityError: with the numbers.
     """
-    size = state_bytes(slots_for(max(1, count), 0, config), config)
+    slots = slots_for(max(1, count), 0, config, config.schedule)
+    size = state_bytes(slots, config)
     require(
         Estimate({"of Gaussians and their moments": size}),
         f"a run from {_gaussians(count)}",

@@ -77,10 +77,7 @@ class Model(NamedTuple):
 
 
 # Renders the Gaussians as they are.
-IDENTITY = Model(
-    init=lambda _: ModelParams(),
-    apply=lambda params, _: params.gaussians,
-)
+IDENTITY = Model(init=lambda _: ModelParams(), apply=lambda params, _: params.gaussians)
 
 
 class SlotParams(NamedTuple):

@@ -72,26 +72,16 @@ def scale_by_rate(rate: Rate) -> optax.GradientTransformationExtraArgs:
     return _scale(lambda fraction, _: rate(fraction) if callable(rate) else rate)
 
 
-def _scale_sh(rates: Rates) -> optax.GradientTransformationExtraArgs:
-    """Return `scale_by_rate` for SH coefficients [N, K, 3]."""
-
-    def rate_of(fraction: Array, update: Array) -> Array:
-        first = jnp.arange(update.shape[-2]) == 0
-        band = jnp.where(first, rates.sh_dc, rates.sh_rest)
-        return cooling_factor(rates, fraction) * band[:, None]
-
-    return _scale(rate_of)
-
-
 def _scale(
     rate_of: Callable[[Array, Array], Array | float],
 ) -> optax.GradientTransformationExtraArgs:
+    """Return `scale_by_rate` for a rate by fraction and update."""
+
     def update(updates, state, params=None, **extra):
         del params
         rates = jax.tree.map(lambda u: rate_of(extra["fraction"], u), updates)
-        return jax.tree.map(
-            lambda u, r: -(u * r).astype(u.dtype), updates, rates
-        ), state
+        scaled = jax.tree.map(lambda u, r: -(u * r).astype(u.dtype), updates, rates)
+        return scaled, state
 
     return optax.GradientTransformationExtraArgs(optax.identity().init, update)
 
@@ -101,20 +91,22 @@ def gaussian_rates(
 ) -> dict[Hashable, optax.GradientTransformation]:
     """Return the transformations of the Gaussians' parameters by label.
 
-    Args:
-      rates: learning rates.
-      extent: scene extent in world units.
+    The scene extent is in world units.
     """
 
-    def cooled(rate: float) -> Rate:
-        return lambda fraction: cooling_factor(rates, fraction) * rate
+    def cooled(name: str):
+        rate = getattr(rates, name)
+        return scale_by_rate(lambda fraction: cooling_factor(rates, fraction) * rate)
+
+    def sh_rate(fraction: Array, update: Array) -> Array:
+        first = jnp.arange(update.shape[-2]) == 0
+        band = jnp.where(first, rates.sh_dc, rates.sh_rest)
+        return cooling_factor(rates, fraction) * band[:, None]
 
     return {
         "means": scale_by_rate(lambda fraction: means_rate(rates, fraction, extent)),
-        "quats": scale_by_rate(cooled(rates.quats)),
-        "log_scales": scale_by_rate(cooled(rates.log_scales)),
-        "logit_opacities": scale_by_rate(cooled(rates.logit_opacities)),
-        "sh": _scale_sh(rates),
+        **{name: cooled(name) for name in ("quats", "log_scales", "logit_opacities")},
+        "sh": _scale(sh_rate),
     }
 
 
@@ -147,8 +139,5 @@ def make_optimiser(
 
 
 def _label(path) -> str:
-    names = [
-        str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", ""))))
-        for key in path
-    ]
+    names = jax.tree_util.keystr(path, simple=True, separator="\n").split("\n")
     return ".".join(names[:2]) if names[0] == "model" else names[-1]

@@ -7,22 +7,16 @@ import optax
 
 from gsjax.densify.schedule import EditSchedule, schedule_of
 from gsjax.densify.types import Strategy
-from gsjax.train.camera_refinement import refinement_rates
 from gsjax.train.config import TrainConfig
 from gsjax.train.losses import LossTerm
 from gsjax.train.models import IDENTITY, Model
-from gsjax.train.optimiser import gaussian_rates, make_optimiser, scale_by_rate
+from gsjax.train.optimiser import Rate, gaussian_rates, make_optimiser, scale_by_rate
 
 
 class Setup(NamedTuple):
-    """Static parts of a training step.
+    """Static parts of a training step, as `make_train_step` takes them.
 
     Attributes:
-      config: settings.
-      extent: scene extent in world units.
-      strategy: density control.
-      loss_terms: terms added to the photometric loss and the strategy's penalty.
-      model: scene model.
       optimiser: for `SlotParams` and `SharedParams`.
       schedule: when the strategy edits, and the growth to expect.
     """
@@ -44,21 +38,18 @@ def make_setup(
     loss_terms: Sequence[LossTerm] = (),
     model: Model | None = None,
 ) -> Setup:
-    """Return the parts of a training step.
-
-    Args:
-      config: settings.
-      extent: scene extent in world units.
-      strategy: density control; default that of ``config``.
-      loss_terms: terms to add to the loss.
-      model: scene model; default `IDENTITY`.
-    """
+    """Return the parts of a training step; arguments as `make_train_step`."""
     strategy = strategy or config.make_strategy(extent)
     model = model or IDENTITY
-    shared = refinement_rates(config)
-    shared |= {f"model.{name}": rate for name, rate in model.rates.items()}
+    rates: dict[str, Rate] = {
+        "turns": config.pose_rate,
+        "shifts": config.pose_rate,
+        "intrinsics": config.intrinsics_rate,
+        "exposures": config.exposure_rate,
+    }
+    rates |= {f"model.{name}": rate for name, rate in model.rates.items()}
     table = gaussian_rates(config.rates, extent)
-    table |= {name: scale_by_rate(rate) for name, rate in shared.items()}
+    table |= {name: scale_by_rate(rate) for name, rate in rates.items()}
     return Setup(
         config=config,
         extent=extent,

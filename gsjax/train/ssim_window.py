@@ -37,13 +37,8 @@ def window_means(planes: Sequence[Array]) -> list[Array]:
       planes: arrays [H, W, C] of one shape and dtype.
     """
     by = _by_loops if on_cpu() else _by_products
-    return custom_transpose(
-        lambda *planes: list(by(planes)),
-        lambda *cotangents: window_means(cotangents),
-        (),
-        planes,
-        planes,
-    )
+    forward, transpose = lambda *p: list(by(p)), lambda *p: window_means(p)
+    return custom_transpose(forward, transpose, (), planes, planes)
 
 
 def _weights() -> list[float]:
@@ -70,14 +65,7 @@ def _by_loops(planes: Sequence[Array]) -> Array:
 
 
 def _add_column_sums(down: Array, place: int, plane: Array, margin: int) -> Array:
-    """Write the column sums of a plane into an array of planes with margins.
-
-    Args:
-      down: [N, H, margin + W · C + margin].
-      place: index of the plane.
-      plane: [H, W · C].
-      margin: width of the margins.
-    """
+    """Write the column sums of a plane [H, W · C] into planes with margins."""
     height, width = plane.shape
     size, parts = _segments(width)
 
@@ -146,18 +134,16 @@ def _blocks(planes: Array, axis: int) -> Array:
     """Split ``axis`` into blocks with margins: [..., blocks, size, ...]."""
     length, shape = planes.shape[axis], planes.shape
     count = -(-length // _BLOCK)
-    blocks = _pad(planes, axis, 0, count * _BLOCK - length)
+
+    def pad(array: Array, before: int, after: int) -> Array:
+        padding = [(0, 0)] * array.ndim
+        padding[axis] = (before, after)
+        return jnp.pad(array, padding)
+
+    blocks = pad(planes, 0, count * _BLOCK - length)
     blocks = blocks.reshape(*shape[:axis], count, _BLOCK, *shape[axis + 1 :])
     ends = lax.slice_in_dim(blocks, _BLOCK - RADIUS, _BLOCK, axis=axis + 1)
     before = lax.slice_in_dim(ends, 0, count - 1, axis=axis)
     starts = lax.slice_in_dim(blocks, 0, RADIUS, axis=axis + 1)
     after = lax.slice_in_dim(starts, 1, count, axis=axis)
-    parts = [_pad(before, axis, 1, 0), blocks, _pad(after, axis, 0, 1)]
-    return jnp.concatenate(parts, axis + 1)
-
-
-def _pad(array: Array, axis: int, before: int, after: int) -> Array:
-    """Pad one axis with zeros."""
-    padding = [(0, 0)] * array.ndim
-    padding[axis] = (before, after)
-    return jnp.pad(array, padding)
+    return jnp.concatenate([pad(before, 1, 0), blocks, pad(after, 0, 1)], axis + 1)

@@ -85,11 +85,8 @@ class TrainState:
     def with_params(self, slots: SlotParams, shared: SharedParams) -> "TrainState":
         """Return a copy with other parameters."""
         gaussians = self.gaussians.replace(params=slots.gaussians)  # pyright: ignore
-        return self.replace(
-            gaussians=gaussians,
-            model=ModelParams(slots.model, shared.model),
-            refinement=shared.refinement,
-        )
+        model, refinement = ModelParams(slots.model, shared.model), shared.refinement
+        return self.replace(gaussians=gaussians, model=model, refinement=refinement)
 
 
 def init_state(
@@ -140,16 +137,15 @@ def setup_state(setup: Setup, gaussians: Gaussians, views: int) -> TrainState:
 def state_arrays(state: Any) -> dict[str, np.ndarray]:
     """Return the leaves of a pytree on the host by path; random keys as numbers."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(state)
-    return {
-        jax.tree_util.keystr(path): np.asarray(
-            jax.random.key_data(leaf) if _is_key(leaf) else leaf
-        )
-        for path, leaf in leaves
-    }
+    return {jax.tree_util.keystr(path): np.asarray(_numbers(v)) for path, v in leaves}
 
 
 def _is_key(leaf) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _numbers(leaf):
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
 def state_from_arrays(where: str, arrays: dict[str, np.ndarray], like: Tree) -> Tree:
@@ -170,8 +166,7 @@ def state_from_arrays(where: str, arrays: dict[str, np.ndarray], like: Tree) -> 
         )
     out = []
     for name, (_, leaf) in zip(names, leaves):
-        array = arrays[name]
-        expected = jax.random.key_data(leaf) if _is_key(leaf) else leaf
+        array, expected = arrays[name], _numbers(leaf)
         if array.shape != expected.shape or array.dtype != expected.dtype:
             raise InputError(
                 f"{where}: expected {name} as {expected.dtype} {expected.shape}, got "
@@ -194,7 +189,6 @@ def save_state(path: str | PathLike, state: Any) -> None:
     Raises:
       InputError: if the file cannot be written.
     """
-
     buffer = io.BytesIO()
     np.savez(buffer, **state_arrays(state))  # pyright: ignore
     write_file(Path(path), buffer.getvalue(), durable=True)
@@ -217,11 +211,10 @@ def load_state(path: str | PathLike, like: Tree) -> Tree:
             entries = archive.infolist()
             if any(entry.compress_type for entry in entries):
                 raise ValueError("compressed arrays")
+            names = [entry.filename for entry in entries]
             arrays = {
-                entry.filename.removesuffix(".npy"): read_npy(
-                    entry.filename, archive.read(entry)
-                )
-                for entry in entries
+                name.removesuffix(".npy"): read_npy(name, archive.read(name))
+                for name in names
             }
     except (OSError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(
@@ -287,23 +280,18 @@ class Gradients(NamedTuple):
 def gradients_like(state: TrainState, batch: int) -> Gradients:
     """Return the shapes and dtypes of the `Gradients` of ``batch`` views."""
     dtype, slots = state.gaussians.params.means.dtype, state.gaussians.capacity
-
-    def shape(*sizes: int, dtype=dtype) -> Any:
-        return jax.ShapeDtypeStruct(sizes, dtype)
-
-    by_slots, by_shared = jax.tree.map(
-        lambda a: shape(*a.shape, dtype=a.dtype),
-        (state.slot_params, state.shared_params),
-    )
+    shape: Any = jax.ShapeDtypeStruct
+    params = state.slot_params, state.shared_params
+    by_slots, by_shared = jax.tree.map(lambda a: shape(a.shape, a.dtype), params)
     return Gradients(
-        loss=shape(),
-        psnr=shape(),
+        loss=shape((), dtype),
+        psnr=shape((), dtype),
         by_slots=by_slots,
         by_shared=by_shared,
-        by_probe=shape(batch, slots, 2),
-        radii=shape(batch, slots),
-        size=shape(batch, 2, dtype=jnp.int32),
-        pairs=shape(dtype=jnp.int32),
-        pair_capacity=shape(dtype=jnp.int32),
-        overflowed=shape(dtype=jnp.bool_),
+        by_probe=shape((batch, slots, 2), dtype),
+        radii=shape((batch, slots), dtype),
+        size=shape((batch, 2), jnp.int32),
+        pairs=shape((), jnp.int32),
+        pair_capacity=shape((), jnp.int32),
+        overflowed=shape((), jnp.bool_),
     )

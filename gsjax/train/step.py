@@ -16,7 +16,7 @@ from jax import lax
 
 from gsjax.cameras.camera import Camera
 from gsjax.densify.types import Observation, Strategy, apply_edit, copy_rows
-from gsjax.gaussians import num_active
+from gsjax.gaussians import Gaussians, num_active
 from gsjax.math.numerics import all_within
 from gsjax.raster.render import render
 from gsjax.raster.tile_render import device_count
@@ -24,12 +24,7 @@ from gsjax.raster.types import OUTPUTS, RasterConfig, Render
 from gsjax.train.camera_refinement import apply_exposure, refine_camera
 from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Batch, targets
-from gsjax.train.losses import (
-    LossTerm,
-    evaluate_terms,
-    penalty_term,
-    photometric_term,
-)
+from gsjax.train.losses import LossTerm, evaluate_terms, photometric_term
 from gsjax.train.metrics import psnr
 from gsjax.train.models import IDENTITY, Model, SceneParams, ViewInfo
 from gsjax.train.optimiser import means_rate
@@ -100,12 +95,7 @@ def make_train_step(
 
 
 def make_stages(setup: Setup, raster: RasterConfig | None = None) -> Stages:
-    """Return the stages of a training step.
-
-    Args:
-      setup: parts of the step, see `make_setup`.
-      raster: as for `make_train_step`.
-    """
+    """Return the stages of a step from `make_setup`; arguments as `make_train_step`."""
     return Stages(_differentiate(setup, raster), _advance(setup), _edit(setup))
 
 
@@ -121,11 +111,12 @@ def step_raster(setup: Setup, raster: RasterConfig | None = None) -> RasterConfi
 
 
 def _differentiate(setup: Setup, raster: RasterConfig | None):
-    config, strategy = setup.config, setup.strategy
+    config, penalty = setup.config, setup.strategy.penalty
     raster = step_raster(setup, raster)
-    photometric = photometric_term(config.ssim_weight, device_count(raster))
-    penalty = penalty_term(strategy)
-    terms = (photometric, *((penalty,) if penalty else ()), *setup.loss_terms)
+    terms = [photometric_term(config.ssim_weight, device_count(raster))]
+    if penalty is not None:
+        terms.append(LossTerm("penalty", lambda *inputs: penalty(inputs[2].gaussians)))
+    terms += setup.loss_terms
 
     def objective(trained, probe, state: TrainState, batch: Batch):
         params = state.with_params(*trained).params
@@ -149,7 +140,7 @@ def _differentiate(setup: Setup, raster: RasterConfig | None):
         batch = batch._replace(background=background)
         probe = jnp.zeros((count, state.gaussians.capacity, 2), dtype)
         trained = state.slot_params, state.shared_params
-        (loss, (quality, view)), ((by_slots, by_shared), by_probe) = value_and_grad(
+        (loss, (quality, view)), (by, by_probe) = value_and_grad(
             trained, probe, state, batch
         )
         size = batch.size
@@ -159,8 +150,8 @@ def _differentiate(setup: Setup, raster: RasterConfig | None):
         found = Gradients(
             loss=loss,
             psnr=quality,
-            by_slots=by_slots,
-            by_shared=by_shared,
+            by_slots=by[0],
+            by_shared=by[1],
             by_probe=by_probe,
             radii=view.radii,
             size=size,
@@ -176,59 +167,49 @@ def _differentiate(setup: Setup, raster: RasterConfig | None):
 
 
 def _render(
-    setup: Setup,
-    raster: RasterConfig,
-    params: SceneParams,
-    batch: Batch,
-    probe: Array,
+    setup: Setup, raster: RasterConfig, params: SceneParams, batch: Batch, probe: Array
 ) -> Render:
     """Render the views of a batch as their photographs would show them."""
-    config, refinement = setup.config, params.refinement
+    config, refinement, background = setup.config, params.refinement, batch.background
     camera = refine_camera(batch.camera, refinement, batch.view, setup.extent)
-    mask = batch.valid if config.skip_masked else None
     camera = camera.replace(visible_size=batch.size)
-    arguments = {"mask": mask, "probe": probe}
-    if not (config.exposure and batch.transparent):
-        behind = batch.background
-        view = _render_model(setup, raster, params, batch, (camera, behind, arguments))
-        image = apply_exposure(_rgb(view), refinement, batch.view)
-        return view._replace(rgb=image)
+    mask = batch.valid if config.skip_masked else None
+    batch = batch._replace(camera=camera, valid=mask)
     # The background of transparent photographs is ours and has no exposure.
-    outputs = tuple(name for name in OUTPUTS if name in {*raster.outputs, "alpha"})
-    raster = raster.replace(outputs=outputs)
-    view = _render_model(setup, raster, params, batch, (camera, None, arguments))
-    assert view.alpha is not None
-    image = apply_exposure(_rgb(view), refinement, batch.view, view.alpha)
-    assert batch.background is not None
-    image += (1 - view.alpha[..., None]) * batch.background
+    apart = config.exposure and batch.transparent
+    if apart:
+        names = {*raster.outputs, "alpha"}
+        raster = raster.replace(outputs=tuple(n for n in OUTPUTS if n in names))
+        batch = batch._replace(background=None)
+    view = _render_model(setup, raster, params, batch, probe)
+    alpha = view.alpha if apart else None
+    assert view.rgb is not None
+    image = apply_exposure(view.rgb, refinement, batch.view, alpha)
+    if alpha is not None:
+        assert background is not None
+        image += (1 - alpha[..., None]) * background
     return view._replace(rgb=image)
 
 
-def _rgb(view: Render) -> Array:
-    assert view.rgb is not None
-    return view.rgb
-
-
 def _render_model(
-    setup: Setup,
-    raster: RasterConfig,
-    params: SceneParams,
-    batch: Batch,
-    inputs: tuple[Camera, Array | None, dict[str, Array | None]],
+    setup: Setup, raster: RasterConfig, params: SceneParams, batch: Batch, probe: Array
 ) -> Render:
-    """Render each view of a batch with its own Gaussians."""
-    camera, background, arguments = inputs
+    """Render each view of a batch with its own Gaussians; skips pixels not valid."""
+
+    def draw(gaussians: Gaussians, camera: Camera, mask: Array | None, probe: Array):
+        behind = batch.background
+        return render(gaussians, camera, raster, behind, mask=mask, probe=probe)
+
+    arguments = batch.camera, batch.valid, probe
     if setup.model is IDENTITY:
-        return render(params.gaussians, camera, raster, background, **arguments)
+        return draw(params.gaussians, *arguments)
     count = batch.view.shape[0]
     time = jnp.zeros(count) if batch.time is None else batch.time
 
     def one(inputs) -> Render:
-        info, camera, arguments = inputs
-        gaussians = setup.model.apply(params, info)
-        return render(gaussians, camera, raster, background, **arguments)
+        return draw(setup.model.apply(params, inputs[0]), *inputs[1])
 
-    views = ViewInfo(batch.view, time), camera, arguments
+    views = ViewInfo(batch.view, time), arguments
     if count == 1:
         found = one(jax.tree.map(lambda a: a[0], views))
         found = jax.tree.map(lambda a: a[None], found)
@@ -249,12 +230,6 @@ def _advance(setup: Setup):
         by = found.by_slots, found.by_shared, found.by_probe
         finite = jnp.isfinite(found.loss) & all_within(by, _MAX_GRADIENT)
 
-        def keep():
-            return state, jnp.asarray(True)
-
-        def skip():
-            return state.replace(step=state.step + 1), jnp.asarray(True)
-
         def update():
             with jax.named_scope("optimise"):
                 moved, good = optimise(setup, state, found)
@@ -263,8 +238,13 @@ def _advance(setup: Setup):
             with jax.named_scope("observe"):
                 return _observe(moved, found, noise_key, strategy, rate), good
 
+        def skip():
+            return state.replace(step=state.step + 1), jnp.asarray(True)
+
         after, good = lax.cond(
-            found.overflowed, keep, lambda: lax.cond(finite, update, skip)
+            found.overflowed,
+            lambda: (state, jnp.asarray(True)),
+            lambda: lax.cond(finite, update, skip),
         )
         metrics = Metrics(
             step=after.step,
@@ -283,11 +263,9 @@ def _advance(setup: Setup):
 
 
 def _edit(setup: Setup):
-    strategy = setup.strategy
-
     def edit(state: TrainState, metrics: Metrics) -> tuple[TrainState, Metrics]:
         *_, key = _keys(state.key, state.step - 1)
-        plan, stats = strategy.plan(key, state.step, state.gaussians, state.stats)
+        plan, stats = setup.strategy.plan(key, state.step, state.gaussians, state.stats)
         gaussians, moments = apply_edit(plan, state.moments)
         model = state.model._replace(slots=copy_rows(plan, state.model.slots))
         state = state.replace(
@@ -319,15 +297,13 @@ def optimise(
 
     Numbers that would become non-finite keep their values.
     """
-    config, by_slots = setup.config, found.by_slots
-    sh = by_slots.gaussians.sh
-    bases = jnp.arange(sh.shape[-2], dtype=jnp.float32)
+    config, by_gaussians = setup.config, found.by_slots.gaussians
+    bases = jnp.arange(by_gaussians.sh.shape[-2], dtype=jnp.float32)
     degree = jnp.floor(jnp.sqrt(bases)).astype(jnp.int32)
     enabled = degree <= state.step // config.sh_every
-    gaussians = by_slots.gaussians.replace(  # pyright: ignore
-        sh=jnp.where(enabled[:, None], sh, 0)
-    )
-    by_slots = by_slots._replace(gaussians=gaussians)
+    sh = jnp.where(enabled[:, None], by_gaussians.sh, 0)
+    by_gaussians = by_gaussians.replace(sh=sh)  # pyright: ignore
+    by_slots = found.by_slots._replace(gaussians=by_gaussians)
     fraction = state.step / config.steps
 
     def update(gradients, moments, params: Any) -> tuple[Any, Any]:
@@ -348,10 +324,7 @@ def optimise(
 
 
 def _keep_finite(active: Array, before: Any, after: Any) -> tuple[Array, Any]:
-    """Return whether all active slots are finite, and the finite values.
-
-    Values that are not finite are replaced by those before the update.
-    """
+    """Return whether all active slots are finite, and ``after`` where it is."""
 
     def is_good(number):
         wide = active.reshape(-1, *(1,) * (number.ndim - 1))

@@ -58,8 +58,7 @@ class StepCompiler:
           CapacityError: if it would take more memory than is available.
         """
         slots = state.gaussians.capacity
-        kind = (frames.pixels.shape, jax.tree.structure(frames))
-        sizes = (kind, slots, raster)
+        sizes = (frames.pixels.shape, jax.tree.structure(frames), slots, raster)
         if sizes not in self.by_sizes:
             self._compile(sizes, state, frames, raster)
         return CompiledStep(self.by_sizes[sizes], self.by_slots[slots])
@@ -71,14 +70,10 @@ class StepCompiler:
         height, width = frames.pixels.shape[1:3]
         told = f"{width} × {height} px, {slots:,} slots, {raster.pair_capacity:,} pairs"
         self._phase(f"compiling (about 30 s) for {told}")
+        size, raster_used = (width, height), step_raster(setup, raster)
+        nbytes = frames.pixels.nbytes
         require(
-            step_estimate(
-                slots,
-                (width, height),
-                setup.config,
-                step_raster(setup, raster),
-                frames.pixels.nbytes,
-            ),
+            step_estimate(slots, size, setup.config, raster_used, nbytes),
             f"a step for {told},",
             "train with smaller photographs (--max-size) or fewer Gaussians "
             "(--max-gaussians)",

@@ -14,7 +14,7 @@ from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig
 from gsjax.train.camera_refinement import refine_camera
 from gsjax.train.frames import Frames
-from gsjax.train.models import IDENTITY, ViewInfo
+from gsjax.train.models import ViewInfo
 from gsjax.train.setup import Setup
 from gsjax.train.state import TrainState
 
@@ -26,26 +26,18 @@ def _in_view(
     gaussians: Gaussians, camera: Camera, size: Array | None, raster: RasterConfig
 ) -> Array:
     """Return [N] bool: the Gaussians visible to any camera of a batch."""
-    return jnp.any(
-        render(gaussians, camera.replace(visible_size=size), raster).radii > 0, 0
-    )
+    found = render(gaussians, camera.replace(visible_size=size), raster)
+    return jnp.any(found.radii > 0, 0)
 
 
 def prune_invisible(
     state: TrainState, frames: Frames, setup: Setup
 ) -> tuple[TrainState, int]:
-    """Remove the Gaussians that none of the views show; the views stay bit-equal.
+    """Remove the Gaussians that no view shows; the views stay bit-equal.
 
     They are below the α threshold everywhere, or outside of all views, where they would
-    appear from other viewpoints as blur.
-
-    Args:
-      state: state of the run.
-      frames: V views, at the size of the last step.
-      setup: parts of the training step.
-
-    Returns:
-      The state, and the number of Gaussians removed.
+    appear from other viewpoints as blur. Returns the state, and the number of Gaussians
+    removed. The frames are those of the last step.
     """
     raster = setup.config.raster.replace(
         outputs=("alpha",), num_size_buckets=1, absgrad=False, visible_capacity=None
@@ -56,11 +48,8 @@ def prune_invisible(
         arrays = frames.camera, frames.size, frames.time
         camera, size, time = jax.tree.map(lambda a, i=index: a[i], arrays)
         camera = refine_camera(camera, state.refinement, index, setup.extent)
-        gaussians = state.gaussians
-        if setup.model is not IDENTITY:
-            time = jnp.zeros(1) if time is None else time
-            info = ViewInfo(index[0], time[0])
-            gaussians = setup.model.apply(state.params, info)
+        time = jnp.zeros(1) if time is None else time
+        gaussians = setup.model.apply(state.params, ViewInfo(index[0], time[0]))
         visible |= _in_view(gaussians, camera, size, raster)
     active = state.gaussians.active
     dropped = int(jnp.sum(active & ~visible))
