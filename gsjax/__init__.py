@@ -22,6 +22,8 @@ if typing.TYPE_CHECKING:  # the same names as in `_PUBLIC`
     from gsjax.data.dataset import load_dataset as load_dataset
     from gsjax.data.photos import load_photos as load_photos
     from gsjax.data.splits import split_views as split_views
+    from gsjax.densify.types import Strategy as Strategy
+    from gsjax.densify.types import apply_edit as apply_edit
     from gsjax.errors import CapacityError as CapacityError
     from gsjax.errors import DivergedError as DivergedError
     from gsjax.errors import GsjaxError as GsjaxError
@@ -49,11 +51,15 @@ if typing.TYPE_CHECKING:  # the same names as in `_PUBLIC`
     from gsjax.raster.types import Render as Render
     from gsjax.runtime.devices import use_all_cores as use_all_cores
     from gsjax.train.config import TrainConfig as TrainConfig
+    from gsjax.train.config import preset as preset
     from gsjax.train.evaluation import evaluate as evaluate
     from gsjax.train.evaluation import summarise as summarise
     from gsjax.train.loop import Hooks as Hooks
     from gsjax.train.loop import fit as fit
     from gsjax.train.loop import subset as subset
+    from gsjax.train.losses import LossTerm as LossTerm
+    from gsjax.train.models import Model as Model
+    from gsjax.train.models import ModelParams as ModelParams
     from gsjax.train.state import init_state as init_state
     from gsjax.train.state import load_state as load_state
     from gsjax.train.state import save_state as save_state
@@ -68,6 +74,7 @@ _PUBLIC = {
     "data.dataset": "load_dataset",
     "data.photos": "load_photos",
     "data.splits": "split_views",
+    "densify.types": "Strategy apply_edit",
     "errors": "CapacityError DivergedError GsjaxError InputError",
     "gaussians": "GaussianParams Gaussians capacity_bucket compact concatenate grow "
     "make_gaussians num_active select with_sh_degree",
@@ -80,9 +87,11 @@ _PUBLIC = {
     "raster.render": "render",
     "raster.types": "RasterConfig Render",
     "runtime.devices": "use_all_cores",
-    "train.config": "TrainConfig",
+    "train.config": "TrainConfig preset",
     "train.evaluation": "evaluate summarise",
     "train.loop": "Hooks fit subset",
+    "train.losses": "LossTerm",
+    "train.models": "Model ModelParams",
     "train.state": "init_state load_state save_state",
     "train.step": "make_train_step",
     "viewer": "notebook",

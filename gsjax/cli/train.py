@@ -1,5 +1,6 @@
 """`gsjax train`: a scene from photographs with known cameras."""
 
+from contextlib import closing
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -63,7 +64,8 @@ class TrainCommand(HeavyCommand):
     """Split by absolute gradients in the adaptive strategy: sharper, with more
     Gaussians."""
     refine_poses: bool = False
-    """Optimise the camera poses together with the scene."""
+    """Optimise the camera poses together with the scene, with accurate render
+    thresholds."""
     refine_intrinsics: bool = False
     """Optimise focal length and principal point together with the scene."""
     exposure: bool = False
@@ -120,14 +122,11 @@ class TrainCommand(HeavyCommand):
     def _train_with_viewer(self) -> int:
         from gsjax.viewer.server import LiveViewer
 
-        viewer = LiveViewer(port=self.viewer_port or 8080)
-        try:
+        with closing(LiveViewer(port=self.viewer_port or 8080)) as viewer:
             code = self._train(viewer.begin)
             if code == 0:
                 viewer.wait_for_browsers()
             return code
-        finally:
-            viewer.close()
 
     def _train(self, watch) -> int:
         result = self._start_or_resume(watch)
@@ -159,23 +158,24 @@ class TrainCommand(HeavyCommand):
             return resume_run(self.out, dataset=dataset, watch=watch)
         if self.resume:
             note(f"{self.out} is not a run yet; starting one")
-        return start_run(
-            self._settings(self._initial_scene()),
-            self.out,
-            overwrite=self.overwrite,
-            watch=watch,
-        )
+        mine = self._settings(self._initial_scene())
+        return start_run(mine, self.out, overwrite=self.overwrite, watch=watch)
 
     def _check_same_settings(self, settings) -> None:
         """Raise if options contradict the settings of the run to resume."""
+        from gsjax.runs.folder import run_files
+
         given = [
             f"--{field.name.replace('_', '-')}"
             for field in fields(self)
             if field.name not in _NOT_SETTINGS
             and getattr(self, field.name) != field.default
         ]
+        # --initial may name the file or its run, existing or not.
+        initial = Path(self.initial or "")
+        named = (initial.resolve(), run_files(initial).splat.resolve())
         # Defaults were resolved when the run started.
-        if self.initial is None or self._is_initial_scene(settings.start):
+        if self.initial is None or settings.start in named:
             mine = self._settings(settings.start)
             initial = settings.config.initial
             mine = replace(mine, config=mine.config.replace(initial=initial))
@@ -190,19 +190,8 @@ class TrainCommand(HeavyCommand):
                 f"{', '.join(given)}"
             )
 
-    def _is_initial_scene(self, start: Path | None) -> bool:
-        """Return whether --initial names that file or its run, existing or not."""
-        from gsjax.runs.folder import run_files
-
-        given = Path(self.initial or "")
-        return start in (given.resolve(), run_files(given).splat.resolve())
-
     def _initial_scene(self) -> Path | None:
-        """Return the file of the scene that --initial names, if it names one.
-
-        Raises:
-          UsageError: if it cannot initialise this run.
-        """
+        """Return the file of the scene that --initial names, if any and suitable."""
         from gsjax.runs.folder import load_settings, run_files
         from gsjax.runs.scene_source import is_run, splat_file
 
