@@ -34,7 +34,7 @@ from gsjax.train.capacity_policy import pairs_for
 from gsjax.train.config import Level, TrainConfig, preset
 from gsjax.train.frames import draw, make_frames
 from gsjax.train.loop import FitResult, fit, subset
-from gsjax.train.setup import make_setup
+from gsjax.train.state import make_setup
 from gsjax.train.step import make_stages, make_train_step
 from gsjax.train.visibility_pruning import prune_invisible
 

@@ -27,8 +27,7 @@ from gsjax.train.frames import draw, make_frames, targets, views_of_step
 from gsjax.train.initialisation import empty_state
 from gsjax.train.loop import subset
 from gsjax.train.losses import photometric_batch
-from gsjax.train.setup import make_setup
-from gsjax.train.state import gradients_like
+from gsjax.train.state import gradients_like, make_setup
 from gsjax.train.step import make_stages, optimise
 
 

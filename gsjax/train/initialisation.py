@@ -16,8 +16,7 @@ from gsjax.math.sh import num_bases
 from gsjax.train.capacity_policy import slots_for
 from gsjax.train.config import TrainConfig
 from gsjax.train.health import check_points
-from gsjax.train.setup import Setup, make_setup
-from gsjax.train.state import TrainState, setup_state
+from gsjax.train.state import Setup, TrainState, make_setup, setup_state
 
 _MIN_FOUND = 1000
 

@@ -28,8 +28,7 @@ from gsjax.train.health import Health, check_photos
 from gsjax.train.initialisation import add_dense_points, initial_state
 from gsjax.train.losses import LossTerm
 from gsjax.train.models import Model
-from gsjax.train.setup import Setup, make_setup
-from gsjax.train.state import Metrics, TrainState
+from gsjax.train.state import Metrics, Setup, TrainState, make_setup
 from gsjax.train.step_compiler import CompiledStep, StepCompiler
 from gsjax.train.visibility_pruning import prune_invisible
 

@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from gsjax.math.numerics import safe_divide
 from gsjax.raster.types import Render
 from gsjax.runtime.devices import map_over_devices
 from gsjax.train import ssim_window
 from gsjax.train.frames import Batch, targets
 from gsjax.train.metrics import (
     mask_excluded,
-    ratio,
     ssim_map,
     weighted_mean,
     weighted_sum,
@@ -145,8 +145,9 @@ def photometric_batch(
 
         return jax.tree.map(lambda x: x[None], jax.vmap(sums)(*arrays))
 
-    values, totals = map_over_devices(band, devices, images, targets, weights)
-    return ratio(jnp.sum(values, 0), jnp.sum(totals, 0))
+    sums = map_over_devices(band, devices, images, targets, weights)
+    value, total = (jnp.sum(a, 0) for a in sums)
+    return safe_divide(value, total, total > 0)
 
 
 def _pixel_loss(

@@ -60,7 +60,10 @@ def mask_excluded(
 
 def weighted_mean(values: Array, weight: Array | None) -> Array:
     """Return the weighted mean of [H, W, …]; 0 if all weights [H, W] are 0."""
-    return jnp.mean(values) if weight is None else ratio(*weighted_sum(values, weight))
+    if weight is None:
+        return jnp.mean(values)
+    total, count = weighted_sum(values, weight)
+    return safe_divide(total, count, count > 0)
 
 
 def weighted_sum(values: Array, weight: Array) -> tuple[Array, Array]:
@@ -70,11 +73,6 @@ def weighted_sum(values: Array, weight: Array) -> tuple[Array, Array]:
     """
     wide = weight.reshape(*weight.shape, *(1,) * (values.ndim - weight.ndim))
     return jnp.sum(values * wide), values.size // weight.size * jnp.sum(weight)
-
-
-def ratio(sums: Array, totals: Array) -> Array:
-    """Return ``sums / totals``; 0 where the total is 0."""
-    return safe_divide(sums, totals, totals > 0)
 
 
 def ssim(image: Array, target: Array, weight: Array | None = None) -> Array:

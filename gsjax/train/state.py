@@ -1,10 +1,11 @@
-"""State of a training run, and the results of its steps.
+"""Parts and state of a training run, and the results of its steps.
 
 Axis legend: N Gaussians (capacity), V views, B views of a step.
 """
 
 import io
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from gsjax.densify.schedule import EditSchedule, schedule_of
 from gsjax.densify.types import Strategy
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
@@ -22,7 +24,9 @@ from gsjax.io.npy import read_npy
 from gsjax.runtime.files import write_file
 from gsjax.train.camera_refinement import CameraRefinement, init_refinement
 from gsjax.train.config import TrainConfig
+from gsjax.train.losses import LossTerm
 from gsjax.train.models import (
+    IDENTITY,
     Model,
     ModelParams,
     SceneParams,
@@ -30,7 +34,7 @@ from gsjax.train.models import (
     SlotParams,
     init_model,
 )
-from gsjax.train.setup import Setup, make_setup
+from gsjax.train.optimiser import Rate, gaussian_rates, make_optimiser, scale_by_rate
 
 Array = jax.Array
 Tree = TypeVar("Tree")
@@ -89,6 +93,54 @@ class TrainState:
         return self.replace(gaussians=gaussians, model=model, refinement=refinement)
 
 
+class Setup(NamedTuple):
+    """Static parts of a training step, as `make_train_step` takes them.
+
+    Attributes:
+      optimiser: for `SlotParams` and `SharedParams`.
+      schedule: when the strategy edits, and the growth to expect.
+    """
+
+    config: TrainConfig
+    extent: float
+    strategy: Strategy
+    loss_terms: tuple[LossTerm, ...]
+    model: Model
+    optimiser: optax.GradientTransformationExtraArgs
+    schedule: EditSchedule
+
+
+def make_setup(
+    config: TrainConfig,
+    extent: float,
+    *,
+    strategy: Strategy | None = None,
+    loss_terms: Sequence[LossTerm] = (),
+    model: Model | None = None,
+) -> Setup:
+    """Return the parts of a training step; arguments as `make_train_step`."""
+    strategy = strategy or config.make_strategy(extent)
+    model = model or IDENTITY
+    rates: dict[str, Rate] = {
+        "turns": config.pose_rate,
+        "shifts": config.pose_rate,
+        "intrinsics": config.intrinsics_rate,
+        "exposures": config.exposure_rate,
+    }
+    rates |= {f"model.{name}": rate for name, rate in model.rates.items()}
+    table = gaussian_rates(config.rates, extent)
+    table |= {name: scale_by_rate(rate) for name, rate in rates.items()}
+    return Setup(
+        config=config,
+        extent=extent,
+        strategy=strategy,
+        loss_terms=tuple(loss_terms),
+        model=model,
+        optimiser=make_optimiser(table),
+        schedule=strategy.schedule or schedule_of(strategy.due, config.steps),
+    )
+
+
 def init_state(
     gaussians: Gaussians,
     config: TrainConfig,
@@ -105,8 +157,7 @@ def init_state(
       config: settings.
       extent: scene extent in world units, see `gsjax.data.extent.scene_extent`.
       views: V, number of views.
-      strategy: density control; default that of ``config``.
-      model: scene model; by default the Gaussians are rendered as they are.
+      strategy, model: as `gsjax.fit` takes them.
 
     Raises:
       InputError: if the model has no learning rate for one of its parameters, or an

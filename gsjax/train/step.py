@@ -28,8 +28,14 @@ from gsjax.train.losses import LossTerm, evaluate_terms, photometric_term
 from gsjax.train.metrics import psnr
 from gsjax.train.models import IDENTITY, Model, SceneParams, ViewInfo
 from gsjax.train.optimiser import means_rate
-from gsjax.train.setup import Setup, make_setup
-from gsjax.train.state import Gradients, Metrics, TrainState, gradients_like
+from gsjax.train.state import (
+    Gradients,
+    Metrics,
+    Setup,
+    TrainState,
+    gradients_like,
+    make_setup,
+)
 
 Array = jax.Array
 
@@ -70,9 +76,7 @@ def make_train_step(
     Args:
       config: settings.
       extent: scene extent in world units.
-      strategy: density control; default that of ``config``.
-      loss_terms: terms added to the photometric loss and the strategy's penalty.
-      model: scene model; by default the Gaussians are rendered as they are.
+      strategy, loss_terms, model: as `gsjax.fit` takes them.
       raster: render settings with a sufficient `pair_capacity`; default
         ``config.raster``. Its ``visible_capacity`` is ignored.
 
@@ -81,10 +85,8 @@ def make_train_step(
       is that of `init_state` with the same strategy and model. If
       ``Metrics.overflowed``, the state is unchanged.
     """
-    setup = make_setup(
-        config, extent, strategy=strategy, loss_terms=loss_terms, model=model
-    )
-    stages = make_stages(setup, raster)
+    parts = {"strategy": strategy, "loss_terms": loss_terms, "model": model}
+    stages = make_stages(make_setup(config, extent, **parts), raster)
 
     def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
         gradients = stages.differentiate(state, batch)
@@ -124,11 +126,9 @@ def _differentiate(setup: Setup, raster: RasterConfig | None):
         assert view.rgb is not None
         loss = evaluate_terms(terms, view, batch, params, state.step + 1)
         image, (target, weight) = view.rgb, targets(batch, view.rgb.dtype)
-        quality = jnp.mean(
-            jax.vmap(psnr, in_axes=(0, 0, None if weight is None else 0))(
-                lax.stop_gradient(image), target, weight
-            )
-        )
+        axes = 0, 0, None if weight is None else 0
+        each = jax.vmap(psnr, axes)(lax.stop_gradient(image), target, weight)
+        quality = jnp.mean(each)
         return loss, (quality, view)
 
     value_and_grad = jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)
@@ -145,7 +145,7 @@ def _differentiate(setup: Setup, raster: RasterConfig | None):
         )
         size = batch.size
         if size is None:
-            whole = jnp.asarray([batch.camera.width, batch.camera.height], jnp.int32)
+            whole = jnp.asarray([*batch.pixels.shape[2:0:-1]], jnp.int32)
             size = jnp.broadcast_to(whole, (count, 2))
         found = Gradients(
             loss=loss,

@@ -18,8 +18,7 @@ from gsjax.runtime.devices import replicated_sharding
 from gsjax.runtime.memory import require
 from gsjax.train.frames import Frames, draw
 from gsjax.train.memory_estimate import step_estimate
-from gsjax.train.setup import Setup
-from gsjax.train.state import Gradients, Metrics, TrainState, gradients_like
+from gsjax.train.state import Gradients, Metrics, Setup, TrainState, gradients_like
 from gsjax.train.step import Stages, make_stages, step_raster
 
 Array = jax.Array

@@ -15,8 +15,7 @@ from gsjax.raster.types import RasterConfig
 from gsjax.train.camera_refinement import refine_camera
 from gsjax.train.frames import Frames
 from gsjax.train.models import ViewInfo
-from gsjax.train.setup import Setup
-from gsjax.train.state import TrainState
+from gsjax.train.state import Setup, TrainState
 
 Array = jax.Array
 
