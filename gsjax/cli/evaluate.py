@@ -43,9 +43,8 @@ class EvalCommand(HeavyCommand):
             if each["ssim"] is not None:
                 text = f"PSNR {decibels(each['psnr'])}  SSIM {each['ssim']:.4f}"
             say(f"{each['name']}  {text}")
-        say(
-            f"{summary.views} {self.views} views: PSNR {decibels(summary.psnr)}, "
-            f"SSIM {summary.ssim:.4f}, LPIPS {summary.lpips}"
-        )
+        quality = f"PSNR {decibels(summary.psnr)}, SSIM {summary.ssim:.4f}"
+        views = f"{summary.views} {self.views} views"
+        say(f"{views}: {quality}, LPIPS {summary.lpips}")
         say(str(files.preview))
         return 0

@@ -23,13 +23,7 @@ _NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,2})?"
 def option(
     metavar: str, parse: Callable[[str], T], show: Callable[[T], str] = str
 ) -> OptionSpec[T | None]:
-    """Return a tyro constructor that calls ``parse`` with one argument.
-
-    Args:
-      metavar: placeholder of the argument in the help text.
-      parse: returns the value, or raises `ValueError`.
-      show: returns the argument of a default.
-    """
+    """Return a tyro constructor that calls ``parse``; ``show`` is its inverse."""
     return OptionSpec(
         nargs=1,
         metavar=metavar,
@@ -126,11 +120,7 @@ def _color(text: str) -> tuple[float, ...]:
 
 
 def parse_budget(text: str) -> float:
-    """Return the maximum error in a text like ``1/255`` or ``0.004``.
-
-    Raises:
-      ValueError: if it is malformed, or not above 0 and below 1.
-    """
+    """Return the error in a text like ``1/255``; raise `ValueError` outside (0, 1)."""
     match = re.fullmatch(rf"({_NUMBER})(?:/({_NUMBER}))?", text)
     parts = [float(part or 1) for part in match.groups()] if match else [0.0]
     if min(parts) <= 0 or parts[0] >= parts[1]:

@@ -1,6 +1,7 @@
 """`gsjax view`: a scene in the browser, or as an HTML page."""
 
 import time
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -75,10 +76,8 @@ class ViewCommand(HeavyCommand):
         missing = page.found - page.drawn
         if missing and self.max_gaussians is None:
             least = max(self.min_opacity, MIN_DRAWN_OPACITY)
-            note(
-                f"{missing:,} of {page.found:,} Gaussians left out: opacity below "
-                f"{least:g}, or not finite"
-            )
+            why = f"opacity below {least:g}, or not finite"
+            note(f"{missing:,} of {page.found:,} Gaussians left out: {why}")
         of_all = f" of {page.found:,}" if missing else ""
         count = len(content.frusta)
         cameras = f", {count} camera{'s' * (count != 1)}" if count else ""
@@ -93,14 +92,11 @@ class ViewCommand(HeavyCommand):
         from gsjax.viewer.server import ViewerServer
 
         server = ViewerServer(content, host=self.host, port=self.port)
-        try:
+        with closing(server), suppress(KeyboardInterrupt):  # the usual way to stop it
             say(server.url)
             note("open it in a browser; Ctrl-C stops serving")
             if views:
                 server.show_cameras(frusta_with_photos(views))
             while True:
                 time.sleep(1)
-        except KeyboardInterrupt:
-            return 0  # the usual way to stop a server
-        finally:
-            server.close()
+        return 0

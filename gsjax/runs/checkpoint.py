@@ -54,8 +54,7 @@ def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Pa
     """Write the state to a new file; remove all but the latest two checkpoints.
 
     Args:
-      folder: created if missing.
-      state: state of the run.
+      folder, state: the folder is created if missing.
       meta: JSON values to store: ``pair_capacity``, ``seconds`` of training, and
         optionally the number of ``devices``.
 
@@ -94,9 +93,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def load_latest(folder: Path, steps: int | None = None) -> Checkpoint:
-    """Return the latest readable checkpoint; warn about each unreadable later one.
-
-    ``steps`` is the number of steps of the whole run, see `load_checkpoint`.
+    """Return the latest readable checkpoint of a run of ``steps``; warn of later ones.
 
     Raises:
       InputError: if no checkpoint is readable.

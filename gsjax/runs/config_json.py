@@ -27,10 +27,8 @@ def config_from_json(data: Any) -> TrainConfig:
     try:
         return _config(copy.deepcopy(data))
     except _MALFORMED as error:
-        raise InputError(
-            f"not the settings of a training run: {error}; train again, or use the "
-            "version of gsjax that wrote them"
-        ) from error
+        remedy = "train again, or use the version of gsjax that wrote them"
+        raise InputError(f"not the settings of a run: {error}; {remedy}") from error
 
 
 def _config(data: Any) -> TrainConfig:

@@ -84,15 +84,10 @@ def run_demo(
     reject_existing(outputs, overwrite, "another folder with -o")
     size = f"{settings.width} × {settings.height} px"
     note(f"rendering {settings.photos} photographs of {size}")
-    dataset_settings = DemoDatasetSettings(
-        photos=settings.photos,
-        width=settings.width,
-        height=settings.height,
-        points=5000,
-        seed=settings.seed,
-    )
-    write_demo_dataset(files.dataset, dataset_settings, overwrite=overwrite)
-    config = demo_config(settings.steps, settings.seed)
+    sizes = settings._asdict()
+    config = demo_config(sizes.pop("steps"), settings.seed)
+    photographs = DemoDatasetSettings(**sizes, points=5000)
+    write_demo_dataset(files.dataset, photographs, overwrite=overwrite)
     run = RunSettings(dataset=files.dataset, config=config)
     result = start_run(run, files.run, overwrite=overwrite)
     if result.finished:

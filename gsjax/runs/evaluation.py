@@ -28,9 +28,7 @@ PREVIEWED = 4  # views in a preview
 def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
     """Evaluate the `splat.ply` of a run and write the files of `run_files`.
 
-    Args:
-      folder: folder of the run.
-      which: "test" or "train" views; the files of the latter have names of their own.
+    ``which`` are the "test" or "train" views; the latter have files of their own.
 
     Raises:
       InputError: if the folder is no run, or has no such view with a visible pixel.
@@ -51,10 +49,8 @@ def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
     photos = load_photos(before, settings.config.max_size)
     photos = refine_photos(photos, before, dataset.views)
     if not any(map(has_valid_pixels, photos)):
-        raise InputError(
-            f"{folder}: all {len(photos)} {which} views are fully masked; hold out "
-            "others (--test-images)"
-        )
+        fault = f"all {len(photos)} {which} views are fully masked"
+        raise InputError(f"{folder}: {fault}; hold out others (--test-images)")
     return write_evaluation(files, settings.config, gaussians, dataset, photos, which)
 
 
@@ -76,11 +72,7 @@ def write_evaluation(
     photos: list[Photo],
     which: str,
 ) -> Summary:
-    """Evaluate all views of ``dataset``; write numbers, renders and preview.
-
-    Raises:
-      InputError: if a file cannot be written.
-    """
+    """Evaluate all views; write numbers, renders and preview, as `write_file`."""
     make_folder(files.renders)
     start, results = time.perf_counter(), []
     names = short_names([view.name for view in dataset.views])
@@ -115,11 +107,7 @@ def write_evaluation(
 
 
 def write_preview(files: RunFiles, results: list[ViewResult]) -> None:
-    """Write the preview of some of the evaluated views.
-
-    Raises:
-      InputError: if it cannot be written.
-    """
+    """Write the preview of some of the evaluated views; as `write_file`."""
     few = np.unique(np.linspace(0, len(results) - 1, PREVIEWED).astype(int))
     rows = [
         SheetRow(results[i].name, results[i].truth, results[i].render, results[i].depth)

@@ -66,8 +66,7 @@ def _load_opaque(path: Path, min_opacity: float) -> tuple[Gaussians, int]:
         opacities = 1 / (1 + np.exp(-logits))
     gaussians = select(gaussians, jnp.asarray(opacities >= min_opacity))
     if found and not int(num_active(gaussians)):
-        raise InputError(
-            f"{path}: none of {found:,} Gaussians has an opacity of {min_opacity:g}; "
-            f"the greatest is {opacities.max():.3g}; lower --min-opacity"
-        )
+        fault = f"none of {found:,} Gaussians has an opacity of {min_opacity:g}"
+        most = f"the greatest is {opacities.max():.3g}; lower --min-opacity"
+        raise InputError(f"{path}: {fault}; {most}")
     return gaussians, found

@@ -103,18 +103,10 @@ class SplitDataset(NamedTuple):
 def run_files(folder: Path, which: str = "test") -> RunFiles:
     """Return the paths inside ``folder``; ``which`` views were evaluated."""
     suffix = "" if which == "test" else f"_{which}"
-    return RunFiles(
-        config=folder / "config.json",
-        metrics=folder / "metrics.jsonl",
-        checkpoints=folder / "checkpoints",
-        splat=folder / "splat.ply",
-        cameras=folder / "cameras.json",
-        eval=folder / f"eval{suffix}.json",
-        held_out=folder / "held_out.jsonl",
-        renders=folder / f"renders{suffix}",
-        preview=folder / f"preview{suffix}.png",
-        curves=folder / "curves.png",
-    )
+    names = ("config.json", "metrics.jsonl", "checkpoints", "splat.ply", "cameras.json")
+    names += (f"eval{suffix}.json", "held_out.jsonl", f"renders{suffix}")
+    names += (f"preview{suffix}.png", "curves.png")
+    return RunFiles(*(folder / name for name in names))
 
 
 def load_split(settings: RunSettings) -> SplitDataset:
@@ -130,11 +122,9 @@ def load_split(settings: RunSettings) -> SplitDataset:
             "you moved it, pass its new place once: gsjax train NEW_PLACE -o RUN "
             "--resume"
         )
+    images, factor, skip = settings.images, settings.factor, settings.skip_missing
     dataset = load_dataset(
-        settings.dataset,
-        images=settings.images,
-        skip_missing=settings.skip_missing,
-        factor=settings.factor,
+        settings.dataset, images=images, skip_missing=skip, factor=factor
     )
     if not settings.trained:
         split = split_views(dataset.views, settings.every, settings.test_images)
@@ -164,10 +154,10 @@ def _check_same_views(then: RunSettings, now: RunSettings) -> None:
             few = changes[:5] + ["…"] * (len(changes) > 5)
             differences.append(f"{' '.join(few)} ({role})")
     if differences or then != now:
+        fault = ", ".join(differences) or "their order differs"
         raise InputError(
-            f"{then.dataset}: its views are not those of the run: "
-            f"{', '.join(differences) or 'their order differs'}; restore the dataset, "
-            "or train again"
+            f"{then.dataset}: its views are not those of the run: {fault}; restore the "
+            "dataset, or train again"
         )
 
 
@@ -230,11 +220,7 @@ def _why_not_a_run(path: Path) -> str:
 
 
 def save_settings(folder: Path, settings: RunSettings) -> None:
-    """Write the config.json that `load_settings` reads.
-
-    Raises:
-      InputError: if it cannot be written.
-    """
+    """Write the config.json of `load_settings`; raise `InputError` if that fails."""
     data = {k: v for k, v in vars(settings).items() if k != "config"}
     for name in ("dataset", "start"):
         if data[name] is not None:
@@ -246,11 +232,7 @@ def save_settings(folder: Path, settings: RunSettings) -> None:
 def save_scene(
     path: Path, gaussians: Gaussians, dataset: Dataset, *, overwrite: bool = False
 ) -> None:
-    """Write Gaussians in the coordinates of the dataset's files.
-
-    Raises:
-      InputError: as `gsjax.save`.
-    """
+    """Write Gaussians in the coordinates of the dataset's files; as `gsjax.save`."""
     if not np.any(dataset.origin):
         return save(path, gaussians, overwrite=overwrite)
     with jax.enable_x64(True):
@@ -286,10 +268,7 @@ def require_splat(folder: Path) -> Path:
 def load_scene(path: Path, origin: np.ndarray) -> Gaussians:
     """Load Gaussians and subtract ``origin`` [3] from their means, in float64.
 
-    With the origin of its dataset, this inverts `save_scene`.
-
-    Raises:
-      InputError: as `gsjax.load`.
+    This inverts `save_scene` for the origin of its dataset; it raises as `gsjax.load`.
     """
     if not np.any(origin):
         return load(path)

@@ -20,10 +20,8 @@ _BUFFERED = 20  # lines written together
 
 
 def _line(record: dict[str, Any]) -> str:
-    finite = {
-        k: finite_or_none(v) if isinstance(v, float) else v for k, v in record.items()
-    }
-    return json.dumps(finite, allow_nan=False) + "\n"
+    values = (finite_or_none(v) if isinstance(v, float) else v for v in record.values())
+    return json.dumps(dict(zip(record, values)), allow_nan=False) + "\n"
 
 
 class JsonlLog:
@@ -44,11 +42,7 @@ class JsonlLog:
                 self.write()
 
     def write(self) -> None:
-        """Write all buffered lines.
-
-        Raises:
-          InputError: if they cannot be written.
-        """
+        """Write all buffered lines; raise `InputError` if that fails."""
         if self._lines:
             append_to_file(self.path, "".join(self._lines).encode())
             self._lines.clear()
@@ -98,11 +92,7 @@ def _parse(line: bytes) -> dict[str, Any] | None:
 
 
 def truncate_log(path: Path, steps: int) -> None:
-    """Drop the records after step ``steps``, at which a run resumes.
-
-    Raises:
-      InputError: if the file cannot be written.
-    """
+    """Drop the records after step ``steps``, at which a run resumes."""
     if path.exists():
         kept = [_line(r) for r in read_metrics(path) if r["step"] <= steps]
         write_file(path, "".join(kept).encode())
@@ -119,12 +109,9 @@ def plot_curves(
     Steps at which the image size changes are marked.
 
     Args:
-      path: PNG to write; replaced if it exists.
+      path: PNG to write, as `write_file`; replaced if it exists.
       metrics, held_out: see `read_metrics`.
       window: steps of the running mean, e.g. one epoch.
-
-    Raises:
-      InputError: if the file cannot be written.
     """
     steps = np.asarray([record["step"] for record in metrics], float)
     psnr = np.asarray([record["psnr"] for record in metrics], float)

@@ -61,13 +61,11 @@ def _evaluation(path: Path) -> dict[str, Any] | None:
     for key, kinds in _REPORTED.items():
         value = data.get(key, "missing")
         good = type(value) in kinds
-        if good and type(value) in (int, float):
-            good = abs(value) < 1e30
+        if type(value) in (int, float):
+            good &= abs(value) < 1e30
         if not good or (key == "which" and value not in _VIEWS):
-            raise InputError(
-                f"{path}: damaged: {key} is {repr(value)[:80]}; write it again with "
-                "`gsjax eval`"
-            )
+            fault = f"damaged: {key} is {repr(value)[:80]}"
+            raise InputError(f"{path}: {fault}; write it again with `gsjax eval`")
     return {key: data[key] for key in _REPORTED}
 
 
@@ -81,11 +79,9 @@ def run_text(path: str, facts: dict[str, Any]) -> str:
     }
     quality = facts["evaluation"]
     if quality is not None:
-        which = _VIEWS[quality["which"]]
-        rows["quality"] = (
-            f"PSNR {decibels(quality['psnr'])}, SSIM {quality['ssim']:.4f} "
-            f"({quality['views']} {which} views)"
-        )
+        views = f"{quality['views']} {_VIEWS[quality['which']]} views"
+        metrics = f"PSNR {decibels(quality['psnr'])}, SSIM {quality['ssim']:.4f}"
+        rows["quality"] = f"{metrics} ({views})"
     return _table(path, rows)
 
 
@@ -161,10 +157,10 @@ def info_text(path: str, facts: dict[str, Any]) -> str:
         low, high = (" ".join(number(v) for v in corner) for corner in corners)
         return f"[{low}] to [{high}]"
 
+    each = f"{facts['numbers_per_gaussian']} numbers each"
     rows = {
         "Gaussians": f"{facts['count']:,}",
-        "SH degree": f"{facts['sh_degree']} "
-        f"({facts['numbers_per_gaussian']} numbers each)",
+        "SH degree": f"{facts['sh_degree']} ({each})",
         "bounds": box(facts["bounds"]),
         "bounds 1 to 99 %": box(facts["bounds_1_99"]),
         "opacity": spread(facts["opacity"]),

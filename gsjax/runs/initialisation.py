@@ -35,9 +35,7 @@ def resolve_initialisation(settings: RunSettings, split: SplitDataset) -> RunSet
 
 
 def load_initial_state(settings: RunSettings, split: SplitDataset) -> TrainState | None:
-    """Return the state before the first step of a run that starts from a scene.
-
-    It is None if ``settings.start`` is not set.
+    """Return the first state of a run that starts from ``settings.start``, if it does.
 
     Raises:
       InputError: if the scene is missing, damaged, of another dataset, or has more
@@ -52,10 +50,8 @@ def load_initial_state(settings: RunSettings, split: SplitDataset) -> TrainState
     check_state_memory(int(active.sum()), config)
     note(f"starting from the scene of {path}")
     if gaussians.sh_degree > config.sh_degree:
-        note(
-            f"its SH degree {gaussians.sh_degree} is reduced to {config.sh_degree} "
-            "(--sh-degree)"
-        )
+        degree = f"{gaussians.sh_degree} is reduced to {config.sh_degree}"
+        note(f"its SH degree {degree} (--sh-degree)")
     try:
         state = initial_state(dataset, config, gaussians)
     except InputError as error:
@@ -73,11 +69,9 @@ def warn_of_trained_views(start: Path, held_out: tuple[str, ...]) -> None:
         return
     trained = set(run_folder.load_settings(folder).trained) & set(held_out)
     if trained:
-        note(
-            f"warning: {folder} was trained on {len(trained)} of the {len(held_out)} "
-            "held-out views, so their metrics are too high; hold out the views that "
-            "it did (--test-images, --test-every)"
-        )
+        seen = f"{len(trained)} of the {len(held_out)} held-out views"
+        remedy = "hold out the views that it did (--test-images, --test-every)"
+        note(f"warning: {folder} was trained on {seen}: metrics too high; {remedy}")
 
 
 def first_state(session: Session, photos: list[Photo]) -> TrainState:

@@ -33,8 +33,7 @@ def refine_dataset(
       dataset: all views.
       trained: indices of the V training views. Poses of other views are not corrected;
         intrinsics are common to all views.
-      refinement: learnt corrections.
-      extent: extent of the training views.
+      refinement, extent: learnt corrections, and the extent of the training views.
     """
     rows = {index: row for row, index in enumerate(trained)}
     with jax.enable_x64(True):
@@ -71,19 +70,11 @@ def refine_photos(
 
 
 def save_cameras(path: Path, dataset: Dataset) -> None:
-    """Write the cameras of all views, in the coordinates of the dataset's files.
-
-    Raises:
-      InputError: if they cannot be written.
-    """
-    views = [
-        {
-            "name": view.name,
-            "viewmat": _translate(view.viewmat, -dataset.origin).tolist(),
-            "K": view.K.tolist(),
-        }
-        for view in dataset.views
-    ]
+    """Write all cameras in the coordinates of the dataset's files; as `write_json`."""
+    views = []
+    for view in dataset.views:
+        viewmat = _translate(view.viewmat, -dataset.origin).tolist()
+        views.append({"name": view.name, "viewmat": viewmat, "K": view.K.tolist()})
     write_json(path, {"views": views})
 
 
@@ -108,17 +99,15 @@ def load_cameras(dataset: Dataset, path: Path) -> Dataset:
             views.append(replace(view, viewmat=viewmat, K=K))
         return replace(dataset, views=tuple(views))
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise InputError(
-            f"{path}: damaged, or of another dataset: {error!r}; remove it to use the "
-            "cameras of the dataset"
-        ) from error
+        fault = f"damaged, or of another dataset: {error!r}"
+        remedy = "remove it to use the cameras of the dataset"
+        raise InputError(f"{path}: {fault}; {remedy}") from error
 
 
 def _is_rigid(viewmat: np.ndarray) -> bool:
     rotation = viewmat[:3, :3]
-    good = (np.abs(viewmat) < MAX_COORDINATE).all()
     return bool(
-        good
+        (np.abs(viewmat) < MAX_COORDINATE).all()
         and np.abs(rotation @ rotation.T - np.eye(3)).max() < _RIGID_TOLERANCE
         and np.linalg.det(rotation) > 0
         and (viewmat[3] == (0, 0, 0, 1)).all()

@@ -80,11 +80,9 @@ class Reporter:
         """Report once that the strategy needs more Gaussians than the maximum."""
         if wanted > self.max_gaussians and not self.full:
             self.full = True
-            note(
-                f"the strategy asks for {wanted:,} Gaussians, the maximum is "
-                f"{self.max_gaussians:,} (train --max-gaussians); the most needed ones "
-                "are added first"
-            )
+            most = f"{self.max_gaussians:,} (train --max-gaussians)"
+            asked = f"the strategy asks for {wanted:,} Gaussians, the maximum is {most}"
+            note(f"{asked}; the most needed ones are added first")
 
     def close(self) -> None:
         """Remove the bar."""
@@ -92,10 +90,7 @@ class Reporter:
 
 
 def _smoothed(mean: float, value: float) -> float:
-    """Return the running mean of finite values.
-
-    The PSNR of a fully masked photograph is not finite.
-    """
+    """Return the running mean of finite values; without valid pixels, PSNR is none."""
     if not math.isfinite(value):
         return mean
     return value if math.isnan(mean) else (1 - _SMOOTHING) * mean + _SMOOTHING * value

@@ -71,8 +71,7 @@ def start_run(
     """Train, save and evaluate.
 
     Args:
-      settings: settings of the run.
-      folder: folder of the run; created if missing.
+      settings, folder: settings and folder of the run; it is created if missing.
       overwrite: replace a run in the folder. It is removed only when the new run can
         start.
       watch: returns `Hooks.state`.
@@ -131,10 +130,7 @@ def resume_run(
 
     With the same number of devices, the result is bit-equal to an uninterrupted run.
 
-    Args:
-      folder: folder of the run.
-      dataset: new place of the dataset, if it was moved.
-      watch: returns `Hooks.state`.
+    ``dataset`` is the new place of the dataset, if it was moved.
 
     Raises:
       InputError: if the folder is not a run, its files are damaged, another process
@@ -165,10 +161,9 @@ def _resumed_session(folder: Path, dataset: Path | None) -> Session:
                     "up to rounding, not bit-equal"
                 )
         else:
-            note(
-                f"the run finished before, at step {start.step:,}: only its results "
-                f"are written again; to train on, start a run with --initial {folder}"
-            )
+            done = f"the run finished before, at step {start.step:,}: only its results"
+            more = f"to train on, start a run with --initial {folder}"
+            note(f"{done} are written again; {more}")
     else:
         start = ResumePoint(load_initial_state(settings, split))
     return Session(settings.config, split, files, start)
@@ -239,10 +234,8 @@ def _fit_and_save(
         )
         gaussians = int(np.sum(result.gaussians.active))
         if result.dropped:
-            note(
-                f"{result.dropped:,} Gaussians visible in no photograph are removed; "
-                f"{gaussians:,} are left"
-            )
+            dropped = f"{result.dropped:,} Gaussians visible in no photograph"
+            note(f"{dropped} are removed; {gaussians:,} are left")
         # Inside the hooks, so that Ctrl-C does not interrupt saving.
         session.save(result.state, result.pair_capacity, result.progress)
         session.save_result(result.state)

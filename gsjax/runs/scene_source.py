@@ -36,10 +36,9 @@ class SceneSource(NamedTuple):
 
 
 def free_view_config(trained: RasterConfig) -> RasterConfig:
-    """Return the render settings of a run with occlusion culling on.
+    """Return the render settings of a run with occlusion culling, off in training.
 
-    Training leaves it off, see `TrainConfig`; a free view may be filled by Gaussians
-    right before the camera, where it pays.
+    A free view may be filled by Gaussians right before the camera, where it pays.
     """
     return trained.replace(occlusion=True)
 

@@ -82,11 +82,8 @@ class Session:
         """
         self.metrics.write()
         self.measured.write()
-        meta = {
-            "pair_capacity": pair_capacity,
-            "seconds": self.seconds(progress),
-            "devices": device_count(self.config.raster),
-        }
+        meta = {"pair_capacity": pair_capacity, "seconds": self.seconds(progress)}
+        meta["devices"] = device_count(self.config.raster)
         path = save_checkpoint(self.files.checkpoints, state, meta)
         for folder in (path.parent, self.files.config.parent):
             remove_leftovers(folder, path)
@@ -108,13 +105,9 @@ class Session:
 
     def log_held_out(self, state: TrainState, summary: Summary, seconds: float) -> None:
         """Log the metrics of the held-out views."""
-        record = {
-            "step": int(state.step),
-            "seconds": round(seconds, 3),
-            "psnr": summary.psnr,
-            "ssim": summary.ssim,
-            "gaussians": int(np.sum(state.gaussians.active)),
-        }
+        record = {"step": int(state.step), "seconds": round(seconds, 3)}
+        record |= {"psnr": summary.psnr, "ssim": summary.ssim}
+        record["gaussians"] = int(np.sum(state.gaussians.active))
         self.measured.add(record)
 
     def save_result(self, state: TrainState) -> None:
@@ -131,9 +124,7 @@ class Session:
         dataset, held_out = self.held_out(cameras)
         if not any(map(has_valid_pixels, held_out)):
             if held_out:
-                note(
-                    "warning: all held-out views are fully masked; nothing is evaluated"
-                )
+                note("warning: all held-out views are fully masked: none is evaluated")
             dataset = subset(cameras, split.train[:PREVIEWED])
             given = self.dataset.views[:PREVIEWED]
             few = refine_photos(photos[:PREVIEWED], given, dataset.views)
@@ -173,10 +164,8 @@ class Session:
                 results = evaluate_views(state.gaussians, dataset, photos, self.config)
                 summary = summarise(list(results))
                 self.log_held_out(state, summary, self.seconds(progress))
-                note(
-                    f"step {int(state.step)}: {len(photos)} held-out views: PSNR "
-                    f"{decibels(summary.psnr)}, SSIM {summary.ssim:.4f}"
-                )
+                quality = f"PSNR {decibels(summary.psnr)}, SSIM {summary.ssim:.4f}"
+                note(f"step {int(state.step)}: {len(photos)} held-out views: {quality}")
 
         try:
             with deferred_interrupt() as stopped:

@@ -54,10 +54,7 @@ def view_entries(
     """Return the cameras of views, at the size of their photographs.
 
     Their names are those of the photographs, relative to the folder that all share.
-
-    Args:
-      views: views of a dataset.
-      max_size: longest side in px, as in training; None for no limit.
+    ``max_size`` is the longest side in px, as in training; None for no limit.
 
     Raises:
       InputError: if the size of a photograph cannot be read.
@@ -83,8 +80,7 @@ def path_entries(
     The views are visited in natural order of their names: IMG_2 before IMG_10.
 
     Args:
-      dataset: dataset with at least one view.
-      path: path, e.g. of `CAMERA_PATHS`.
+      dataset, path: at least one view, and a path of `CAMERA_PATHS` or another.
       frames: F.
       max_size: longest side in px, as in training; None for no limit.
 
@@ -96,10 +92,8 @@ def path_entries(
     depth = _median_depth(dataset)
     unseen = camera_paths.unseen_angle(viewmats, depth=depth)
     if path is camera_paths.orbit and unseen > _WIDEST_GAP:
-        note(
-            f"warning: {unseen:.0f}° of the orbit see sides that no photograph shows; "
-            "--path interpolate or spiral stay near the cameras"
-        )
+        seen = f"{unseen:.0f}° of the orbit see sides that no photograph shows"
+        note(f"warning: {seen}; --path interpolate or spiral stay near the cameras")
     poses = path(viewmats, frames, depth=depth)
     scaled = [_at_photo_size(view, max_size) for view in dataset.views]
     intrinsics = camera_paths.median_intrinsics(scaled)

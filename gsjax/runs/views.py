@@ -1,5 +1,6 @@
 """Renders of a scene as image files, one or several per camera."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -124,19 +125,15 @@ def render_cameras(
             capacity = capacity_bucket(int(_MARGIN * needed))
             config = config.replace(pair_capacity=capacity)
         if index == 0:
-            _note_memory(gaussians, camera, config)
+            size, bases = (camera.width, camera.height), gaussians.params.sh.shape[1]
+            need = render_estimate(gaussians.capacity, bases, size, config).total
+            free = available()
+            of_free = "" if free is None else f" of {size_text(free)} available"
+            note(f"memory: about {size_text(need)} per view{of_free}")
         view = render_exact(gaussians, camera, config, color)
         needed = capacity_bucket(int(view.demand.capacity))
         config = config.replace(pair_capacity=max(config.pair_capacity or 1, needed))
         yield view
-
-
-def _note_memory(gaussians: Gaussians, camera: Camera, config: RasterConfig) -> None:
-    bases, size = gaussians.params.sh.shape[1], (camera.width, camera.height)
-    estimate = render_estimate(gaussians.capacity, bases, size, config)
-    free = available()
-    of_free = "" if free is None else f" of {size_text(free)} available"
-    note(f"memory: about {size_text(estimate.total)} per view{of_free}")
 
 
 def _targets(folder: Path, name: str, kinds: Sequence[str], npy: bool) -> list[_Target]:
@@ -151,14 +148,13 @@ def _check_paths(targets: list[list[_Target]], overwrite: bool) -> None:
     """Raise if two files have the same name, or one exists without ``overwrite``."""
     flat = [target for of_view in targets for target in of_view]
     paths = [path for t in flat for path in (t.png, t.npy) if path is not None]
-    seen: set[str] = set()
+    names = Counter(str(path).casefold() for path in paths)
     for path in paths:
-        if str(path).casefold() in seen:
+        if names[str(path).casefold()] > 1:
             raise InputError(
                 f"{path}: two images would have this name; rename the frames in the "
                 "camera file, or render one kind of image at a time"
             )
-        seen.add(str(path).casefold())
     reject_existing(paths, overwrite, "another folder with -o")
 
 
