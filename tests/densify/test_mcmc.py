@@ -8,15 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import (
-    cast,
-)
+from conftest import assert_not_empty, camera_of, cast, reference
 
 import gsjax
 from gsjax.densify.adaptive import AdaptiveSettings, adaptive
 from gsjax.densify.mcmc import McmcSettings, mcmc, shared_opacity, shared_scale, spawn
 from gsjax.densify.types import apply_edit, copy_rows
 from gsjax.math.rotations import covariance
+from gsjax.train.metrics import psnr
 from gsjax.train.optimiser import Rates, gaussian_rates, make_optimiser
 
 SLOTS = 96
@@ -302,3 +301,37 @@ def test_noise_and_penalty_scale_with_the_extent():
         np.testing.assert_allclose(found, moved * unit, rtol=1e-6, atol=1e-12 * unit)
         wanted = here.penalty(gaussians)
         np.testing.assert_allclose(there.penalty(larger), wanted, rtol=1e-9)
+
+
+def test_relocation_keeps_the_image(report):
+    """Eq. 9 preserves the integral of each Gaussian, not its shape."""
+    rng = np.random.default_rng(3)
+    opacities = rng.uniform(0.2, 0.9, SLOTS)
+    opacities[24:] = 0.004
+    gaussians = scene_with(opacities, np.ones(SLOTS, bool), scales=0.25)
+    points = np.column_stack([rng.uniform(-1, 1, (SLOTS, 2)), np.full(SLOTS, 3.0)])
+    colors = jnp.asarray(rng.uniform(0.5, 1.7, (SLOTS, 4, 3))).at[:, 1:].set(0)
+    params = gaussians.params.replace(means=jnp.asarray(points), sh=colors)
+    gaussians = gaussians.replace(params=params)
+    config = McmcSettings(start=0, stop=9, every=1, growth=1.0)
+    edit = planned(config, jax.random.key(4), gaussians)
+    parents = np.asarray(children_of(edit, gaussians, range(SLOTS)))
+    assert np.bincount(parents)[:24].max() > 4
+    camera = camera_of(45, 29, np.eye(4))
+
+    def image(params, logits):
+        params = params.replace(logit_opacities=logits)
+        return reference(gaussians.replace(params=params), camera, None)
+
+    logits = params.logit_opacities
+    alone = image(params, jnp.where(jnp.asarray(first(24)), logits, -20.0))
+    moved = image(edit.params, edit.params.logit_opacities)
+    unshared = image(edit.params, logits[parents])
+    assert_not_empty(alone["alpha"])
+    light = float(jnp.sum(moved["alpha"]) / jnp.sum(alone["alpha"]))
+    quality, without = (psnr(i["rgb"], alone["rgb"]) for i in (moved, unshared))
+    report("light after relocation", abs(light - 1), 0.05)
+    report("relocation, −dB", -quality, -28)
+    assert light == pytest.approx(1, rel=0.05)
+    assert quality > 28
+    assert without < quality - 6

@@ -27,9 +27,9 @@ from training import (
 
 import gsjax
 import gsjax.train.loop as fit_module
-from gsjax.cameras.camera import make_camera
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
+from gsjax.densify.schedule import EditSchedule
 from gsjax.errors import CapacityError, InputError
 from gsjax.raster.exact import count_demand
 from gsjax.runs.checkpoint import load_latest, restore, save_checkpoint
@@ -44,8 +44,7 @@ from gsjax.train.config import Level, TrainConfig
 from gsjax.train.frames import make_frames
 from gsjax.train.initialisation import empty_state, initial_state, resolve_initial
 from gsjax.train.loop import Hooks, fit, subset
-from gsjax.train.setup import make_setup
-from gsjax.train.state import init_state
+from gsjax.train.state import init_state, make_setup
 from gsjax.train.visibility_pruning import prune_invisible
 
 STEPS, FINER = 60, 30
@@ -149,6 +148,10 @@ def test_the_loss_falls(whole, strategy):
     seconds, compiling = np.asarray(log.told("seconds", "compile_seconds")).T
     gone = np.diff(seconds - compiling)
     assert gone[[24, 49]].max() < _PAUSE
+    # Spare capacity: one program per resolution, though Gaussians and pairs grow.
+    assert log.records[-1]["compilations"] == len(CONFIGS[strategy].levels)
+    pairs = np.asarray(log.told("pair_capacity"))[:FINER, 0]
+    assert pairs.max() > 1.2 * pairs[0]
     divisors = np.asarray(log.told("divisor"))[:, 0]
     finer = len(CONFIGS[strategy].levels) > 1
     wanted = np.where(finer & (np.arange(STEPS) >= FINER), 1, 2)
@@ -216,24 +219,27 @@ def test_capacities_grow_without_changing_bits(shared_programs):
 
 
 @on_cpu
-@pytest.mark.parametrize("bad", [0, 1])
-def test_the_state_is_saved_before_a_capacity_error(bad, monkeypatch):
+def test_the_state_is_saved_before_a_capacity_error(monkeypatch):
     """Not after a failed step."""
     config = CONFIGS["adaptive"]
     begun, _ = run(config, Log(stop_at=FINER - 1))
-    log = Log()
+    given = {"state": begun.state, "pair_capacity": begun.pair_capacity}
 
     def too_many(*_):
         raise CapacityError("too many")
 
     monkeypatch.setattr(fit_module, "pairs_for", too_many)
-    monkeypatch.setattr(
-        fit_module.Health, "check", lambda self, _: setattr(self, "bad", bad)
-    )
-    with pytest.raises(CapacityError, match="too many"):
-        run(config, log, state=begun.state, pair_capacity=begun.pair_capacity)
-    assert [record["step"] for record in log.records] == [FINER]
-    assert log.saved == ([] if bad else [FINER])
+    for bad, saved in ((0, [FINER]), (1, [])):
+        log = Log()
+        monkeypatch.setattr(
+            fit_module.Health,
+            "check",
+            lambda self, _, bad=bad: setattr(self, "bad", bad),
+        )
+        with pytest.raises(CapacityError, match="too many"):
+            run(config, log, **given)
+        assert [record["step"] for record in log.records] == [FINER]
+        assert log.saved == saved
 
 
 @on_cpu
@@ -271,17 +277,8 @@ def test_pruning_invisible_gaussians_keeps_the_views_bit_equal():
     assert count == POINTS
 
 
-def test_a_finished_run_makes_no_step():
-    config = CONFIGS["adaptive"]
-    state = initial_state(dataset(), config).replace(step=jnp.int32(STEPS))
-    result, log = run(config, state=state, pair_capacity=99)
-    assert (result.progress, result.pair_capacity) == (None, 99)
-    assert log.records == log.phases == []
-    assert changed(result.state, state) == []
-
-
 def test_initial_points():
-    """Non-finite points do not count."""
+    """Non-finite points do not count. A finished run makes no step."""
     config, bare = CONFIGS["mcmc"], replace(dataset(), points=np.zeros((0, 3)))
     wild = replace(dataset(), points=np.full((POINTS, 3), np.nan))
     assert config.initial == "auto"
@@ -296,6 +293,11 @@ def test_initial_points():
         assert changed(first, second) == []
         with pytest.raises(InputError, match="points"):
             resolve_initial(without, config.replace(initial="points"))
+    state = first.replace(step=jnp.int32(STEPS))
+    result, log = run(config, state=state, pair_capacity=99)
+    assert (result.progress, result.pair_capacity) == (None, 99)
+    assert log.records == log.phases == []
+    assert changed(result.state, state) == []
 
 
 def test_photographs_must_match_the_views():
@@ -307,74 +309,79 @@ def test_photographs_must_match_the_views():
         fit(subset(dataset(), []), [], CONFIG)
 
 
-@pytest.mark.parametrize("steps", [1000, 4000, 30_000])
 @on_cpu
-def test_the_slots_minimise_the_cost(steps):
+def test_the_slots_minimise_the_cost():
     """To a tenth; compiling a program costs as much as 10⁷ idle slots in a step."""
     first, last = 20_000, 200_000
-    mcmc = McmcSettings(start=0, stop=steps, every=1, growth=2, max_gaussians=last)
-    config = CONFIG.replace(strategy="mcmc", mcmc=mcmc, steps=steps)
-    config = config.replace(levels=(Level(0.0, 1),))
-
-    def cost(lot):
-        programs = (last - first) / lot
-        return programs * 1e7 + steps * lot / 2
-
-    chosen = slots_for(first, 0, config) - first
-    assert cost(chosen) < 1.1 * min(map(cost, range(1000, last - first, 1000)))
+    for steps in (1000, 4000, 30_000):
+        schedule = EditSchedule(0, steps, 1, 2.0, last)
+        config = TrainConfig(steps=steps)
+        chosen = slots_for(first, 0, config, schedule) - first
+        cost = [
+            (last - first) / lot * 1e7 + steps * lot / 2
+            for lot in (chosen, *range(1000, last - first, 1000))
+        ]
+        assert cost[0] < 1.1 * min(cost)
 
 
 @on_cpu
 def test_slots_are_limited_by_the_growth():
-    few = CONFIG.replace(adaptive=replace(CONFIG.adaptive, max_gaussians=50_000))
-    known = replace(CONFIG.mcmc, max_gaussians=50_000, growth=1.05)
-    grows = CONFIG.replace(strategy="mcmc", mcmc=known)
-    assert slots_for(40_000, 0, few) == 53_248  # 50,000, in eighths of 32,768
-    assert slots_for(40_000, 60, few) == 40_960  # after the last edit
+    few = replace(CONFIG.adaptive, max_gaussians=50_000).schedule
+    grows = replace(CONFIG.mcmc, max_gaussians=50_000, growth=1.05).schedule
+    assert slots_for(40_000, 0, CONFIG, few) == 53_248  # 50,000, in eighths of 32,768
+    assert slots_for(40_000, 60, CONFIG, few) == 40_960  # after the last edit
     # Four edits until the resolution changes.
-    assert slots_for(20_000, 0, grows) == 24_576
-    assert slots_for(24_310, FINER, grows) == 28_672
-    assert slots_for(60_000, 0, few) == 61_440
+    assert slots_for(20_000, 0, CONFIG, grows) == 24_576
+    assert slots_for(24_310, FINER, CONFIG, grows) == 28_672
+    assert slots_for(60_000, 0, CONFIG, few) == 61_440
 
 
-@pytest.mark.parametrize("initial", ["points", "random"])
-def test_estimate_of_the_initial_pairs(initial):
-    config = CONFIG.replace(initial=initial, initial_count=500)
-    state = initial_state(dataset(), config)
-    frames, start = make_frames(dataset().views, photos()), as_spheres(state.gaussians)
-    for index in range(VIEWS):
-        camera = jax.tree.map(lambda a, i=index: a[i], frames.camera)
-        counted = int(count_demand(state.gaussians, camera, config.raster).capacity)
-        found = expected_pairs(start, camera, config.raster)
-        assert found == pytest.approx(counted, rel=0.25)
-    aside = make_camera(
-        viewmat=np.diag([-1.0, 1, -1, 1]) @ dataset().views[0].viewmat,
-        K=dataset().views[0].K, width=WIDTH, height=HEIGHT,
-    )  # fmt: skip
-    assert expected_pairs(start, aside, config.raster) < 0.2 * counted
+def test_estimate_of_the_initial_pairs():
+    frames, raster = make_frames(dataset().views, photos()), CONFIG.raster
+    cameras = [jax.tree.map(lambda a, i=i: a[i], frames.camera) for i in range(VIEWS)]
+    for initial in ("points", "random"):
+        config = CONFIG.replace(initial=initial, initial_count=500)
+        state = initial_state(dataset(), config)
+        start = as_spheres(state.gaussians)
+        for camera in cameras:
+            counted = int(count_demand(state.gaussians, camera, raster).capacity)
+            found = expected_pairs(start, camera, raster)
+            assert found == pytest.approx(counted, rel=0.25)
+        flipped = np.diag([-1.0, 1, -1, 1]) @ cameras[0].viewmat
+        aside = cameras[0].replace(viewmat=flipped)
+        assert expected_pairs(start, aside, raster) < 0.2 * counted
 
 
 @pytest.mark.parametrize("strategy", ["adaptive", "mcmc"])
-@pytest.mark.parametrize("stop", [99, 100, 1000])
-def test_the_last_step_is_not_followed_by_an_edit(strategy, stop):
-    edits = {"start": 0, "every": 10, "stop": stop}
-    config = TrainConfig(
-        steps=100,
-        strategy=strategy,
-        adaptive=AdaptiveSettings(**edits, reset_every=50),
-        mcmc=McmcSettings(**edits),
-    )
-    strategy = config.make_strategy(EXTENT)
-    due = [step for step in range(200) if strategy.due(jnp.int32(step))]
-    assert due == [*range(10, 100, 10)]
-    assert config.strategy_settings.stop == 99
-    assert config.replace(steps=5000).strategy_settings.stop == stop
+def test_the_last_step_is_not_followed_by_an_edit(strategy):
+    for stop in (99, 100, 1000):
+        settings = replace(getattr(CONFIG, strategy), start=0, every=10, stop=stop)
+        config = TrainConfig(steps=100, strategy=strategy, **{strategy: settings})
+        due = config.make_strategy(EXTENT).due
+        assert [step for step in range(200) if due(step)] == [*range(10, 100, 10)]
+        assert config.replace(steps=5000).strategy_settings.stop == stop
 
 
-def test_the_limit_of_pairs():
+@on_cpu
+def test_spare_pairs_grow_with_the_expected_gaussians():
+    """Limited by the growth, and by the cost of a compilation."""
     state = initial_state(dataset(), CONFIG)
-    done = state.replace(step=jnp.int32(CONFIG.strategy_settings.stop))
-    assert with_margin(1000, done, CONFIG) == 1536
-    assert with_margin(2**30 - 9, done, CONFIG) == 2**30 - 1
+
+    def margin(pairs, step, steps, growth=100, stop=5000):
+        config = TrainConfig(steps=steps)
+        schedule = EditSchedule(0, stop, 1, 2.0, growth * POINTS)
+        now = state.replace(step=jnp.int32(step))
+        return with_margin(pairs, now, config, schedule) / pairs
+
+    roomy = margin(300_000, 0, 100)
+    assert roomy == pytest.approx(4, rel=0.4)
+    assert margin(300_000, 0, 10_000) == pytest.approx(2.5, rel=0.2)
+    assert margin(60_000, 0, 1500) == pytest.approx(3, rel=0.2)
+    settled = margin(300_000, 60, 100, stop=60)
+    assert settled == margin(300_000, 1, 100, growth=1) < 2
+    # Initial Gaussians are narrow.
+    assert 1.1 * settled < margin(300_000, 0, 100, growth=1) < roomy
+    done = state.replace(step=jnp.int32(CONFIG.schedule.stop))
+    assert with_margin(2**30 - 9, done, CONFIG, CONFIG.schedule) == 2**30 - 1
     with pytest.raises(CapacityError, match="2,147,483,647 or more"):
-        with_margin(2**31 - 1, done, CONFIG)
+        with_margin(2**31 - 1, done, CONFIG, CONFIG.schedule)

@@ -123,7 +123,7 @@ def test_weights():
     assert weighted_mean(values, np.zeros_like(values)) == 0
 
 
-@pytest.mark.parametrize("garbage", [1e30, np.inf, np.nan])
+@pytest.mark.parametrize("garbage", [np.inf, np.nan])
 def test_excluded_pixels_have_no_effect(garbage):
     x, y = (np.float32(a) for a in pair(24, 32))
     weight = np.float32(np.random.default_rng(1).uniform(size=(24, 32)) > 0.3)

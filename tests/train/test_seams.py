@@ -10,8 +10,8 @@ from training import (
     EXTENT,
     RASTER,
     VIEWS,
-    bits,
     changed,
+    copy,
     dataset,
     photos,
     rough_start,
@@ -28,12 +28,10 @@ from gsjax.train.frames import draw, make_frames
 from gsjax.train.loop import Hooks, fit
 from gsjax.train.losses import LossTerm
 from gsjax.train.models import Model, ModelParams
-from gsjax.train.optimiser import Rates
 from gsjax.train.state import init_state, load_state, save_state
 from gsjax.train.step import make_train_step
 
 SLOTS = 96
-STILL = Rates((0.0, 0.0), 0.0, 0.0, 0.0, 0.0, 0.0)
 CONFIG = TrainConfig(
     steps=40,
     sh_degree=0,
@@ -90,69 +88,78 @@ def clone_all(gaussians):
     )
 
 
-def test_a_rigid_motion_is_recovered():
-    """Photographs of a moving scene, with known Gaussians and 6 unknown numbers."""
-    truth = rough_start(0, SLOTS)
-    views = [replace(v, time=float(t)) for t, v in enumerate(dataset().views)]
-    frames = make_frames(views, photos())
-    config = CONFIG.replace(rates=STILL, batch=VIEWS)
-    rigid = RIGID._replace(rates={"motion": 2e-3, "offset": 0.0})
-    start = init_state(truth, config, EXTENT, VIEWS, model=rigid)
-    wanted = jnp.asarray([0.02, -0.01, 0.03, 0.03, 0.02, -0.02])
-    moved = start.replace(model=start.model._replace(shared={"motion": wanted}))
-    batch = draw(frames, jnp.arange(VIEWS))
-    images = [
-        gsjax.render(
-            rigid.apply(moved.params, jax.tree.map(lambda a, i=i: a[i], info)),
-            jax.tree.map(lambda a, i=i: a[i], frames.camera),
-            RASTER.replace(outputs=("rgb",)),
-        ).rgb
-        for i in range(VIEWS)
-        for info in [_info(batch)]
-    ]
-    pixels = np.rint(np.clip(np.stack(images), 0, 1) * 255).astype(np.uint8)
-    batch = batch._replace(pixels=jnp.asarray(pixels))
-    step = jax.jit(make_train_step(config, EXTENT, model=rigid))
-    state, losses = start, []
-    for _ in range(40):
-        state, metrics = step(state, batch)
-        assert metrics.finite
-        assert not metrics.overflowed
-        losses.append(float(metrics.loss))
-    error = np.abs(state.model.shared["motion"] - wanted).max()
-    assert losses[-1] < 0.3 * losses[0]
-    assert error < 0.01
-    assert changed(start.gaussians, state.gaussians) == []
-
-
-def _info(batch):
-    from gsjax.train.models import ViewInfo
-
-    return ViewInfo(batch.view, batch.time)
-
-
-def test_rows_of_a_model_follow_the_edit():
-    """And their moments are cleared; shared parameters are not touched."""
+@pytest.fixture(scope="module")
+def given():
+    """The other arguments of `fit`; runs share their programs."""
     gaussians = rough_start(0, SLOTS)
-    given = {"strategy": clone_all(gaussians), "model": RIGID}
-    state = init_state(gaussians, CONFIG, EXTENT, VIEWS, **given)
-    step = jax.jit(make_train_step(CONFIG, EXTENT, **given))
-    batch = draw(FRAMES, jnp.zeros(1, jnp.int32))._replace(time=jnp.ones(1))
-    for _ in range(2):
-        before = state
-        state, metrics = step(state, batch)
-    count = int(jnp.sum(before.gaussians.active))
+    term = LossTerm("zero", lambda *_: jnp.asarray(0.0))
+    return {"strategy": clone_all(gaussians), "model": RIGID, "loss_terms": (term,)}
+
+
+def captured(turn=1):
+    """Return the photographs of the dataset, taken at time 1, from arrays."""
+    cameras = [
+        gsjax.make_camera(
+            viewmat=np.diag([turn, 1, turn, 1]) @ view.viewmat, K=view.K,
+            width=view.width, height=view.height,
+        )
+        for view in dataset().views
+    ]  # fmt: skip
+    made, taken = gsjax.make_dataset([p.pixels for p in photos()], cameras)
+    views = tuple(replace(view, time=1.0) for view in made.views)
+    return replace(made, views=views), taken
+
+
+def test_fit_takes_all_of_them(tmp_path, given, shared_programs):
+    """Rows of a model follow the edit, and their moments are cleared."""
+    del shared_programs
+    seams = {name: given[name] for name in ("strategy", "model")}
+    state = init_state(rough_start(0, SLOTS), CONFIG, EXTENT, VIEWS, **seams)
+    states, records = [], []
+    hooks = Hooks(
+        step=records.append,
+        state=lambda state, _: states.append(copy(state)),
+        stop=lambda: len(states) == 2,
+    )
+    result = fit(*captured(), CONFIG, state=state, hooks=hooks, **given)
+    before, after = states
+    assert changed(result.state, after) == []
+    count, metrics = int(gsjax.num_active(before.gaussians)), records[-1].metrics
     assert (int(metrics.wanted), int(metrics.gaussians)) == (2 * count, SLOTS)
-    offset = np.asarray(state.model.slots["offset"])
-    born = SLOTS - count
-    np.testing.assert_array_equal(offset[count:], offset[:born])
+    offset = np.asarray(after.model.slots["offset"])
+    np.testing.assert_array_equal(offset[count:], offset[: SLOTS - count])
     assert (offset[:count] != 0).any()
-    moments = state.moments[0].mu
-    assert (np.asarray(moments.model["offset"])[count:] == 0).all()
-    assert (np.asarray(moments.gaussians.means)[count:] == 0).all()
-    assert (np.asarray(moments.model["offset"])[:count] != 0).any()
-    assert (np.asarray(state.shared_moments[0].mu.model["motion"]) != 0).all()
-    assert (state.stats > 0).any()
+    moments = after.moments[0].mu
+    for rows in (moments.model["offset"], moments.gaussians.means):
+        assert (np.asarray(rows)[count:] == 0).all()
+        assert (np.asarray(rows)[:count] != 0).any()
+    assert (np.asarray(after.shared_moments[0].mu.model["motion"]) != 0).all()
+    assert (after.stats > 0).any()
+    # The state can be saved and loaded.
+    path = tmp_path / "state.npz"
+    save_state(path, after)
+    assert changed(load_state(path, state), after) == []
+    other = init_state(rough_start(0, 64), CONFIG, EXTENT, VIEWS, **seams)
+    with pytest.raises(InputError, match=r"expected .* \(64,"):
+        load_state(path, other)
+    path.write_bytes(path.read_bytes()[:1000])
+    for bad in (path, tmp_path / "none.npz"):
+        with pytest.raises(InputError, match=bad.name):
+            load_state(bad, state)
+    with pytest.raises(InputError, match="none"):
+        save_state(tmp_path / "none" / "state.npz", state)
+
+
+def test_nothing_in_view_warns_once(given, shared_programs):
+    """Cameras that look away."""
+    del shared_programs
+    seams = {name: given[name] for name in ("strategy", "model")}
+    state = init_state(rough_start(0, SLOTS), CONFIG, EXTENT, VIEWS, **seams)
+    stops = iter([False, False, True])
+    hooks = Hooks(stop=lambda: next(stops))
+    with pytest.warns(UserWarning, match="poses may be inverted") as told:
+        fit(*captured(turn=-1), CONFIG, state=state, hooks=hooks, **given)
+    assert len(told) == 1
 
 
 def test_loss_terms_are_weighted_and_scheduled():
@@ -166,44 +173,14 @@ def test_loss_terms_are_weighted_and_scheduled():
                     outputs=("depth",))  # fmt: skip
     state = init_state(rough_start(0, SLOTS), CONFIG, EXTENT, VIEWS)
     batch = draw(FRAMES, jnp.zeros(1, jnp.int32))
-    plain = jax.jit(make_train_step(CONFIG, EXTENT))
-    more = jax.jit(make_train_step(CONFIG, EXTENT, loss_terms=(term,)))
-    first, second = plain(state, batch), more(state, batch)
-    assert bits(first[1]) == bits(second[1])
-    state = first[0]
-    (_, without), (_, with_it) = plain(state, batch), more(state, batch)
+    step = jax.jit(make_train_step(CONFIG, EXTENT, loss_terms=(term,)))
+    told = [step(state.replace(step=jnp.int32(s)), batch)[1] for s in range(3)]
     camera = jax.tree.map(lambda a: a[0], batch.camera)
-    image = gsjax.render(state.gaussians, camera, RASTER)
-    wanted = without.loss + 0.2 * jnp.mean(image.depth)
-    np.testing.assert_allclose(with_it.loss, wanted, rtol=1e-6)
-    assert with_it.psnr == without.psnr
-
-
-def test_fit_takes_all_of_them(tmp_path):
-    """And its state can be saved and loaded."""
-    term = LossTerm("zero", lambda *_: jnp.asarray(0.0))
-    gaussians = rough_start(0, 128)
-    given = {"strategy": clone_all(gaussians), "model": RIGID}
-    state = init_state(gaussians, CONFIG, EXTENT, VIEWS, **given)
-    stops = iter([False, False, True])
-    result = fit(
-        dataset(), photos(), CONFIG, state=state, loss_terms=(term,),
-        hooks=Hooks(stop=lambda: next(stops)), **given,
-    )  # fmt: skip
-    assert int(gsjax.num_active(result.gaussians)) == 120
-    path = tmp_path / "state.npz"
-    save_state(path, result.state)
-    template = init_state(result.gaussians, CONFIG, EXTENT, VIEWS, **given)
-    assert changed(load_state(path, template), result.state) == []
-    other = init_state(rough_start(0, SLOTS), CONFIG, EXTENT, VIEWS, **given)
-    with pytest.raises(InputError, match=r"expected .* \(96,"):
-        load_state(path, other)
-    path.write_bytes(path.read_bytes()[:1000])
-    for bad, like in ((path, template), (tmp_path / "none.npz", template)):
-        with pytest.raises(InputError, match=bad.name):
-            load_state(bad, like)
-    with pytest.raises(InputError, match="none"):
-        save_state(tmp_path / "none" / "state.npz", state)
+    added = jnp.mean(gsjax.render(state.gaussians, camera, RASTER).depth)
+    assert added > 0.1
+    for metrics, weight in zip(told, (0.0, 0.2, 0.3)):
+        np.testing.assert_allclose(metrics.loss, told[0].loss + weight * added, 1e-6)
+        np.testing.assert_allclose(metrics.psnr, told[0].psnr, 1e-12)
 
 
 def test_models_are_checked():
@@ -213,18 +190,6 @@ def test_models_are_checked():
     few = RIGID._replace(init=lambda _: ModelParams(slots={"offset": jnp.zeros(3)}))
     with pytest.raises(InputError, match="expected slots"):
         init_state(gaussians, CONFIG, EXTENT, VIEWS, model=few)
-
-
-def test_nothing_in_view_warns_once():
-    """Poses camera → world instead of world → camera."""
-    views = [replace(v, viewmat=np.linalg.inv(v.viewmat)) for v in dataset().views]
-    inverted = replace(dataset(), views=tuple(views))
-    state = init_state(rough_start(0, SLOTS), CONFIG, EXTENT, VIEWS)
-    stops = iter([False, False, True])
-    hooks = Hooks(stop=lambda: next(stops))
-    with pytest.warns(UserWarning, match="poses may be inverted") as told:
-        fit(inverted, photos(), CONFIG, state=state, hooks=hooks)
-    assert len(told) == 1
 
 
 def test_settings_of_a_preset():

@@ -1,9 +1,9 @@
 """Laws of the training step: pure, guarded, with correct gradients.
 
-Two programs are compiled: "plain" (adaptive, photographs with an alpha channel over
-random backgrounds, no threshold within reach) and "tuned" (MCMC, two views a step,
-padding, corrections of all kinds). The Gaussians of the latter have rates of zero, so
-that only the corrections move.
+Two steps are compiled, by their stages: "plain" (adaptive, photographs with an alpha
+channel over random backgrounds, no threshold within reach) and "tuned" (MCMC, two views
+a step, padding, corrections of all kinds). The Gaussians of the latter have rates of
+zero, so that only the corrections move.
 """
 
 from dataclasses import replace
@@ -33,14 +33,14 @@ from training import (
 import gsjax
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
+from gsjax.densify.types import Observation
 from gsjax.math.sh import num_bases
 from gsjax.train.camera_refinement import refine_camera
 from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Batch, draw, make_frames, targets, views_of_step
 from gsjax.train.losses import photometric
 from gsjax.train.optimiser import Rates
-from gsjax.train.setup import make_setup
-from gsjax.train.state import init_state
+from gsjax.train.state import init_state, make_setup
 from gsjax.train.step import background_of, make_stages, make_train_step
 
 SLOTS = 96
@@ -49,6 +49,7 @@ PLAIN = TrainConfig(
     sh_degree=2,
     sh_every=3,
     background="random",
+    exposure=True,
     adaptive=AdaptiveSettings(start=0, every=2, threshold=1e-9, clone_below=0.05),
     raster=SMOOTH,
 )
@@ -68,8 +69,26 @@ TUNED = TrainConfig(
     raster=RASTER.replace(pair_capacity=512),
 )
 
-plain_step = jax.jit(make_train_step(PLAIN, EXTENT), donate_argnums=0)
-tuned_step = jax.jit(make_train_step(TUNED, EXTENT))
+
+def by_stages(config):
+    """Return the compiled differentiation, and the step; it donates the state."""
+    differentiate, *rest = make_stages(make_setup(config, EXTENT))
+    differentiate = jax.jit(differentiate)
+    advance, edit = (jax.jit(stage, donate_argnums=0) for stage in rest)
+
+    def step(state, batch):
+        state, metrics, due = advance(state, differentiate(state, batch))
+        return edit(state, metrics) if due else (state, metrics)
+
+    return differentiate, advance, step
+
+
+plain_gradients, plain_advance, plain_step = by_stages(PLAIN)
+tuned_gradients, _, donating_step = by_stages(TUNED)
+
+
+def tuned_step(state, batch):
+    return donating_step(copy(state), batch)
 
 
 @cache
@@ -114,21 +133,16 @@ def test_the_step_is_pure():
 def test_the_state_can_be_donated():
     """It holds no buffer twice."""
     state = plain_state()
-    after, metrics = plain_step(state, plain_batch())
+    plain_step(state, plain_batch())
     assert state.gaussians.params.means.is_deleted()
-    jax.block_until_ready((after, metrics))
-    kinds = {
-        "refine_poses": True, "refine_intrinsics": True, "exposure": True
-    }  # fmt: skip
     for strategy in ("adaptive", "mcmc"):
-        config = PLAIN.replace(strategy=strategy, **kinds)
+        config = PLAIN.replace(
+            strategy=strategy, refine_poses=True, refine_intrinsics=True
+        )
         state = init_state(rough_start(2, SLOTS), config, EXTENT, VIEWS)
         arrays = jax.tree.leaves(replace(state, key=jax.random.key_data(state.key)))
-        pointers = [
-            (shard.device, shard.data.unsafe_buffer_pointer())
-            for array in arrays
-            for shard in array.addressable_shards
-        ]
+        shards = [s.data for array in arrays for s in array.addressable_shards]
+        pointers = [(s.device, s.unsafe_buffer_pointer()) for s in shards]
         assert len(set(pointers)) == len(pointers)
 
 
@@ -145,21 +159,23 @@ def test_sh_degrees_are_enabled_one_by_one():
     assert bands == num_bases(PLAIN.sh_degree)
 
 
-def test_vmap_and_scan_equal_the_loop():
-    steps = 3
+def test_the_stages_compose_to_the_step():
+    """Which scan and vmap take too; over two edits."""
+    steps = 5
     starts = [plain_state(seed) for seed in (3, 4)]
-    batches = jax.tree.map(
-        lambda *a: jnp.stack(a), *(plain_batch(step) for step in range(steps))
+    batches, seeds = (
+        jax.tree.map(lambda *a: jnp.stack(a), *trees)
+        for trees in (map(plain_batch, range(steps)), starts)
     )
     step = make_train_step(PLAIN, EXTENT)
-    seeds = jax.tree.map(lambda *a: jnp.stack(a), *starts)
-    mapped = jax.vmap(lambda state: jax.lax.scan(step, state, batches))
-    both = jax.jit(mapped)(seeds)
+    both = jax.jit(jax.vmap(lambda state: jax.lax.scan(step, state, batches)))(seeds)
     means = []
     for index, start in enumerate(starts):
         wanted, told = run_plain(start, steps)
         found, metrics = jax.tree.map(lambda a, i=index: a[i], both)
         np.testing.assert_array_equal(found.gaussians.active, wanted.gaussians.active)
+        np.testing.assert_array_equal(metrics.wanted, [m.wanted for m in told])
+        assert (metrics.wanted > 0).sum() == 2
         for a, b in zip(
             jax.tree.leaves((found.gaussians.params, found.moments, found.stats)),
             jax.tree.leaves((wanted.gaussians.params, wanted.moments, wanted.stats)),
@@ -169,6 +185,20 @@ def test_vmap_and_scan_equal_the_loop():
         np.testing.assert_allclose(metrics.loss, [m.loss for m in told], rtol=1e-6)
         means.append(np.asarray(found.gaussians.params.means))
     assert np.abs(means[0] - means[1]).max() > 0.01  # splits draw from the seed
+
+
+def test_no_edit_is_due_after_a_step_that_does_not_count():
+    state = plain_state().replace(step=jnp.int32(1))
+    found = plain_gradients(state, plain_batch())
+    for changes, due, moved in (
+        ({}, True, None),
+        ({"loss": jnp.asarray(jnp.nan)}, False, [".step"]),
+        ({"overflowed": jnp.asarray(True)}, False, []),
+    ):
+        after, metrics, edit = plain_advance(copy(state), found._replace(**changes))
+        assert bool(edit) == due
+        assert moved is None or changed(state, after) == moved
+        assert bool(metrics.finite) == ("loss" not in changes)
 
 
 def test_a_non_finite_loss_changes_only_the_step():
@@ -190,14 +220,11 @@ def test_numbers_that_would_become_non_finite_are_kept():
     means = adam.mu.gaussians.means.at[:7, 1].set(1e308)
     gaussians = adam.mu.gaussians.replace(means=means)
     adam = adam._replace(mu=adam.mu._replace(gaussians=gaussians))
-    moments = (adam, *rest)
-    after, told = plain_step(copy(start.replace(moments=moments)), plain_batch())
+    after, (told,) = run_plain(start.replace(moments=(adam, *rest)), 1)
     assert not told.finite
     assert int(told.step) == 1
-    wanted, _ = run_plain(start, 1)
-    before, found, wanted = (
-        np.asarray(s.gaussians.params.means) for s in (start, after, wanted)
-    )
+    states = start, after, run_plain(start, 1)[0]
+    before, found, wanted = (np.asarray(s.gaussians.params.means) for s in states)
     np.testing.assert_array_equal(found[:7, 1], before[:7, 1])
     kept = np.zeros_like(before, bool)
     kept[:7, 1] = True
@@ -263,7 +290,8 @@ def tuned_batch(index=(0, 2), gain=1.0, viewmats=None, K=None, seed=None):
         width=WIDTH,
         height=HEIGHT,
     )
-    return Batch(*map(jnp.asarray, (pixels, valid)), camera, jnp.asarray(index))
+    size = jnp.full((2, 2), jnp.asarray([WIDTH, HEIGHT], jnp.int32))
+    return Batch(*map(jnp.asarray, (pixels, valid)), camera, jnp.asarray(index), size)
 
 
 def tuned_state(gaussians=None):
@@ -280,6 +308,56 @@ def test_padding_has_no_effect():
     assert first[1].loss > 0.01
 
 
+@cache
+def alone_gradients():
+    return jax.jit(
+        make_stages(make_setup(TUNED.replace(skip_masked=False), EXTENT)).differentiate
+    )
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_padded_view_is_as_the_view_alone(masked, report):
+    """In its gradients and statistics; skipped tiles have no gradient."""
+    width, height = 20, 15
+    batch = tuned_batch(gain=0.7)
+    rows, columns = np.arange(HEIGHT)[:, None] < height, np.arange(WIDTH) < width
+    valid = np.broadcast_to(rows & columns & (np.arange(WIDTH) < 14 + 9 * (not masked)),
+                            (2, HEIGHT, WIDTH))  # fmt: skip
+    size = jnp.full((2, 2), jnp.asarray([width, height], jnp.int32))
+    padded = batch._replace(valid=jnp.asarray(valid), size=size)
+    alone = batch._replace(
+        pixels=batch.pixels[:, :height, :width],
+        valid=padded.valid[:, :height, :width],
+        camera=batch.camera.replace(width=width, height=height),
+        size=None,
+    )
+    gaussians = exact_gaussians()
+    params = gaussians.params.replace(log_scales=gaussians.params.log_scales - 0.5)
+    state = tuned_state(gaussians.replace(params=params))
+    found, wanted = tuned_gradients(state, padded), alone_gradients()(state, alone)
+    assert masked == (int(found.pairs) < 0.9 * int(wanted.pairs))
+    worst = abs(float(found.loss / wanted.loss) - 1)
+    for name in ("by_slots", "by_shared", "by_probe"):
+        trees = getattr(found, name), getattr(wanted, name)
+        for a, b in zip(*map(jax.tree.leaves, trees), strict=True):
+            scale = float(jnp.abs(b).max()) or 1.0
+            worst = max(worst, float(jnp.abs(a - b).max()) / scale)
+    report(f"padded view, masked {masked}", worst, 1e-10)
+    assert worst < 1e-10
+    if not masked:
+        strategy = PLAIN.make_strategy(EXTENT)
+        stats = [
+            strategy.observe(
+                strategy.init(gaussians), Observation(g.by_probe, g.radii, *g.size.T)
+            )
+            for g in (found, wanted)
+        ]
+        assert (stats[1].gradient > 1e-4).sum() > 15
+        assert 0 < (stats[1].views == 0).sum() < 30
+        for a, b in zip(*stats):
+            np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-12)
+
+
 def test_the_first_step_of_each_correction_is_its_rate():
     start = tuned_state()
     after, metrics = tuned_step(start, tuned_batch(gain=0.7))
@@ -293,50 +371,43 @@ def test_the_first_step_of_each_correction_is_its_rate():
     np.testing.assert_allclose(np.abs(after.refinement.intrinsics), 1e-3, rtol=1e-3)
 
 
-def projected(viewmat, K):
-    at = dataset().points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    return at[:, :2] / at[:, 2:] * np.diag(K)[:2] + K[:2, 2]
+def off_by(state, batch):
+    """Return the RMS reprojection error of the points in px."""
+    camera = refine_camera(batch.camera, state.refinement, batch.view, EXTENT)
 
+    def project(viewmat, K):
+        at = dataset().points @ viewmat[:3, :3].T + viewmat[:3, 3]
+        return at[:, :2] / at[:, 2:] * np.diag(K)[:2] + K[:2, 2]
 
-def off_by(start, batch):
-    """Return the RMS reprojection error in px."""
-    camera = refine_camera(batch.camera, start.refinement, batch.view, EXTENT)
-    errors = []
-    for at, index in enumerate(batch.view):
-        view = dataset().views[int(index)]
-        found = projected(np.asarray(camera.viewmat[at]), np.asarray(camera.K[at]))
-        errors.append(found - projected(view.viewmat, view.K))
+    views = [dataset().views[int(i)] for i in batch.view]
+    found = map(project, np.asarray(camera.viewmat), np.asarray(camera.K))
+    errors = [at - project(v.viewmat, v.K) for at, v in zip(found, views)]
     return np.sqrt(np.mean(np.square(errors)))
 
 
 @pytest.mark.parametrize("wrong", ["poses", "intrinsics", "exposures"])
 def test_corrections_reduce_the_error(wrong, report):
-    rng = np.random.default_rng(0)
-    viewmats, K, gain = [dataset().views[i].viewmat for i in (0, 2)], None, 1.0
+    viewmats = np.stack([dataset().views[i].viewmat for i in (0, 2)])
+    K, gain = np.array(dataset().views[0].K), 1.0
     if wrong == "poses":
-        moved = []
-        for viewmat in viewmats:
-            matrix, _ = np.linalg.qr(np.eye(3) + 0.02 * rng.normal(size=(3, 3)))
-            error = np.eye(4)
-            error[:3, :3] = matrix * np.sign(np.diag(matrix))
-            error[:3, 3] = 0.03 * rng.normal(size=3)
-            moved.append(error @ viewmat)
-        viewmats = moved
+        turn, _ = np.linalg.qr(np.eye(3) + [[0, 0.03, -0.02], [0, 0, 0.03], [0, 0, 0]])
+        viewmats[:, :3] = turn * np.sign(np.diag(turn)) @ viewmats[:, :3]
+        viewmats[:, :3, 3] += [0.03, -0.02, 0.04]
     elif wrong == "intrinsics":
-        K = dataset().views[0].K * [[1.06, 1, 1], [1, 0.95, 1], [1, 1, 1]]
+        K = K * [[1.06, 1, 1], [1, 0.95, 1], [1, 1, 1]]
         K[0, 2] += 0.5
     else:
         gain = 0.7
     batch = tuned_batch(gain=gain, viewmats=viewmats, K=K)
     state = tuned_state()
-    before, told = off_by(state, batch), []
+    before, losses = off_by(state, batch), []
     for _ in range(90):
-        state, metrics = tuned_step(state, batch)
-        told.append(metrics)
-    assert not any(m.overflowed for m in told)
-    losses = np.asarray([m.loss for m in told])
-    report(f"{wrong}, loss left", losses[-5:].mean() / losses[0], 0.4)
-    assert losses[-5:].mean() < 0.4 * losses[0]
+        state, metrics = donating_step(state, batch)
+        assert not metrics.overflowed
+        losses.append(float(metrics.loss))
+    left = np.mean(losses[-5:]) / losses[0]
+    report(f"{wrong}, loss left", left, 0.4)
+    assert left < 0.4
     if wrong == "exposures":
         affine = np.asarray(state.refinement.exposures)[[0, 2]]
         shown = affine[..., :3] @ np.full(3, 0.5) + 0.5 + affine[..., 3]
@@ -350,8 +421,7 @@ def test_corrections_reduce_the_error(wrong, report):
 
 def test_the_background_has_no_exposure():
     """If photograph and scene are empty, the loss and its gradient are zero."""
-    config = PLAIN.replace(exposure=True, ssim_weight=0.0)
-    state = init_state(rough_start(2, SLOTS), config, EXTENT, VIEWS)
+    state = plain_state()
     nothing = state.gaussians.replace(active=jnp.zeros(SLOTS, bool))
     rng = np.random.default_rng(0)
     exposures = 0.3 * jnp.asarray(rng.normal(size=(VIEWS, 3, 4)))
@@ -360,12 +430,10 @@ def test_the_background_has_no_exposure():
     )
     batch = plain_batch()
     empty = batch._replace(pixels=batch.pixels.at[..., 3].set(0))
-    differentiate = jax.jit(make_stages(make_setup(config, EXTENT)).differentiate)
-    found = differentiate(state, empty)
-    assert float(found.loss) < 1e-12
-    by = found.by_shared.refinement.exposures
-    assert float(jnp.abs(by).max()) == 0
-    assert float(differentiate(state, batch).loss) > 0.01
+    found = plain_gradients(state, empty)
+    assert abs(float(found.loss)) < 1e-12
+    assert float(jnp.abs(found.by_shared.refinement.exposures).max()) < 1e-12
+    assert float(plain_gradients(state, batch).loss) > 0.01
 
 
 def test_an_overflow_changes_nothing():
@@ -382,27 +450,22 @@ def test_an_overflow_changes_nothing():
 
 def test_targets():
     pixels = np.random.default_rng(0).integers(0, 256, (2, 3, 4, 4)).astype(np.uint8)
-    behind = jnp.asarray([0.1, 0.5, 0.9])
-    batch = tuned_batch()._replace(
-        pixels=jnp.asarray(pixels), valid=None, background=behind
-    )
+    behind, valid = jnp.asarray([0.1, 0.5, 0.9]), pixels[..., 0] > 99
+    batch = tuned_batch()._replace(pixels=pixels, valid=valid, background=behind)
     found, weight = targets(batch, jnp.float64)
     rgb, alpha = pixels[..., :3] / 255, pixels[..., 3:] / 255
     np.testing.assert_allclose(found, rgb * alpha + behind * (1 - alpha), rtol=1e-12)
+    np.testing.assert_array_equal(weight, valid.astype(float))
+    opaque = batch._replace(pixels=pixels[..., :3], valid=None)
+    found, weight = targets(opaque, jnp.float64)
+    np.testing.assert_allclose(found, rgb)
     assert weight is None
-    opaque = batch._replace(pixels=jnp.asarray(pixels[..., :3]))
-    np.testing.assert_allclose(targets(opaque, jnp.float64)[0], rgb)
-    valid = pixels[..., 0] > 99
-    _, weight = targets(batch._replace(valid=jnp.asarray(valid)), jnp.float32)
-    np.testing.assert_array_equal(weight, valid.astype(np.float32))
 
 
 @pytest.mark.parametrize("strategy", ["adaptive", "mcmc"])
-@pytest.mark.parametrize("absgrad", [False, True])
-def test_dtypes_are_kept(strategy, absgrad):
-    config = PLAIN.replace(
-        strategy=strategy, adaptive=replace(PLAIN.adaptive, absgrad=absgrad)
-    )
+def test_dtypes_are_kept(strategy):
+    settings = replace(PLAIN.adaptive, absgrad=True)
+    config = PLAIN.replace(strategy=strategy, adaptive=settings)
     for dtype in (jnp.float32, jnp.float64):
         gaussians = cast(rough_start(2, SLOTS), dtype)
         state = init_state(gaussians, config, EXTENT, VIEWS)
