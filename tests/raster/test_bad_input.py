@@ -226,10 +226,8 @@ def test_gaussians_at_the_camera_far_from_the_origin_stay_finite():
     viewmat = np.array(camera.viewmat)
     centre = 3e5 * np.asarray([1.0, -0.7, 0.4])
     rng = np.random.default_rng(0)
-    seen = np.stack(
-        [*(0.01 * rng.normal(size=(2, COUNT))), rng.uniform(0, 0.05, COUNT)]
-    )
-    means = (centre + seen.T @ viewmat[:3, :3]).astype(np.float32)
+    seen = [*(0.01 * rng.normal(size=(2, COUNT))), rng.uniform(0, 0.05, COUNT)]
+    means = (centre + np.transpose(seen) @ viewmat[:3, :3]).astype(np.float32)
     viewmat[:3, 3] = -viewmat[:3, :3] @ centre
     row = viewmat[2]
     true = means.astype(float) @ row[:3].astype(float) + float(row[3])

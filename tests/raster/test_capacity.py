@@ -102,7 +102,7 @@ def test_counts_past_32_bits_do_not_wrap():
         tiles_per_step=1024,
         pair_capacity=8192,
     )
-    out = render(*cast((scene, camera), jnp.float32), config)
+    out = gsjax.render(*cast((scene, camera), jnp.float32), config)
     assert out.overflowed
     assert out.demand.pairs == out.demand.capacity == 2**31 - 1
     with pytest.raises(CapacityError, match="2,147,483,647 or more"):

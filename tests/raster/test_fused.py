@@ -215,7 +215,7 @@ def test_one_kernel_wherever_it_suits(reverse, dtype):
 
         program = jax.jit(run).lower(tiles, kept, cotangent).compile().as_text()
         assert "xla_cpu_small_call" in program
-        assert not loops.has_loop_by_turns(program)
+        assert not loops.has_interpreted_loop(program)
 
 
 def test_tasks_that_do_not_suit():
@@ -223,13 +223,9 @@ def test_tasks_that_do_not_suit():
     assert not fused.suits(task_of(config, "float32", make_grid(24, 24, 4, 1)))
     assert not fused.suits(task_of(config, "float32", colors=200))
     assert not fused.suits(task_of(config, "float64", make_grid(64, 64, 32, 1)))
-    for changes, suits in (
-        ({}, True),
-        ({"absgrad": True}, False),
-        ({"outputs": ALL}, False),
-    ):
-        task = task_of(config.replace(**changes), "float32")
-        assert fused_vjp.suits(task) == suits
+    assert fused_vjp.suits(task_of(config, "float32"))
+    for changes in ({"absgrad": True}, {"outputs": ALL}):
+        assert not fused_vjp.suits(task_of(config.replace(**changes), "float32"))
 
 
 CHOICE = """

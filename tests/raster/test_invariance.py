@@ -44,9 +44,8 @@ pytestmark = [on_cpu, pytest.mark.as_users]
 def test_settings_and_slots_are_bit_equal(changes):
     """Also with empty slots, whose number no two devices can share equally."""
     for kind in KINDS:
-        gaussians, camera = scene_of(kind)
-        wanted = images(gaussians, camera)
-        grown = gsjax.grow(gaussians, COUNT + 9)
+        scene, camera = scene_of(kind)
+        wanted, grown = images(scene, camera), gsjax.grow(scene, COUNT + 9)
         out = images(grown, camera, WHOLE.replace(**changes))
         assert_same(out, wanted)
         np.testing.assert_array_equal(out.radii[:COUNT], wanted.radii)

@@ -47,7 +47,7 @@ def lists_of(kind, tile, stride=1, device=0, **options):
 
 
 def listed_pairs(grid, lists) -> np.ndarray:
-    """[T, R] bool, from the sorted lists."""
+    """Return [T, R] bool from the sorted lists."""
     out = np.zeros((grid.tiles, COUNT), bool)
     ends = np.cumsum(lists.length)
     for tile, (end, length) in enumerate(zip(ends, lists.length)):
@@ -58,7 +58,7 @@ def listed_pairs(grid, lists) -> np.ndarray:
 
 
 def touched_pairs(grid, projected, device: int = 0) -> np.ndarray:
-    """[T, R] bool, by evaluating Q at every pixel."""
+    """Return [T, R] bool by evaluating Q at every pixel."""
     ys, xs = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     splat, reach = projected.splat, projected.footprint.reach
     u, v, sx, slope, sy, _, reach = (
@@ -171,8 +171,7 @@ def test_devices_share_the_rows():
 def test_pairs_and_steps_have_matching_capacities(group, chunk):
     """The pair capacity for so many steps holds them, and a smaller one does not."""
     grid = binning.make_grid(800, 600, 8, 1)
-    steps = np.unique(np.geomspace(1, 5000, 20).astype(int))
-    for wanted in steps:
+    for wanted in np.unique(np.geomspace(1, 5000, 20).astype(int)):
         count = jnp.int32(wanted)
         pairs = int(schedules.pairs_for_steps(count, grid, group, chunk))
         assert schedules.step_capacity(pairs, grid, group, chunk) >= wanted
