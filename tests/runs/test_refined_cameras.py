@@ -26,11 +26,8 @@ def learnt() -> CameraRefinement:
     """Return float32 corrections of three views."""
     rng = np.random.default_rng(0)
     turns, shifts = rng.normal(scale=0.02, size=(2, len(TRAINED), 3))
-    intrinsics = rng.normal(scale=0.02, size=4)
-    return jax.tree.map(
-        lambda a: jnp.asarray(a, jnp.float32),
-        CameraRefinement(turns, shifts, intrinsics, None),
-    )
+    found = CameraRefinement(turns, shifts, rng.normal(scale=0.02, size=4), None)
+    return jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), found)
 
 
 def test_no_correction_changes_nothing():
@@ -47,12 +44,10 @@ def test_cameras_are_those_of_the_training_steps():
     found = refine_dataset(dataset, TRAINED, refinement, EXTENT)
     for row, index in enumerate(TRAINED):
         view = dataset.views[index]
-        camera = make_camera(
-            viewmat=view.viewmat[None],
-            K=view.K[None],
-            width=view.width + 7,  # padded, beside larger ones in a batch
-            height=view.height + 20,
-        )
+        # Padded, beside larger ones in a batch.
+        width, height = view.width + 7, view.height + 20
+        pose, K = view.viewmat[None], view.K[None]
+        camera = make_camera(viewmat=pose, K=K, width=width, height=height)
         wanted = refine_camera(camera, refinement, jnp.asarray([row]), EXTENT)
         refined = found.views[index]
         np.testing.assert_allclose(refined.viewmat, wanted.viewmat[0], atol=1e-6)

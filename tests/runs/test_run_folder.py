@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from hostile import HOSTILE, escape_controls, write_hostile
+from hostile import HOSTILE, harmless, write_hostile
 
 import gsjax
 from gsjax.cli.main import main
@@ -20,18 +20,12 @@ from gsjax.data.dataset import load_dataset
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import InputError
 from gsjax.raster.types import RasterConfig
+from gsjax.runs import folder as run_folder
 from gsjax.runs import initialisation
 from gsjax.runs import run as run_module
 from gsjax.runs.config_json import config_from_json
 from gsjax.runs.evaluation import evaluate_run
-from gsjax.runs.folder import (
-    RunSettings,
-    load_settings,
-    load_split,
-    run_files,
-    save_settings,
-    with_views,
-)
+from gsjax.runs.folder import RunSettings, load_settings, load_split
 from gsjax.runs.history import read_metrics
 from gsjax.runs.run import RunResult, resume_run, start_run
 from gsjax.runs.scene_source import open_scene_source
@@ -54,7 +48,7 @@ CONFIG = TrainConfig(
 def whole(tmp_path_factory) -> Path:
     """Return a folder with a dataset and a finished run, which no test changes."""
     folder = tmp_path_factory.mktemp("whole")
-    data = write_hostile(folder / "data", escape_controls())
+    data = write_hostile(folder / "data", harmless())
     assert start_run(RunSettings(data, CONFIG), folder / "run").finished
     return folder
 
@@ -76,16 +70,26 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {p: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-# --- replaced ---
+def train(dataset: Path, run: Path, *words) -> int:
+    """Run the command line, and return its exit code."""
+    return main(["train", *map(str, (dataset, "-o", run, *words))])
 
 
-@pytest.mark.parametrize("config", ['{"my": "app"}', None])
-def test_only_a_run_is_replaced(whole, tmp_path, config):
+def repeat(run: Path) -> None:
+    """Resume a run as if killed before its first checkpoint; the bits are equal."""
+    before = (run / "splat.ply").read_bytes()
+    shutil.rmtree(run / "checkpoints")
+    (run / "splat.ply").unlink()
+    assert resume_run(run).finished
+    assert (run / "splat.ply").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["config.json", "other.json"])
+def test_only_a_run_is_replaced(whole, tmp_path, name):
     folder = tmp_path / "mine"
     (folder / "renders" / "precious").mkdir(parents=True)
     (folder / "renders" / "precious" / "a.blend").write_text("mine")
-    if config is not None:
-        (folder / "config.json").write_text(config)
+    (folder / name).write_text('{"my": "app"}')
     before = contents(folder)
     with pytest.raises(InputError, match=r"config\.json"):
         start_run(RunSettings(whole / "data", CONFIG), folder, overwrite=True)
@@ -105,11 +109,11 @@ def test_a_run_is_replaced_only_when_the_next_can_start(made, tmp_path, monkeypa
                 start_run(points, folder, overwrite=True)
     assert contents(run) == before
     assert not (tmp_path / "new").exists()
+
+    def refused(_):
+        raise PermissionError(13, "Permission denied")
+
     with monkeypatch.context() as patch:
-
-        def refused(_):
-            raise PermissionError(13, "Permission denied")
-
         patch.setattr(shutil, "rmtree", refused)
         with pytest.raises(InputError, match="checkpoints: cannot be removed: Permis"):
             start_run(RunSettings(made / "data", CONFIG), run, overwrite=True)
@@ -131,22 +135,19 @@ def test_a_run_is_replaced_only_when_the_next_can_start(made, tmp_path, monkeypa
 def test_one_training_at_a_time_in_a_folder(made):
     before, settings = contents(made / "run"), RunSettings(made / "data", CONFIG)
     with locked_folder(made / "run"):
-        for begin in (
-            lambda: start_run(settings, made / "run", overwrite=True),
-            lambda: resume_run(made / "run"),
-        ):
-            with pytest.raises(InputError, match="another"):
-                begin()
-            assert contents(made / "run") == before
+        with pytest.raises(InputError, match="another"):
+            start_run(settings, made / "run", overwrite=True)
+        with pytest.raises(InputError, match="another"):
+            resume_run(made / "run")
+    assert contents(made / "run") == before
     program = (
         "import sys, time, pathlib\nfrom gsjax.runtime.files import locked_folder\n"
-        "with locked_folder(pathlib.Path(sys.argv[1])):\n"
-        "    print('held', flush=True)\n    time.sleep(600)\n"
     )
+    program += "with locked_folder(pathlib.Path(sys.argv[1])):\n"
+    program += "    print('held', flush=True), time.sleep(600)"
     arguments = [sys.executable, "-c", program, str(made)]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE) as other:
         try:
-            assert other.stdout is not None
             assert other.stdout.readline() == b"held\n"
             with pytest.raises(InputError, match="another"), locked_folder(made):
                 pass
@@ -154,9 +155,6 @@ def test_one_training_at_a_time_in_a_folder(made):
             other.kill()
     with locked_folder(made):  # a killed process holds nothing
         pass
-
-
-# --- resumed ---
 
 
 @pytest.fixture(scope="module")
@@ -202,26 +200,18 @@ def test_each_step_is_logged_once(killed, tmp_path, name, capsys, monkeypatch):
             assert steps_of(run / log) == [1, 2, 3, 4]
 
 
-@pytest.mark.parametrize("again", ["resumed", "replaced"])
-def test_leftovers_of_killed_processes_are_removed(made, again):
+def test_leftovers_of_killed_processes_are_removed(made):
     """Newer ones may be another process's."""
     run = made / "run"
-    folders = (run, run / "checkpoints") if again == "resumed" else (run,)
-    for folder in folders:
+    for folder in (folders := (run, run / "checkpoints")):
         for name, seconds in ((".gsjax-0f.tmp", 1), (".gsjax-1f.tmp", 2**32), ("a", 1)):
             (folder / name).write_bytes(b"half")
             os.utime(folder / name, (seconds, seconds))
-    if again == "resumed":
-        assert resume_run(run).finished
-    else:
-        start_run(RunSettings(made / "data", CONFIG), run, overwrite=True)
+    assert resume_run(run).finished
     for folder in folders:
-        assert not (folder / ".gsjax-0f.tmp").exists()
-        assert (folder / ".gsjax-1f.tmp").exists()
-        assert (folder / "a").exists()
-
-
-# --- initialised ---
+        names = {path.name for path in folder.iterdir()}
+        assert ".gsjax-0f.tmp" not in names
+        assert {".gsjax-1f.tmp", "a"} <= names
 
 
 def test_a_dataset_without_points_starts_at_random(whole, tmp_path, capsys):
@@ -233,13 +223,10 @@ def test_a_dataset_without_points_starts_at_random(whole, tmp_path, capsys):
     assert start_run(RunSettings(data, config), run).finished
     assert "no points: initialising at random" in capsys.readouterr().err
     assert load_settings(run).config == config.replace(initial="random")
-    splat = (run / "splat.ply").read_bytes()
-    shutil.rmtree(run / "checkpoints")
     shutil.rmtree(data)
-    write_hostile(data, replace(bare, scene=escape_controls().scene))
+    write_hostile(data, replace(bare, dataset=harmless().dataset))
     capsys.readouterr()
-    assert resume_run(run).finished
-    assert (run / "splat.ply").read_bytes() == splat
+    repeat(run)
     assert "--initial" not in capsys.readouterr().err
 
 
@@ -257,10 +244,8 @@ def test_initial_gaussians_are_kept_bit_by_bit(whole, degree):
     assert int(state.step) == 0
     active = np.asarray(state.gaussians.active)
     assert active.sum() == keep.sum() > 0
-    for ours, theirs in zip(
-        jax.tree.leaves(state.gaussians.params), jax.tree.leaves(wanted.params)
-    ):
-        np.testing.assert_array_equal(ours[active], theirs)
+    ours = jax.tree.map(lambda leaf: leaf[active], state.gaussians.params)
+    jax.tree.map(np.testing.assert_array_equal, ours, wanted.params)
     few = replace(config.mcmc, max_gaussians=given.capacity - 1)
     for count in (0, given.capacity):
         some = gsjax.select(given, np.arange(given.capacity) < count)
@@ -281,11 +266,7 @@ def test_a_run_starts_from_a_scene(made, capsys):
     begun, *_, last = read_metrics(made / "run" / "metrics.jsonl")
     assert first["loss"] < begun["loss"]
     assert first["gaussians"] == last["gaussians"]
-    before = (run / "splat.ply").read_bytes()
-    shutil.rmtree(run / "checkpoints")
-    (run / "splat.ply").unlink()
-    assert resume_run(run).finished
-    assert (run / "splat.ply").read_bytes() == before
+    repeat(run)
     shutil.rmtree(run / "checkpoints")
     splat.unlink()
     with pytest.raises(InputError, match=r"splat\.ply"):
@@ -305,26 +286,23 @@ def test_a_scene_of_another_dataset_is_rejected(made, tmp_path, monkeypatch, cap
     far = given.replace(params=given.params.replace(means=means))
     gsjax.save(tmp_path / "far.ply", far)
     gsjax.save(tmp_path / "bands.ply", gsjax.with_sh_degree(given, 2))
-    args = ["train", str(made / "data"), "-o", str(tmp_path / "new"), "--initial"]
-    few = ["--max-gaussians", str(count - 1)]
-    for options, message in (
-        ([str(tmp_path / "far.ply")], "in any of 2 views"),
-        ([str(made / "run"), *few], f"1 to {count - 1}"),
-        (
-            [str(tmp_path / "bands.ply"), *few, "--sh-degree", "1"],
-            "SH degree 2 is reduced to 1 (--sh-degree)",
-        ),
+    few = ["--max-gaussians", count - 1]
+    reduced = "SH degree 2 is reduced to 1 (--sh-degree)"
+    for scene, options, message in (
+        (tmp_path / "far.ply", [], "in any of 2 views"),
+        (made / "run", few, f"1 to {count - 1}"),
+        (tmp_path / "bands.ply", [*few, "--sh-degree", 1], reduced),
     ):
-        assert main([*args, *options]) == 3
+        words = ("--initial", scene, *options)
+        assert train(made / "data", tmp_path / "new", *words) == 3
         assert message in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
 def test_a_trained_scene_is_used_in_full_from_the_first_step():
     config = preset("default")
-    assert config.divisor(0) > 1
     changed = continuation_config(config)
-    assert changed.divisor(0) == 1
+    assert config.divisor(0) > changed.divisor(0) == 1
     assert changed == config.replace(sh_every=1, levels=(Level(0.0, 1),))
 
 
@@ -340,22 +318,14 @@ def test_dense_initialisation_counts_as_training(whole, tmp_path, monkeypatch, c
         return replace(dataset, points=points, colors=colors)
 
     monkeypatch.setattr(initialisation, "add_dense_points", found)
-    settings = RunSettings(whole / "data", CONFIG.replace(initial="dense"))
-    start_run(settings, tmp_path / "run")
+    run = tmp_path / "run"
+    start_run(RunSettings(whole / "data", CONFIG.replace(initial="dense")), run)
     assert "7 points added in " in capsys.readouterr().err
-    files = run_files(tmp_path / "run")
-    first, *_ = read_metrics(files.metrics)
+    first, *_ = read_metrics(run / "metrics.jsonl")
     assert first["seconds"] > first["compile_seconds"] + 0.5
-    scene = files.splat.read_bytes()
-    shutil.rmtree(files.checkpoints)
-    files.splat.unlink()
-    assert load_settings(tmp_path / "run").config.initial == "dense"
-    resume_run(tmp_path / "run")
+    assert load_settings(run).config.initial == "dense"
+    repeat(run)
     assert "7 points added in " in capsys.readouterr().err
-    assert files.splat.read_bytes() == scene
-
-
-# --- its dataset ---
 
 
 def test_a_dataset_with_other_views_is_rejected(made):
@@ -382,11 +352,10 @@ def test_the_split_of_a_run_is_fixed(made):
         change(config, held_out=[], trained=["0.png", "1.png", "2.png"])
         assert load_split(load_settings(made / "run")).test == []
     # Older runs have no names, and 8 was the default.
+    data = json.loads(config.read_text())
+    data = {k: v for k, v in data.items() if k not in ("trained", "held_out")}
     for every, wanted in ((8, None), (5, 5), (0, 0)):
-        change(config, every=every)
-        data = json.loads(config.read_text())
-        data = {k: v for k, v in data.items() if k not in ("trained", "held_out")}
-        config.write_text(json.dumps(data))
+        config.write_text(json.dumps({**data, "every": every}))
         assert load_settings(made / "run").every == wanted
 
 
@@ -396,7 +365,7 @@ def test_a_dataset_that_was_moved(made, capsys):
     with pytest.raises(InputError, match="train NEW_PLACE -o RUN --resume"):
         evaluate_run(run)
     before = contents(run)
-    assert main(["train", str(there), "-o", str(run), "--resume"]) == 0
+    assert train(there, run, "--resume") == 0
     notes = capsys.readouterr().err
     assert f"dataset is now {there}" in notes
     assert "finished before" in notes
@@ -406,11 +375,8 @@ def test_a_dataset_that_was_moved(made, capsys):
     evaluate_run(run)
     # If the old place exists, the new one is another dataset.
     shutil.copytree(there, made / "data")
-    assert main(["train", str(made / "data"), "-o", str(run), "--resume"]) == 2
+    assert train(made / "data", run, "--resume") == 2
     assert "was trained on" in capsys.readouterr().err
-
-
-# --- the command line ---
 
 
 @pytest.fixture
@@ -418,94 +384,93 @@ def started(monkeypatch):
     """Replace training; return the initial scenes of runs that were started."""
     scenes = []
 
-    def train(settings, folder, **_):
+    def start(settings, folder, **_):
         scenes.append(settings.start)
         folder.mkdir(exist_ok=True)
-        save_settings(folder, with_views(settings, load_split(settings)))
-        return RunResult(run_files(folder), False, 0, 0.0, 0, None)
+        settings = run_folder.with_views(settings, load_split(settings))
+        run_folder.save_settings(folder, settings)
+        return RunResult(run_folder.run_files(folder), False, 0, 0.0, 0, None)
 
     def resume(folder, **_):
-        return train(load_settings(folder), folder)
+        return start(load_settings(folder), folder)
 
-    monkeypatch.setattr(run_module, "start_run", train)
+    monkeypatch.setattr(run_module, "start_run", start)
     monkeypatch.setattr(run_module, "resume_run", resume)
     return scenes
 
 
 def test_a_run_is_resumed_with_its_own_options_only(made, started, capsys):
     """Options that are not given are those of the run."""
-    run = made / "again"
-    options = ["--preset", "fast", "--steps", "2", "--max-gaussians", "40"]
-    options += ["--antialias", "--test-images", "0.png"]
-    args = ["train", str(made / "data"), "-o", str(run)]
+    data, run = made / "data", made / "again"
+    options = "--preset fast --steps 2 --max-gaussians 40 --antialias --test-images"
+    options = [*options.split(), "0.png"]
     for more in (options, [*options, "--resume"], ["--resume"]):
-        assert main([*args, *more]) == 130
+        assert train(data, run, *more) == 130
     assert len(started) == 3
     for option in (["--seed", "1"], ["--initial", "random"]):
         capsys.readouterr()
-        assert main([*args, *option, "--resume"]) == 2
+        assert train(data, run, *option, "--resume") == 2
         assert f"leave out {option[0]}" in capsys.readouterr().err
     change(run / "config.json", every=8)
-    assert main([*args, *options, "--resume"]) == 130
-    train = json.loads((run / "config.json").read_text())["train"]
-    change(run / "config.json", train={**train, "initial": "dense"})
-    assert main([*args, *options, "--resume"]) == 130
-    assert main([*args, *options, "--resume", "--initial", "dense"]) == 130
-    assert main([*args, *options, "--resume", "--initial", "points"]) == 2
+    assert train(data, run, *options, "--resume") == 130
+    settings = json.loads((run / "config.json").read_text())["train"]
+    change(run / "config.json", train={**settings, "initial": "dense"})
+    for initial, code in (([], 130), (["dense"], 130), (["points"], 2)):
+        words = ["--initial"] * len(initial) + initial
+        assert train(data, run, *options, "--resume", *words) == code
 
 
 def test_an_initial_scene_is_named_by_its_run_or_file(made, started, capsys):
-    run = made / "next"
+    data, run = made / "data", made / "next"
     splat = (made / "run" / "splat.ply").resolve()
-    args = ["train", str(made / "data"), "-o", str(run), "--steps", "2"]
     (made / "other.ply").write_bytes(splat.read_bytes())
+
+    def start(*words):
+        return train(data, run, "--steps", 2, *words)
+
     for given in (made / "run", splat):
-        assert main([*args, "--initial", str(given)]) == 130
-        assert main([*args, "--initial", str(given), "--resume"]) == 130
-        assert main([*args, "--resume"]) == 130
+        assert start("--initial", given) == 130
+        assert start("--initial", given, "--resume") == start("--resume") == 130
         assert started == [splat] * 3
-        for other in ("dense", str(made / "other.ply")):
-            assert main([*args, "--initial", other, "--resume"]) == 2
+        for other in ("dense", made / "other.ply"):
+            assert start("--initial", other, "--resume") == 2
             assert "leave out --steps, --initial" in capsys.readouterr().err
         if given != splat:  # it may be gone when the run is resumed
             given.rename(made / "moved")
-            assert main([*args, "--initial", str(given), "--resume"]) == 130
+            assert start("--initial", given, "--resume") == 130
             (made / "moved").rename(given)
         started.clear()
         (run / "config.json").unlink()
     (made / "run" / "cameras.json").write_text("[]")
-    assert main([*args, "--initial", str(made / "run")]) == 130
+    assert start("--initial", made / "run") == 130
     assert "has refined cameras" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
-        (["--initial", "densely"], 2, "--initial: expected points, dense, random"),
-        (["--initial", "none.ply"], 3, "none.ply"),
-        (["--initial", "data"], 3, "is a dataset; train on it first"),
-        (["--initial", "run", "-o", "run", "--overwrite"], 2, "another folder with -o"),
-        (["--initial", "run", "--antialias"], 2, "leave out --antialias"),
-        (["--test-images", "0.png", "--test-every", "0"], 2, "exclude each other"),
-        (["--resume", "--overwrite"], 2, "exclude each other"),
+        ("--initial densely", 2, "--initial: expected points, dense, random"),
+        ("--initial none.ply", 3, "none.ply"),
+        ("--initial data", 3, "is a dataset; train on it first"),
+        ("--initial run -o run --overwrite", 2, "another folder with -o"),
+        ("--initial run --antialias", 2, "leave out --antialias"),
+        ("--test-images 0.png --test-every 0", 2, "exclude each other"),
     ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_invalid_options_of_train(options, code, message, whole, tmp_path, capsys):
     before = contents(whole)
-    paths = {name: str(whole / name) for name in ("data", "run")}
-    args = ["train", paths["data"], "-o", str(tmp_path / "new")]
-    assert main([*args, *(paths.get(word, word) for word in options)]) == code
+    paths = {name: whole / name for name in ("data", "run")}
+    words = [paths.get(word, word) for word in options.split()]
+    assert train(paths["data"], tmp_path / "new", *words) == code
     assert message in capsys.readouterr().err
     assert contents(whole) == before
     assert not (tmp_path / "new").exists()
 
 
 def test_evaluating_an_unfinished_run_is_reported(made, capsys):
-    config = json.loads((made / "run" / "config.json").read_text())
+    path = made / "run" / "config.json"
     for steps in (4, 8):
-        train = {**config["train"], "steps": steps}
-        change(made / "run" / "config.json", train=train)
+        change(path, train={**json.loads(path.read_text())["train"], "steps": steps})
         assert main(["eval", str(made / "run"), "--views", "train"]) == 0
         unfinished = "unfinished: step 4 of 8" in capsys.readouterr().err
         assert unfinished == (steps == 8)

@@ -13,12 +13,8 @@ from gsjax.data.photos import load_photo
 from gsjax.data.transforms import CameraEntry
 from gsjax.data.types import Dataset, View
 from gsjax.plots.contact_sheets import depth_colors
-from gsjax.runs.trajectories import (
-    CAMERA_PATHS,
-    depth_limits,
-    path_entries,
-    view_entries,
-)
+from gsjax.runs import trajectories
+from gsjax.runs.trajectories import CAMERA_PATHS, depth_limits, path_entries
 
 K = np.asarray([[90.0, 0, 49.5], [0, 91.0, 36.0], [0, 0, 1]])
 
@@ -39,24 +35,28 @@ def dataset(tmp_path) -> Dataset:
 
 @pytest.mark.parametrize("max_size", [None, 200, 33])
 def test_views_have_the_size_and_camera_of_their_photographs(dataset, max_size):
-    entries = view_entries(dataset.views, max_size=max_size)
+    entries = trajectories.view_entries(dataset.views, max_size=max_size)
     for view, (_, camera) in zip(dataset.views, entries, strict=True):
         photo = load_photo(view, max_size)
         assert photo.pixels.shape[:2] == (camera.height, camera.width)
         np.testing.assert_allclose(camera.K, photo.K, rtol=1e-6)
         np.testing.assert_allclose(camera.viewmat, view.viewmat, atol=1e-6)
     dataset.views[0].image.unlink()  # a missing photograph has the size of its camera
-    found = view_entries(dataset.views[:1], max_size=max_size)[0].camera
+    found = trajectories.view_entries(dataset.views[:1], max_size=max_size)[0].camera
     assert (found.width, found.height) == (camera.width, camera.height)
     np.testing.assert_array_equal(found.K, entries[0].camera.K)
 
 
 def test_names_are_relative_to_the_common_folder_and_unique(dataset):
-    assert [e.name for e in view_entries(dataset.views[:2])] == ["0", "1"]
-    assert [e.name for e in view_entries(dataset.views)] == ["a_0", "a_1", "b_0"]
+    assert [e.name for e in trajectories.view_entries(dataset.views[:2])] == ["0", "1"]
+    assert [e.name for e in trajectories.view_entries(dataset.views)] == [
+        "a_0",
+        "a_1",
+        "b_0",
+    ]
     for names in (("a/0.png", "a/0.jpg"), ("a/b_0.png", "a_b/0.png")):
         views = [replace(v, name=n) for v, n in zip(dataset.views, names)]
-        found = [e.name.casefold() for e in view_entries(views)]
+        found = [e.name.casefold() for e in trajectories.view_entries(views)]
         assert len(set(found)) == 2
 
 
@@ -76,11 +76,9 @@ def test_paths_have_frames_of_one_size_that_see_the_scene(dataset, path):
 def test_interpolation_follows_the_numbers_in_names(dataset):
     poses = []
     for form in ("left/IMG_{}.png", "left/IMG_{:03}.png"):
-        views = [
-            replace(view, name=form.format(number))
-            for view, number in zip(dataset.views, (10, 9, 100))
-        ]
-        views.sort(key=lambda view: view.name)
+        names = [form.format(number) for number in (10, 9, 100)]
+        views = [replace(v, name=name) for v, name in zip(dataset.views, names)]
+        views = sorted(views, key=lambda view: view.name)
         renamed = replace(dataset, views=tuple(views))
         entries = path_entries(renamed, CAMERA_PATHS["interpolate"], frames=4)
         poses.append(np.stack([entry.camera.viewmat for entry in entries]))
@@ -94,9 +92,8 @@ def test_an_orbit_beyond_the_cameras_is_warned_about(dataset, capsys):
     path_entries(dataset, orbit, frames=2)
     assert "warning: 245° of the orbit" in capsys.readouterr().err
     path_entries(dataset, CAMERA_PATHS["interpolate"], frames=2)
-    eyes = [(np.cos(angle), np.sin(angle), 1) for angle in (0, 1.5, 3, 4.5)]
-    view = dataset.views[0]
-    views = [replace(view, viewmat=look_at(eye, (0, 0, 0))) for eye in eyes]
+    poses = [look_at((np.cos(a), np.sin(a), 1), (0, 0, 0)) for a in (0, 1.5, 3, 4.5)]
+    views = [replace(dataset.views[0], viewmat=pose) for pose in poses]
     path_entries(replace(dataset, views=tuple(views)), orbit, frames=2)
     assert capsys.readouterr().err == ""
     bare = Dataset(Path(), "test", dataset.views)
@@ -106,9 +103,7 @@ def test_an_orbit_beyond_the_cameras_is_warned_about(dataset, capsys):
 
 
 def row_of_gaussians(x, z, unseen=()):
-    means = np.concatenate(
-        [np.column_stack([x, 0 * x, z]), np.reshape(unseen, (-1, 3))]
-    )
+    means = [*np.column_stack([x, 0 * x, z]), *unseen]
     return gsjax.make_gaussians(
         means=means,
         quats=np.tile([1.0, 0, 0, 0], (len(means), 1)),
@@ -122,13 +117,8 @@ def row_of_gaussians(x, z, unseen=()):
 @pytest.mark.parametrize(("lens", "focal"), [("pinhole", 90), ("orthographic", 25)])
 def test_depth_limits_are_those_of_the_image(lens, focal):
     gaussians = row_of_gaussians(np.linspace(-4, 4, 201), np.linspace(1, 5, 201))
-    camera = gsjax.make_camera(
-        viewmat=np.eye(4),
-        K=[[focal, 0, 59.5], [0, focal, 36], [0, 0, 1]],
-        width=101,
-        height=75,
-        lens=lens,
-    )
+    K = [[focal, 0, 59.5], [0, focal, 36], [0, 0, 1]]
+    camera = gsjax.make_camera(viewmat=np.eye(4), K=K, width=101, height=75, lens=lens)
     config = gsjax.RasterConfig(num_size_buckets=1, devices=1, occlusion=False)
     depth = np.asarray(gsjax.render_exact(gaussians, camera, config).depth)
     shown = depth[depth > 0]
