@@ -87,16 +87,12 @@ class AdaptiveSettings:
     def __post_init__(self):
         convert_fields(self)
         require_ranges(self, {
-            "start": "[0, inf)",
-            "every": "[1, inf)",
-            "threshold": "(0, inf)",
-            "shrink": "(0, inf)",
+            **dict.fromkeys(("start", "reset_every"), "[0, inf)"),
+            **dict.fromkeys(("opacity_penalty", "scale_penalty"), "[0, inf)"),
+            **dict.fromkeys(("every", "max_gaussians"), "[1, inf)"),
+            **dict.fromkeys(("threshold", "shrink"), "(0, inf)"),
             "prune_opacity": "[0, 1)",
-            "reset_every": "[0, inf)",
             "reset_opacity": "(0, 1)",
-            "opacity_penalty": "[0, inf)",
-            "scale_penalty": "[0, inf)",
-            "max_gaussians": "[1, inf)",
         })  # fmt: skip
 
     @property

@@ -71,14 +71,10 @@ class McmcSettings:
     def __post_init__(self):
         convert_fields(self)
         require_ranges(self, {
-            "start": "[0, inf)",
-            "every": "[1, inf)",
-            "max_gaussians": "[1, inf)",
-            "growth": "[1, inf)",
+            **dict.fromkeys(("every", "max_gaussians", "growth"), "[1, inf)"),
+            **dict.fromkeys(("start", "noise"), "[0, inf)"),
+            **dict.fromkeys(("opacity_penalty", "scale_penalty"), "[0, inf)"),
             "dead_opacity": "(0, 1)",
-            "noise": "[0, inf)",
-            "opacity_penalty": "[0, inf)",
-            "scale_penalty": "[0, inf)",
         })  # fmt: skip
 
     @property

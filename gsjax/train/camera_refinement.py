@@ -50,13 +50,9 @@ def init_refinement(config: TrainConfig, views: int) -> CameraRefinement:
 def refine_camera(
     camera: Camera, refinement: CameraRefinement, index: Array, extent: float
 ) -> Camera:
-    """Return corrected cameras.
+    """Return B cameras, corrected as the views ``index`` [B] int32.
 
-    Args:
-      camera: batch of B cameras.
-      refinement: corrections of V views.
-      index: [B] int32, the view of each camera.
-      extent: scene extent in world units.
+    The scene extent is in world units.
     """
     viewmat, K = camera.viewmat, camera.K
     if refinement.turns is not None and refinement.shifts is not None:

@@ -5,7 +5,6 @@ capacity is chosen to minimise recompilation plus the cost of idle slots.
 """
 
 import math
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -62,19 +61,22 @@ def pairs_for(
     Raises:
       CapacityError: as `with_margin` and `count_demand`.
     """
-    gaussians, raster, least = state.gaussians, config.raster, 1
-    if int(state.step) == 0:
-        tiles = [-(-side // raster.tile_size) for side in frames.pixels.shape[1:3]]
-        least = _PAIRS_OF_TILE * int(np.prod(tiles))
-        count = partial(expected_pairs, as_spheres(gaussians), config=raster)
-    else:
-        # A fixed visible capacity, so that one program serves all views.
-        raster = raster.replace(visible_capacity=gaussians.capacity)
-        count = lambda camera: count_demand(gaussians, camera, raster).capacity  # noqa: E731
+    gaussians, begins = state.gaussians, int(state.step) == 0
+    # A fixed visible capacity, so that one program serves all views.
+    raster = config.raster.replace(visible_capacity=gaussians.capacity)
+    spheres = as_spheres(gaussians)
+
+    def count(camera: Camera) -> int:
+        if begins:
+            return int(expected_pairs(spheres, camera, raster))
+        return int(count_demand(gaussians, camera, raster).capacity)
+
+    tiles = [-(-side // raster.tile_size) for side in frames.pixels.shape[1:3]]
+    least = _PAIRS_OF_TILE * int(np.prod(tiles)) if begins else 1
     probed = np.linspace(0, frames.count - 1, min(frames.count, _MAX_PROBED_VIEWS))
     cameras = jax.device_get(frames.camera)  # indexing on the host compiles nothing
     wanted = [
-        int(count(jax.tree.map(lambda a, i=index: a[i], cameras)))
+        count(jax.tree.map(lambda a, i=index: a[i], cameras))
         for index in np.unique(probed.astype(int))
     ]
     return with_margin(max(least, *wanted), state, config, schedule)

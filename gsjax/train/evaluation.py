@@ -91,10 +91,10 @@ def evaluate(
       CapacityError: as `render_exact`.
     """
     config = config or RasterConfig()
-    config = config.replace(outputs=("rgb", "depth"), absgrad=False)
     # Independent of the number of active Gaussians, so that a run compiles once.
     visible = config.visible_capacity or gaussians.capacity
-    config = config.replace(visible_capacity=visible)
+    changes = {"outputs": ("rgb", "depth"), "absgrad": False}
+    config = config.replace(**changes, visible_capacity=visible)
     behind = np.asarray(background, np.float32)
     gaussians = replicate(gaussians)
     for view, photo in zip(views, photos, strict=True):

@@ -47,17 +47,13 @@ class LossTerm(NamedTuple):
 
 
 def evaluate_terms(
-    terms: Sequence[LossTerm],
-    render: Render,
-    batch: Batch,
-    params: SceneParams,
-    step: Array,
+    terms: Sequence[LossTerm], inputs: tuple[Render, Batch, SceneParams], step: Array
 ) -> Array:
     """Return the weighted sum [] of loss terms at ``step`` (counted from 1)."""
 
     def value_of(term: LossTerm) -> Array:
         with jax.named_scope(term.name):
-            value = term.function(render, batch, params)
+            value = term.function(*inputs)
         weight = term.weight(step) if callable(term.weight) else term.weight
         return value if isinstance(weight, float) and weight == 1 else weight * value
 

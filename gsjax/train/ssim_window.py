@@ -112,7 +112,12 @@ def _by_products(planes: Sequence[Array]) -> Array:
     """Return the means [N, H, W, C] by banded matrix products; for accelerators."""
     stack = jnp.stack(list(planes))
     count, height, width, channels = stack.shape
-    window = jnp.asarray(_band(), stack.dtype)
+    # The weights of a block with its margins.
+    shape = _BLOCK, _BLOCK + 2 * RADIUS
+    band = sum(
+        weight * np.eye(*shape, place) for place, weight in enumerate(_weights())
+    )
+    window = jnp.asarray(band, stack.dtype)
     product = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
     stack = jnp.moveaxis(stack, -1, 1).reshape(-1, height, width)
     stack = product("rk,nbkw->nbrw", window, _blocks(stack, 1))
@@ -120,14 +125,6 @@ def _by_products(planes: Sequence[Array]) -> Array:
     stack = product("nhbk,rk->nhbr", _blocks(stack, 2), window)
     stack = stack.reshape(count, channels, height, -1)[..., :width]
     return jnp.moveaxis(stack, 1, -1)
-
-
-def _band() -> np.ndarray:
-    """Return the weights [block, block + 2 · RADIUS] of a block with its margins."""
-    band = np.zeros((_BLOCK, _BLOCK + 2 * RADIUS))
-    for row in range(_BLOCK):
-        band[row, row : row + 2 * RADIUS + 1] = _weights()
-    return band
 
 
 def _blocks(planes: Array, axis: int) -> Array:

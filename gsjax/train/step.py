@@ -124,7 +124,7 @@ def _differentiate(setup: Setup, raster: RasterConfig | None):
         params = state.with_params(*trained).params
         view = _render(setup, raster, params, batch, probe)
         assert view.rgb is not None
-        loss = evaluate_terms(terms, view, batch, params, state.step + 1)
+        loss = evaluate_terms(terms, (view, batch, params), state.step + 1)
         image, (target, weight) = view.rgb, targets(batch, view.rgb.dtype)
         axes = 0, 0, None if weight is None else 0
         each = jax.vmap(psnr, axes)(lax.stop_gradient(image), target, weight)

@@ -38,7 +38,7 @@ class StepCompiler:
         self._sharding = replicated_sharding(device_count(setup.config.raster))
         self._worker = ThreadPoolExecutor(1)
         self.by_sizes: dict[Any, Any] = {}
-        self.by_slots: dict[int, _SlotStages] = {}
+        self.by_slots: dict[int, tuple[Future, Future | None]] = {}
 
     def close(self) -> None:
         """Cancel compilations that have not started."""
@@ -60,7 +60,7 @@ class StepCompiler:
         sizes = (frames.pixels.shape, jax.tree.structure(frames), slots, raster)
         if sizes not in self.by_sizes:
             self._compile(sizes, state, frames, raster)
-        return CompiledStep(self.by_sizes[sizes], self.by_slots[slots])
+        return CompiledStep(self.by_sizes[sizes], *self.by_slots[slots])
 
     def _compile(
         self, sizes: Any, state: TrainState, frames: Frames, raster: RasterConfig
@@ -87,20 +87,21 @@ class StepCompiler:
         view = jax.ShapeDtypeStruct((setup.config.batch,), jnp.int32)
         inputs = self._shapes((state, frames, view))
         self.by_sizes[sizes] = self._jit(differentiate).lower(*inputs).compile()
-        self.by_slots[slots].advance.result()
+        self.by_slots[slots][0].result()
 
-    def _compile_slot_stages(self, state: TrainState, stages: Stages) -> "_SlotStages":
+    def _compile_slot_stages(
+        self, state: TrainState, stages: Stages
+    ) -> tuple[Future, Future | None]:
         """Trace here, because JAX's settings are per thread; compile in the other."""
         config, schedule = self._setup.config, self._setup.schedule
         shapes, found = self._shapes((state, gradients_like(state, config.batch)))
         advance = self._jit(stages.advance, donate_argnums=0).lower(shapes, found)
         advancing = self._worker.submit(advance.compile)
         if not schedule.edits_between(0, config.steps):
-            return _SlotStages(advancing, None)
-        _, metrics, _ = advance.out_info
-        edit = self._jit(stages.edit, donate_argnums=0)
-        edit = edit.lower(shapes, self._shapes(metrics))
-        return _SlotStages(advancing, self._worker.submit(edit.compile))
+            return advancing, None
+        metrics = self._shapes(advance.out_info[1])
+        edit = self._jit(stages.edit, donate_argnums=0).lower(shapes, metrics)
+        return advancing, self._worker.submit(edit.compile)
 
     def _jit(self, stage: Callable, **options):
         return jax.jit(stage, out_shardings=self._sharding, **options)
@@ -116,27 +117,21 @@ class StepCompiler:
         return jax.tree.map(shape, tree)
 
 
-class _SlotStages(NamedTuple):
-    """Stages that depend on the slots alone; ``edit`` is None in runs without edits."""
-
-    advance: Future
-    edit: Future | None
-
-
 class CompiledStep(NamedTuple):
     """A training step from compiled stages; see `gsjax.train.step.make_stages`."""
 
     differentiate: Any
-    slot_stages: _SlotStages
+    advance: Future
+    edit: Future | None  # None in runs without edits
 
     def __call__(
         self, state: TrainState, frames: Frames, view: Array
     ) -> tuple[TrainState, Metrics]:
         """Run a step; donates the state and returns the metrics on the host."""
         found = self.differentiate(state, frames, view)
-        state, metrics, due = self.slot_stages.advance.result()(state, found)
+        state, metrics, due = self.advance.result()(state, found)
         del found
         if due:
-            assert self.slot_stages.edit is not None
-            state, metrics = self.slot_stages.edit.result()(state, metrics)
+            assert self.edit is not None
+            state, metrics = self.edit.result()(state, metrics)
         return state, jax.device_get(metrics)

@@ -353,7 +353,7 @@ def test_a_padded_view_is_as_the_view_alone(masked, report):
             for g in (found, wanted)
         ]
         assert (stats[1].gradient > 1e-4).sum() > 15
-        assert 0 < (stats[1].views == 0).sum() < 30
+        assert (stats[1].views < 2).sum() > 10
         for a, b in zip(*stats):
             np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-12)
 
