@@ -1,7 +1,6 @@
 """The coarsest accuracy settings whose error stays within a budget."""
 
-from collections.abc import Iterator, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -20,17 +19,13 @@ _ROUNDS = 5
 _STOP_SHARE = 1 / 16  # share of the budget for stopping early
 _ALPHA_MAX = 1 - 1e-6
 _REFERENCE_ALPHA_MIN, _LEAST_TRANSMITTANCE = 1e-5, 1e-6
+_PROVEN_ALPHA_MIN = (0.05, 0.02, 0.01, 1 / 255)  # tried by their bounds
 _LARGEST_ALPHA_MIN = 0.05
 _PAIRS_PER_GAUSSIAN = 8  # first guess of the capacity
 
 
 class Measured(NamedTuple):
-    """Measurements with one α cutoff.
-
-    Attributes:
-      error: largest error of a colour on the cameras given.
-      demands: counts that each of these views needs.
-    """
+    """Largest error of a colour with one α cutoff, and the counts of each view."""
 
     error: float
     demands: list[Demand]
@@ -52,12 +47,10 @@ def fit_budget(
       InputError: if the colour range is too large for the finest cutoffs.
     """
     spread = bounds.color_range(gaussians, background)
-    share = _STOP_SHARE * budget
-    stop = float(np.clip(share / max(spread, 1e-9), _LEAST_TRANSMITTANCE, 1e-2))
-    stop = _rounded(stop)
-    config = config.replace(
-        alpha_max=_ALPHA_MAX, transmittance_min=stop, stop_rule="after"
-    )
+    stop = _STOP_SHARE * budget / max(spread, 1e-9)
+    stop = _rounded(float(np.clip(stop, _LEAST_TRANSMITTANCE, 1e-2)))
+    chosen = {"alpha_max": _ALPHA_MAX, "transmittance_min": stop, "stop_rule": "after"}
+    config = config.replace(**chosen)
     stop_error = bounds.stop_error(stop, "after", _ALPHA_MAX, spread)
     alpha_max_error = bounds.alpha_max_error(_ALPHA_MAX, spread)
     why = f"{stop:g}: the weight behind is less; the colour range is {spread:.3g}"
@@ -76,22 +69,21 @@ def fit_budget(
             f"{spread:.3g}; raise the budget, or remove the brightest Gaussians"
         )
     budget -= fixed
-    cutoff = _bounded_alpha_min(gaussians, spread, budget)
-    if cutoff is not None:
+    for cutoff in _PROVEN_ALPHA_MIN:
         error = bounds.alpha_min_error(gaussians, cutoff, spread)
-        why = f"{cutoff:g}: holds even if all splats overlap"
-        reasons.append(Reason("alpha_min", why, error, "bound"))
-        return config.replace(alpha_min=cutoff), reasons, None
+        if error <= budget:
+            why = f"{cutoff:g}: holds even if all splats overlap"
+            reasons.append(Reason("alpha_min", why, error, "bound"))
+            return config.replace(alpha_min=cutoff), reasons, None
     # A heuristic: other cameras of a trained scene had 1.7 times the error of 12 of it.
     margin = 1.5 + 2 / np.sqrt(len(views))
     least = _reference_alpha_min(gaussians, spread, budget)
     cutoff, measured = _measured_alpha_min(
         gaussians, views, config, background, (budget / margin, least)
     )
-    cameras = f"{len(views)} camera{'s' * (len(views) != 1)}"
     why = (
-        f"{cutoff:.3g}: largest error {255 * measured.error:.3g}/255 on {cameras}, "
-        f"times {margin:.2g} for other cameras"
+        f"{cutoff:.3g}: largest error {255 * measured.error:.3g}/255 on {len(views)} "
+        f"camera{'s' * (len(views) != 1)}, times {margin:.2g} for other cameras"
     )
     reasons.append(Reason("alpha_min", why, margin * measured.error, "estimate"))
     return config.replace(alpha_min=cutoff), reasons, measured
@@ -103,25 +95,8 @@ def _rounded(value: float) -> float:
     return float(f"{np.floor(value / power * (1 + 1e-9)) * power:.2g}")
 
 
-def _bounded_alpha_min(
-    gaussians: Gaussians, spread: float, budget: float
-) -> float | None:
-    """Return a cutoff of at least 1/255 with a proven error within ``budget``.
-
-    None if there is none.
-    """
-    for cutoff in (_LARGEST_ALPHA_MIN, 0.02, 0.01, 1 / 255):
-        if bounds.alpha_min_error(gaussians, cutoff, spread) <= budget:
-            return cutoff
-    return None
-
-
 def _reference_alpha_min(gaussians: Gaussians, spread: float, budget: float) -> float:
-    """Return the cutoff of the reference image.
-
-    It is that of `RasterConfig.accurate`, or finer if fainter splats could add up to a
-    tenth of the budget.
-    """
+    """Return a cutoff whose fainter splats add up to a tenth of the budget at most."""
     cutoff = min(_REFERENCE_ALPHA_MIN, budget / 400)
     opacity = bounds.opacities(gaussians)
     while cutoff > 1e-12 and spread * opacity[opacity < cutoff].sum() > 0.1 * budget:
@@ -142,25 +117,33 @@ def _measured_alpha_min(
     ``limits[1]`` is the cutoff of the reference, and the result if no other fits.
     """
     allowed, least = limits
-    draw = partial(_renders, gaussians, views, config, background)
-    # The finest cutoff needs the most pairs: its capacity is enough for the others.
+    behind = jnp.asarray(background, gaussians.params.means.dtype)
+    config = config.replace(num_size_buckets=1, outputs=("rgb",), visible_capacity=None)
     capacity = capacity_bucket(_PAIRS_PER_GAUSSIAN * gaussians.capacity)
-    references, demands = zip(*draw(capacity, least))
-    needed = (capacity_bucket(int(demand.capacity)) for demand in demands)
-    capacity = max(capacity, *needed)
+
+    def draw(cutoff: float) -> list[tuple[np.ndarray, Demand]]:
+        """Return rgb and demand of each view; all cutoffs share one program."""
+        nonlocal capacity
+        drawn, alpha_min = [], jnp.asarray(cutoff, behind.dtype)
+        for view in views:
+            roomy = config.replace(pair_capacity=capacity)
+            result = render_exact(gaussians, view, roomy, behind, alpha_min=alpha_min)
+            capacity = max(capacity, capacity_bucket(int(result.demand.capacity)))
+            drawn.append((np.asarray(result.rgb), result.demand))
+        return drawn
+
+    # The finest cutoff needs the most pairs: its capacity is enough for the others.
+    references, demands = zip(*draw(least))
     best, found = least, Measured(float("inf"), list(demands))
     # The coarsest cutoff known to fail, or beyond what is sensible.
     failed = _LARGEST_ALPHA_MIN * 1.01
     cutoff = _rounded(max(allowed / 12, 2 * least))
     for _ in range(_ROUNDS):
-        largest, demands = 0.0, []
-        for (image, demand), reference in zip(draw(capacity, cutoff), references):
-            largest = max(largest, float(np.abs(image - reference).max()))
-            demands.append(demand)
-        # Corrected for the reference's own error.
-        largest *= cutoff / (cutoff - least)
+        drawn, demands = zip(*draw(cutoff))
+        largest = max(float(np.abs(a - b).max()) for a, b in zip(drawn, references))
+        largest *= cutoff / (cutoff - least)  # for the error of the reference
         if largest <= allowed:
-            best, found = cutoff, Measured(largest, demands)
+            best, found = cutoff, Measured(largest, list(demands))
             if largest > 0.7 * allowed:
                 break
         else:
@@ -173,25 +156,3 @@ def _measured_alpha_min(
         if cutoff <= best * 1.05:
             break
     return best, found
-
-
-def _renders(
-    gaussians: Gaussians,
-    views: list[Camera],
-    config: RasterConfig,
-    background: Sequence[float],
-    capacity: int,
-    cutoff: float,
-) -> Iterator[tuple[np.ndarray, Demand]]:
-    """Yield rgb [H, W, 3] and demand of each camera, with at least ``capacity`` pairs.
-
-    The cutoff is traced, so all of them share one program.
-    """
-    behind = jnp.asarray(background, gaussians.params.means.dtype)
-    config = config.replace(num_size_buckets=1, outputs=("rgb",), visible_capacity=None)
-    alpha_min = jnp.asarray(cutoff, behind.dtype)
-    for view in views:
-        config = config.replace(pair_capacity=capacity)
-        result = render_exact(gaussians, view, config, behind, alpha_min=alpha_min)
-        capacity = max(capacity, capacity_bucket(int(result.demand.capacity)))
-        yield np.asarray(result.rgb), result.demand

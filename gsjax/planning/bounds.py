@@ -9,6 +9,7 @@ Axis legend: N Gaussians, L bands of spherical harmonics.
 """
 
 import numpy as np
+from scipy.special import expit
 
 from gsjax.gaussians import Gaussians
 from gsjax.math.sh import C0
@@ -17,9 +18,7 @@ from gsjax.math.sh import C0
 def opacities(gaussians: Gaussians) -> np.ndarray:
     """Return the opacities [N] of the active Gaussians, above their α at any pixel."""
     active = np.asarray(gaussians.active)
-    logits = np.asarray(gaussians.params.logit_opacities, np.float64)[active]
-    with np.errstate(over="ignore"):
-        return 1 / (1 + np.exp(-logits))
+    return expit(np.asarray(gaussians.params.logit_opacities, np.float64)[active])
 
 
 def band_changes(gaussians: Gaussians) -> np.ndarray:
@@ -75,8 +74,7 @@ def color_range(gaussians: Gaussians, background=(0.0, 0.0, 0.0)) -> float:
 def alpha_min_error(gaussians: Gaussians, alpha_min: float, spread: float) -> float:
     """Bound the change of rgb if α below ``alpha_min`` counts as 0; ``spread`` is D.
 
-    The bound assumes that all splats overlap, so it is useful for few or very faint
-    splats only.
+    All splats may overlap, so it is useful for few or very faint splats only.
     """
     left_out = np.minimum(opacities(gaussians), min(alpha_min, 1 - 1e-16))
     return float(-spread * np.expm1(np.log1p(-left_out).sum()))

@@ -64,7 +64,8 @@ def plan(
       CapacityError: as `render_exact`.
     """
     views = _sample(cameras)
-    _check_budget(budget, gaussians)
+    if budget is not None:
+        _check_budget(budget, gaussians)
     config = config.replace(outputs=tuple(outputs), absgrad=False)
     lenses = ", ".join(sorted({view.lens.name for view in views}))
     reasons = [
@@ -79,8 +80,9 @@ def plan(
         left = budget - sum(reason.error for reason in reasons)
         config, found, measured = fit_budget(gaussians, views, config, background, left)
         reasons += found
-    gaussians, reason = drop_faint(gaussians, config, slots)
-    reasons.append(reason)
+    gaussians, why = drop_faint(gaussians, config)
+    why = f"{gaussians.capacity:,} slots in place of {slots:,}{why}"
+    reasons.append(Reason("capacity", why))
     if tune:
         config, reason = tune_sizes(gaussians, views[0], config, background)
     else:
@@ -98,47 +100,33 @@ def plan(
 
 
 def trim_scene(gaussians: Gaussians, config: RasterConfig) -> Gaussians:
-    """Remove what changes no render of any camera beyond rounding.
+    """Remove what changes no render of any camera beyond rounding, and spare slots.
 
-    That is SH bands that are 0, and Gaussians that are nowhere above the α cutoff. The
-    result has as many slots as Gaussians.
-
-    Args:
-      gaussians: N slots, concrete.
-      config: its ``alpha_min`` counts.
+    That is SH bands that are 0, and Gaussians nowhere above ``config.alpha_min``.
     """
-    slots = gaussians.capacity
     gaussians = _drop_invalid(gaussians)
     gaussians = with_sh_degree(gaussians, bounds.highest_band(gaussians))
-    return drop_faint(gaussians, config, slots)[0]
+    return drop_faint(gaussians, config)[0]
 
 
 def _sample(cameras: Camera | Sequence[Camera]) -> list[Camera]:
     """Return at most `_MAX_CAMERAS` single cameras, with the first and the last."""
-    given = [cameras] if isinstance(cameras, Camera) else list(cameras)
     singles = []
-    for camera in given:
-        if camera.batched:
-            count = camera.viewmat.shape[0]
-            singles += [jax.tree.map(lambda a, i=i: a[i], camera) for i in range(count)]
-        else:
-            singles.append(camera)
+    for camera in [cameras] if isinstance(cameras, Camera) else cameras:
+        count = camera.viewmat.shape[0] if camera.batched else 0
+        singles += [jax.tree.map(lambda a, i=i: a[i], camera) for i in range(count)]
+        singles += [] if camera.batched else [camera]
     if not singles:
         raise InputError("cameras: expected at least one camera, got none")
     count = min(len(singles), _MAX_CAMERAS)
     return [singles[i] for i in np.linspace(0, len(singles) - 1, count).astype(int)]
 
 
-def _check_budget(budget: float | None, gaussians: Gaussians) -> None:
-    if budget is None:
-        return
+def _check_budget(budget: float, gaussians: Gaussians) -> None:
+    """Raise `InputError` if no plan can keep the budget."""
     if not 0 < budget < 1:
-        raise InputError(
-            f"budget: expected an error above 0 and below 1, such as 1 / 255, got "
-            f"{budget}"
-        )
-    single = gaussians.params.means.dtype == jnp.float32
-    if single and budget < 5 * ROUNDING:
+        raise InputError(f"budget: expected an error above 0 and below 1, got {budget}")
+    if gaussians.params.means.dtype == jnp.float32 and budget < 5 * ROUNDING:
         raise InputError(
             f"budget: expected at least {5 * ROUNDING:g} in float32, whose rounding is "
             f"{ROUNDING:g}, got {budget:g}; raise it, or enable jax_enable_x64"
@@ -150,11 +138,11 @@ def _drop_invalid(gaussians: Gaussians) -> Gaussians:
 
     This comes before bands are removed, which could make such a Gaussian valid.
     """
-    valid = np.ones(gaussians.capacity, bool)
+    valid = (np.abs(np.asarray(gaussians.params.sh)) < COLOR_LIMIT).all(axis=(1, 2))
     for leaf in jax.tree.leaves(gaussians.params):
-        valid &= np.isfinite(np.asarray(leaf)).reshape(len(valid), -1).all(axis=1)
-    colors = np.abs(np.asarray(gaussians.params.sh)) < COLOR_LIMIT
-    valid &= colors.all(axis=(1, 2))
+        valid &= (
+            np.isfinite(np.asarray(leaf)).reshape(gaussians.capacity, -1).all(axis=1)
+        )
     return select(gaussians, jnp.asarray(valid))
 
 
@@ -162,18 +150,16 @@ def _choose_sh_degree(
     gaussians: Gaussians, budget: float | None
 ) -> tuple[Gaussians, Reason]:
     """Reduce the SH degree to the lowest whose error bound is within its share."""
-    degree = gaussians.sh_degree
-    allowed = 0.0 if budget is None else _SH_SHARE * budget
-    errors = [bounds.degree_error(gaussians, d) for d in range(degree + 1)]
-    least = next((d for d in range(degree) if errors[d] <= allowed), degree)
+    degree, allowed = gaussians.sh_degree, _SH_SHARE * (budget or 0.0)
     if degree == 0:
         return gaussians, Reason("SH degree", "0: colours do not depend on the view")
+    errors = [bounds.degree_error(gaussians, d) for d in range(degree)]
+    least = next((d for d, error in enumerate(errors) if error <= allowed), degree)
     if least == degree:
-        error = 255 * errors[degree - 1]
-        why = f"{degree}: without its last band rgb could change by {error:.3g}/255"
+        error = f"{255 * errors[-1]:.3g}/255"
+        why = f"{degree}: without its last band rgb could change by {error}"
         return gaussians, Reason("SH degree", why)
-    kind = "are 0" if errors[least] == 0 else "are invisible"
-    why = f"{least} in place of {degree}: the bands above {kind}"
-    basis = "bound" if errors[least] else "exact"
+    kind, basis = ("invisible", "bound") if errors[least] else ("0", "exact")
+    why = f"{least} in place of {degree}: the bands above are {kind}"
     reason = Reason("SH degree", why, errors[least], basis)
     return with_sh_degree(gaussians, least), reason

@@ -19,16 +19,8 @@ _MARGIN = 1.125  # on capacities, for views that show more than those measured
 _TRIALS = ((8, 32), (16, 32), (16, 64))  # tile and chunk sizes
 
 
-def drop_faint(
-    gaussians: Gaussians, config: RasterConfig, slots: int
-) -> tuple[Gaussians, Reason]:
-    """Keep active Gaussians with an opacity above the α cutoff, in as many slots.
-
-    Args:
-      gaussians: the scene.
-      config: its ``alpha_min`` counts.
-      slots: number of slots before, for the reason.
-    """
+def drop_faint(gaussians: Gaussians, config: RasterConfig) -> tuple[Gaussians, str]:
+    """Keep active Gaussians with an opacity above ``config.alpha_min``, and say so."""
     active = np.asarray(gaussians.active)
     visible = np.zeros(active.shape, bool)
     # Antialiasing only lowers opacities.
@@ -36,10 +28,8 @@ def drop_faint(
     faint = int(active.sum() - visible.sum())
     count = max(int(visible.sum()), 1)
     gaussians = compact(select(gaussians, jnp.asarray(visible)), count)
-    why = f"{count:,} slots in place of {slots:,}"
-    if faint:
-        why += f"; {faint:,} Gaussians are nowhere above the α cutoff"
-    return gaussians, Reason("capacity", why)
+    why = f"; {faint:,} Gaussians are nowhere above the α cutoff" if faint else ""
+    return gaussians, why
 
 
 def fit_capacities(
@@ -50,9 +40,7 @@ def fit_capacities(
 ) -> tuple[RasterConfig, list[Reason]]:
     """Return ``config`` with capacities for the cameras and an eighth more.
 
-    Args:
-      gaussians, views, config: what is rendered.
-      demands: of these cameras with that config, if they are known.
+    ``demands`` are those of these cameras with that config, if they are known.
     """
     if demands is None:
         unlimited = config.replace(visible_capacity=None)

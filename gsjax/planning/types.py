@@ -7,13 +7,10 @@ from gsjax.raster.types import RasterConfig
 
 
 class Reason(NamedTuple):
-    """Reason for one setting.
+    """Reason for one setting or part of the scene, in words.
 
-    Attributes:
-      what: the setting, or the part of the scene.
-      why: in words.
-      error: largest error of rgb that it may add.
-      basis: "exact" (none), "bound" (for every camera), "estimate", or "rounding".
+    ``error`` is the largest error of rgb that it may add; its ``basis`` is "exact"
+    (none), "bound" (for every camera), "estimate", or "rounding".
     """
 
     what: str
