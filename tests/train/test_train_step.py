@@ -390,16 +390,17 @@ def test_corrections_reduce_the_error(wrong, report):
     viewmats = np.stack([dataset().views[i].viewmat for i in (0, 2)])
     K, gain = np.array(dataset().views[0].K), 1.0
     if wrong == "poses":
-        turn, _ = np.linalg.qr(np.eye(3) + [[0, 0.03, -0.02], [0, 0, 0.03], [0, 0, 0]])
+        error = [[1, 0.02, -0.01], [-0.02, 1, 0.02], [0.01, -0.02, 1]]
+        turn, _ = np.linalg.qr(error)
         viewmats[:, :3] = turn * np.sign(np.diag(turn)) @ viewmats[:, :3]
-        viewmats[:, :3, 3] += [0.03, -0.02, 0.04]
+        viewmats[:, :3, 3] += [-0.03, 0.02, 0.04]
     elif wrong == "intrinsics":
         K = K * [[1.06, 1, 1], [1, 0.95, 1], [1, 1, 1]]
         K[0, 2] += 0.5
     else:
         gain = 0.7
     batch = tuned_batch(gain=gain, viewmats=viewmats, K=K)
-    state = tuned_state()
+    state = copy(tuned_state())  # donated
     before, losses = off_by(state, batch), []
     for _ in range(90):
         state, metrics = donating_step(state, batch)
