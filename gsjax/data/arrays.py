@@ -48,11 +48,10 @@ def make_dataset(
     singles = _single_cameras(cameras)
     names = [f"{i:06d}" for i in range(len(images))] if names is None else list(names)
     masks = [None] * len(images) if valid is None else list(valid)
-    counts = {"cameras": len(singles), "names": len(names), "valid": len(masks)}
-    for what, count in counts.items():
-        if count != len(images):
+    for what, given in {"cameras": singles, "names": names, "valid": masks}.items():
+        if len(given) != len(images):
             expected = f"{len(images)}, one per image"
-            raise unexpected(what, expected, count, "pass as many")
+            raise unexpected(what, expected, len(given), "pass as many")
     views, photos = [], {}
     for name, image, camera, mask in zip(names, images, singles, masks):
         photo = photos[name] = _photo(name, np.asarray(image), camera, mask)
@@ -87,12 +86,9 @@ def _photo(name: str, image: np.ndarray, camera: Camera, mask) -> Photo:
         raise unexpected(where, shape, image.shape, "resize the image or the camera")
     pixels = _to_uint8(where, image)
     opaque = pixels.shape[2] == 3 or (pixels[..., 3] == 255).all()
-    photo = Photo(
-        pixels=np.ascontiguousarray(pixels[..., :3]),
-        alpha=None if opaque else pixels[..., 3].copy(),
-        valid=None if mask is None else np.asarray(mask),
-        K=np.asarray(camera.K, np.float64),
-    )
+    alpha = None if opaque else pixels[..., 3].copy()
+    valid, K = None if mask is None else np.asarray(mask), np.asarray(camera.K, float)
+    photo = Photo(np.ascontiguousarray(pixels[..., :3]), alpha, valid, K)
     photo.require(where)
     return photo
 

@@ -39,14 +39,10 @@ def median_intrinsics(views: Sequence[View]) -> Intrinsics:
       InputError: if there is no view.
     """
     if not views:
-        raise InputError(
-            "views: expected at least one, got none; pass the views of a dataset"
-        )
+        raise unexpected("views", "at least one", "none", "pass those of a dataset")
     sizes = Counter((view.width, view.height) for view in views)
     width, height = max(sizes, key=lambda size: (sizes[size], size))
-    scaled = [
-        view.K * ([width / view.width], [height / view.height], [1]) for view in views
-    ]
+    scaled = [v.K * ([width / v.width], [height / v.height], [1]) for v in views]
     return Intrinsics(np.median(scaled, axis=0), width, height)
 
 
@@ -109,8 +105,7 @@ def orbit(viewmats, frames: int, *, depth: float | None = None) -> np.ndarray:
     Raises:
       InputError: as `focus_point`, or if ``frames`` is below 1.
     """
-    _check_frames(frames)
-    centres, _ = _centres_and_axes(viewmats)
+    centres, _ = _centres_and_axes(viewmats, frames)
     focus, up = focus_point(viewmats, depth), up_direction(viewmats)
     offsets = centres - focus
     distances = np.linalg.norm(offsets, axis=1)
@@ -123,9 +118,8 @@ def orbit(viewmats, frames: int, *, depth: float | None = None) -> np.ndarray:
         start = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     start = start / np.linalg.norm(start)
     turns = 2 * np.pi * np.arange(frames) / frames
-    around = np.outer(np.cos(turns), start) + np.outer(
-        np.sin(turns), np.cross(up, start)
-    )
+    around = np.outer(np.cos(turns), start)
+    around += np.outer(np.sin(turns), np.cross(up, start))
     eyes = np.cos(elevation) * around + np.sin(elevation) * up
     return np.stack([look_at(focus + distance * eye, focus, up) for eye in eyes])
 
@@ -166,9 +160,8 @@ def spiral(
     Raises:
       InputError: as `focus_point`, or if ``frames`` is below 1.
     """
-    _check_frames(frames)
     viewmats = np.asarray(viewmats, np.float64)
-    centres, axes = _centres_and_axes(viewmats)
+    centres, axes = _centres_and_axes(viewmats, frames)
     # For a ring that looks down, the mean direction and the mean up are parallel.
     upward = _mean_direction(-axes[:, 1]) @ _mean_direction(axes[:, 2])
     if np.linalg.norm(axes[:, 2].mean(axis=0)) < _ALIKE or abs(upward) > _ALIKE:
@@ -213,8 +206,7 @@ def interpolate(
     from scipy.interpolate import CubicHermiteSpline
     from scipy.spatial.transform import Rotation
 
-    _check_frames(frames)
-    centres, axes = _centres_and_axes(viewmats)
+    centres, axes = _centres_and_axes(viewmats, frames)
     away = focus_point(viewmats, depth) - centres
     scale = np.median(np.linalg.norm(away, axis=1)) or 1.0
     keys = np.concatenate([centres, Rotation.from_matrix(axes).as_quat()], axis=1)
@@ -229,25 +221,19 @@ def interpolate(
     pieces = len(keys) - 1
     places = np.linspace(0, pieces, pieces * _SAMPLES + 1)
     dense = np.interp(places, np.arange(pieces + 1), knots)
-    lengths = _steps(path(dense), scale)
-    lengths = np.concatenate([[0], np.cumsum(lengths)])
+    lengths = np.concatenate([[0], np.cumsum(_steps(path(dense), scale))])
     even = np.linspace(0, lengths[-1], frames, endpoint=not closed)
     return _matrices(path(np.interp(even, lengths, dense)))
 
 
-def _check_frames(frames: int) -> None:
+def _centres_and_axes(viewmats, frames: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions [B, 3] and rotations [B, 3, 3], rows right, down, ahead."""
     if frames < 1:
         raise unexpected("frames", "at least 1", frames, "pass 60, for instance")
-
-
-def _centres_and_axes(viewmats) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions [B, 3] and rotations [B, 3, 3], rows right, down, ahead."""
     viewmats = np.asarray(viewmats, np.float64)
     if viewmats.ndim != 3 or viewmats.shape[1:] != (4, 4) or len(viewmats) == 0:
-        raise InputError(
-            "viewmats: expected shape [B, 4, 4] with at least one camera, got "
-            f"{viewmats.shape}; stack the matrices"
-        )
+        expected = "shape [B, 4, 4] with at least one camera"
+        raise unexpected("viewmats", expected, viewmats.shape, "stack the matrices")
     if not np.isfinite(viewmats).all():
         raise InputError("viewmats: expected finite values; remove the damaged cameras")
     axes = viewmats[:, :3, :3]
@@ -261,11 +247,8 @@ def _mean_direction(directions: np.ndarray) -> np.ndarray:
     return mean / length if length > 1e-3 else directions[0]
 
 
-# Keyframes: [·, 7], position and quaternion.
-
-
 def _aligned(keys: np.ndarray) -> np.ndarray:
-    """Flip quaternions so that neighbours are less than half a turn apart."""
+    """Flip quaternions of keyframes [·, 3 + 4] to at most half a turn from the last."""
     keys = keys.copy()
     for before, key in pairwise(keys):
         if before[3:] @ key[3:] < 0:
@@ -283,20 +266,20 @@ def _steps(keys: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _tangents(keys: np.ndarray, knots: np.ndarray, closed: bool) -> np.ndarray:
-    """Return the derivatives at the keyframes.
-
-    They are those of the parabola through each keyframe and its neighbours, at the ends
-    of an open path through the three keyframes there.
-    """
+    """Return the derivatives of the parabolas through three neighbouring keyframes."""
     gaps = np.diff(knots)[:, None]
     slopes = np.diff(keys, axis=0) / gaps
     tangents = np.empty_like(keys)
-    tangents[1:-1] = _between(slopes[:-1], slopes[1:], gaps[:-1], gaps[1:])
+
+    def between(before, after, gap_before, gap_after):
+        return (before * gap_after + after * gap_before) / (gap_before + gap_after)
+
+    tangents[1:-1] = between(slopes[:-1], slopes[1:], gaps[:-1], gaps[1:])
     if closed:
         # The last keyframe equals the first; its quaternion may have the other sign.
         sign = np.ones(7)
         sign[3:] = np.sign(keys[0, 3:] @ keys[-1, 3:])
-        tangents[0] = _between(sign * slopes[-1], slopes[0], gaps[-1], gaps[0])
+        tangents[0] = between(sign * slopes[-1], slopes[0], gaps[-1], gaps[0])
         tangents[-1] = sign * tangents[0]
     elif len(keys) == 2:
         tangents[:] = slopes[0]
@@ -304,10 +287,6 @@ def _tangents(keys: np.ndarray, knots: np.ndarray, closed: bool) -> np.ndarray:
         tangents[0] = 2 * slopes[0] - tangents[1]
         tangents[-1] = 2 * slopes[-1] - tangents[-2]
     return tangents
-
-
-def _between(before, after, gap_before, gap_after):
-    return (before * gap_after + after * gap_before) / (gap_before + gap_after)
 
 
 def _matrices(keys: np.ndarray) -> np.ndarray:

@@ -4,12 +4,11 @@ The files are parsed here, not by pycolmap, which hangs on or silently accepts t
 files.
 """
 
-import warnings
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
-from gsjax.data import colmap_binary, colmap_text
+from gsjax.data import colmap_binary, colmap_text, image_files
 from gsjax.data.colmap_model import (
     NO_POINTS,
     ColmapCamera,
@@ -17,18 +16,13 @@ from gsjax.data.colmap_model import (
     ColmapPoints,
     viewmat_of,
 )
-from gsjax.data.image_files import (
-    find_files,
-    find_masks,
-    image_folder,
-    inside,
-    last_parts,
-)
-from gsjax.data.types import Dataset, Reader, ReadOptions, View
+from gsjax.data.types import Dataset, Reader, ReadOptions, View, unexpected
 from gsjax.errors import InputError
+from gsjax.io.common import warn
 
 _PLACES = ("sparse/0", "sparse", ".")
 _NERFSTUDIO = "colmap/sparse/0"
+_ALL_PLACES = (*_PLACES, _NERFSTUDIO)
 
 
 class ColmapModel(NamedTuple):
@@ -44,15 +38,11 @@ def find_colmap(folder: Path) -> Path | None:
 
     It is sparse/0, sparse, the folder itself, or nerfstudio's colmap/sparse/0.
     """
-    return next(
-        filter(None, (_model_in(folder, p) for p in (*_PLACES, _NERFSTUDIO))), None
-    )
+    return next((folder / p for p in _ALL_PLACES if _has_model(folder / p)), None)
 
 
-def _model_in(folder: Path, place: str) -> Path | None:
-    path = folder / place
-    forms = (path / f"cameras.{suffix}" for suffix in ("bin", "txt"))
-    return path if any(form.exists() for form in forms) else None
+def _has_model(path: Path) -> bool:
+    return any((path / f"cameras.{suffix}").exists() for suffix in ("bin", "txt"))
 
 
 def read_colmap(folder: Path) -> ColmapModel:
@@ -72,13 +62,12 @@ def read_colmap(folder: Path) -> ColmapModel:
         if image.camera not in cameras:
             raise InputError(
                 f"{path}: image {image.name!r} refers to camera {image.camera}, which "
-                f"is not among the {len(cameras)} cameras of {folder}; use files of "
-                "one model"
+                f"is not among the {len(cameras)} cameras; use files of one model"
             )
     try:
         path, parser = _file(folder, "points3D")
     except InputError as error:
-        warnings.warn(f"{error}; the dataset has no points", UserWarning, stacklevel=2)
+        warn(f"{error}; the dataset has no points")
         return ColmapModel(cameras, images, NO_POINTS)
     return ColmapModel(cameras, images, parser.read_points(path))
 
@@ -88,27 +77,20 @@ def _file(folder: Path, name: str) -> tuple[Path, ModuleType]:
         path = folder / (name + suffix)
         if path.exists():
             return path, parser
-    raise InputError(
-        f"{folder}: expected {name}.bin or {name}.txt, got neither; a COLMAP model has "
-        "cameras, images and points3D"
-    )
+    remedy = "a COLMAP model has cameras, images and points3D"
+    raise unexpected(folder, f"{name}.bin or {name}.txt", "neither", remedy)
 
 
 def _warn_of_larger(place: Path, count: int) -> None:
-    """Warn if another model beside this one has more images.
-
-    COLMAP writes several models if it could not join them, in no particular order.
-    """
+    """Warn if another of several models, which COLMAP did not join, has more images."""
     if place.name != "0":
         return
     counts = {path: _declared(path) for path in place.parent.glob("*/images.bin")}
     path = max(counts, key=lambda path: counts[path], default=place)
     if counts.get(path, 0) > count:
-        warnings.warn(
+        warn(
             f"{place}: this model has {count} images, that of {path.parent} "
-            f"{counts[path]}; to use the larger one, exchange the two folders",
-            UserWarning,
-            stacklevel=3,
+            f"{counts[path]}; to use the larger one, exchange the two folders"
         )
 
 
@@ -125,25 +107,16 @@ def _declared(path: Path) -> int:
 def _path(place: Path, listed: str, root: Path, moved: bool) -> str:
     """Return the path of a photograph relative to ``root``, from its name in the model.
 
-    For photographs ``moved`` to another folder it is the last part of the name that
-    does not leave the folder. Names of some models are relative to the folder above and
-    start with ``images``.
+    Names of some models are relative to the folder above and start with ``images``.
     """
-    if moved:
-        listed = last_parts(listed) or listed
-    offer = ", or pass images=, the folder that it is in (--images)"
-    path = inside(str(place), listed, offer)
+    path = image_files.listed_path(str(place), listed, moved)
     if len(path.parts) > 1 and path.parts[0] == "images" and not (root / path).exists():
         return path.relative_to("images").as_posix()
-    return listed
+    return path.as_posix() if moved else listed
 
 
-def _name(root: Path, path: str, found: dict[str, Path]) -> str | None:
-    """Return the name of a view; None if its photograph is missing.
-
-    It is the path that was searched, or the path of the file if found elsewhere.
-    """
-    file = found.get(path)
+def _name(root: Path, path: str, file: Path | None) -> str | None:
+    """Return the searched path, or that of the file if found elsewhere, else None."""
     if file is None or file.parent == (root / path).parent:
         return None if file is None else path
     return file.relative_to(root).as_posix()
@@ -156,46 +129,35 @@ def load_colmap(folder: Path, options: ReadOptions | None = None) -> Dataset:
     if place is None:
         raise InputError(
             f"{folder}: expected cameras.bin or cameras.txt in one of "
-            f"{', '.join((*_PLACES, _NERFSTUDIO))}; pass the folder of a dataset"
+            f"{', '.join(_ALL_PLACES)}; pass the folder of a dataset"
         )
     model = read_colmap(place)
     _warn_of_larger(place, len(model.images))
-    root = image_folder(folder, options)
+    root = image_files.image_folder(folder, options)
     moved = options.images is not None or options.poses_only
     paths = {i.name: _path(place, i.name, root, moved) for i in model.images}
-    found = find_files(
+    found = image_files.find_files(
         place, root, paths.values(), options, elsewhere=options.images is not None
     )
-    names = {listed: _name(root, path, found) for listed, path in paths.items()}
-    called = list(filter(None, names.values()))
-    masks = {} if options.poses_only else find_masks(folder / "masks", called)
+    names = {listed: _name(root, p, found.get(p)) for listed, p in paths.items()}
+    masks, called = {}, list(filter(None, names.values()))
+    if not options.poses_only:
+        masks = image_files.find_masks(folder / "masks", called)
     views = []
     for image in model.images:
         name, camera = names[image.name], model.cameras[image.camera]
-        if name is None:
-            continue
-        view = View(
-            name=name,
-            image=found[paths[image.name]],
-            viewmat=viewmat_of(image.quat, image.translation),
-            K=camera.K,
-            width=camera.width,
-            height=camera.height,
-            lens=camera.lens,
-            mask=masks.get(name),
-        )
-        views.append(view)
+        if name is not None:
+            file, mask = found[paths[image.name]], masks.get(name)
+            viewmat = viewmat_of(image.quat, image.translation)
+            size = camera.width, camera.height
+            views.append(View(name, file, viewmat, camera.K, *size, camera.lens, mask))
     points = model.points
     return Dataset(place, "colmap", tuple(views), points.xyz, points.colors)
 
 
-COLMAP = Reader(
-    "COLMAP",
-    lambda path: any(_model_in(path, place) for place in _PLACES),
-    load_colmap,
-)
-NERFSTUDIO_COLMAP = Reader(
-    "COLMAP of nerfstudio",
-    lambda path: _model_in(path, _NERFSTUDIO) is not None,
-    load_colmap,
-)
+def _detects(*places: str):
+    return lambda path: any(_has_model(path / place) for place in places)
+
+
+COLMAP = Reader("COLMAP", _detects(*_PLACES), load_colmap)
+NERFSTUDIO_COLMAP = Reader("COLMAP of nerfstudio", _detects(_NERFSTUDIO), load_colmap)

@@ -5,21 +5,12 @@ before any allocation, and a file must be consumed completely.
 """
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from gsjax.data.colmap_model import (
-    MAX_NAME_BYTES,
-    ColmapCamera,
-    ColmapImage,
-    ColmapPoints,
-    duplicate_id,
-    kind_of,
-    make_colmap_camera,
-    make_colmap_image,
-    sorted_points,
-)
+from gsjax.data import colmap_model as model
 from gsjax.errors import InputError
 from gsjax.runtime.files import read_bytes
 
@@ -27,11 +18,9 @@ _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters
 _IMAGE = struct.Struct("<I7dI")  # id, quaternion, translation, camera; then the name
 _POINT_2D_BYTES = 24  # x, y as float64, id of the point as int64
-_FIELDS = (
-    *(("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3)),
-    *(("error", "<f8"), ("n", "<u8")),
-)
-_POINT = np.dtype([*_FIELDS])
+_FIELDS = [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")]
+_FIELDS += [("n", "<u8")]
+POINT = np.dtype(_FIELDS)
 _CHUNK = 1 << 12  # records gathered at a time
 _TRACK_BYTES = 8  # image and index of the observation, uint32 each
 _REMEDY = "the file is truncated or damaged: export or copy it again"
@@ -76,49 +65,46 @@ class _Data:
             )
 
 
-def read_cameras(path: Path) -> dict[int, ColmapCamera]:
+def read_cameras(path: Path) -> dict[int, model.ColmapCamera]:
     """Return the cameras of a cameras.bin by id."""
-    data = _Data(path, _CAMERA.size, "cameras")
-    cameras: dict[int, ColmapCamera] = {}
+    return model.by_id(_cameras(_Data(path, _CAMERA.size, "cameras")), "camera")
+
+
+def _cameras(data: _Data) -> Iterator[tuple[str, int, model.ColmapCamera]]:
     for index in range(data.count):
-        where = f"{path}: camera {index} (byte {data.offset})"
+        where = f"{data.path}: camera {index} (byte {data.offset})"
         identity, number, *size = data.take(_CAMERA, f"camera {index}")
-        kind = kind_of(where, number)
+        kind = model.kind_of(where, number)
         form = struct.Struct(f"<{kind.size}d")
         params = data.take(form, f"{kind.name} camera {index}")
-        if identity in cameras:
-            raise duplicate_id(where, identity, "camera")
-        cameras[identity] = make_colmap_camera(where, kind, (size[0], size[1]), params)
+        yield where, identity, model.make_colmap_camera(where, kind, size, params)
     data.finish("cameras")
-    return cameras
 
 
-def read_images(path: Path) -> list[ColmapImage]:
+def read_images(path: Path) -> list[model.ColmapImage]:
     """Return the images of an images.bin in file order; 2D points are skipped."""
     data = _Data(path, _IMAGE.size + 1 + _COUNT.size, "images")
-    images: list[ColmapImage] = []
-    identities: set[int] = set()
+    return [*model.by_id(_images(data), "image").values()]
+
+
+def _images(data: _Data) -> Iterator[tuple[str, int, model.ColmapImage]]:
     for index in range(data.count):
-        where = f"{path}: image {index} (byte {data.offset})"
+        where = f"{data.path}: image {index} (byte {data.offset})"
         identity, *pose, camera = data.take(_IMAGE, f"image {index}")
         name = _name(data, where)
         (points,) = data.take(_COUNT, f"the number of 2D points of image {index}")
         data.skip(points * _POINT_2D_BYTES, f"the {points} 2D points of image {index}")
-        if identity in identities:
-            raise duplicate_id(where, identity, "image")
-        identities.add(identity)
-        images.append(make_colmap_image(where, name, camera, tuple(pose)))
+        yield where, identity, model.make_colmap_image(where, name, camera, pose)
     data.finish("images")
-    return images
 
 
 def _name(data: _Data, where: str) -> str:
-    limit = data.offset + MAX_NAME_BYTES + 1
+    limit = data.offset + model.MAX_NAME_BYTES + 1
     end = data.bytes.find(b"\0", data.offset, limit)
     if end < 0:
+        most = f"{model.MAX_NAME_BYTES} bytes; {_REMEDY}"
         raise InputError(
-            f"{where}: the name (byte {data.offset}) has no end within "
-            f"{MAX_NAME_BYTES} bytes; {_REMEDY}"
+            f"{where}: the name (byte {data.offset}) has no end within {most}"
         )
     raw = data.bytes[data.offset : end]
     data.offset = end + 1
@@ -126,21 +112,20 @@ def _name(data: _Data, where: str) -> str:
         return raw.decode()
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{where}: the name {raw[:80]!r} is not UTF-8; rename the photograph, or "
-            "export the file again"
+            f"{where}: the name {raw[:80]!r} is not UTF-8; rename the photograph"
         ) from error
 
 
-def read_points(path: Path) -> ColmapPoints:
+def read_points(path: Path) -> model.ColmapPoints:
     """Return the points of a points3D.bin sorted by id; of tracks only the length."""
-    data = _Data(path, _POINT.itemsize, "points")
+    data = _Data(path, POINT.itemsize, "points")
     raw = np.frombuffer(data.bytes, np.uint8)
     fields = {name: np.empty((data.count, *s), kind) for name, kind, *s in _FIELDS}
     for first in range(0, data.count, _CHUNK):
         chunk = range(first, min(first + _CHUNK, data.count))
         starts = _point_starts(data, chunk)
         # A gather of the fixed part of records: [·, 51] bytes.
-        rows = raw[starts[:, None] + np.arange(_POINT.itemsize)].view(_POINT)[:, 0]
+        rows = raw[starts[:, None] + np.arange(POINT.itemsize)].view(POINT)[:, 0]
         for name, field in fields.items():
             field[chunk.start : chunk.stop] = rows[name]
     data.finish("points")
@@ -148,16 +133,15 @@ def read_points(path: Path) -> ColmapPoints:
     del data, raw
     identities, xyz, rgb, errors, lengths = fields.values()
     lengths = lengths.view(np.int64)
-    return sorted_points(str(path), ColmapPoints(identities, xyz, rgb, errors, lengths))
+    return model.sorted_points(
+        str(path), model.ColmapPoints(identities, xyz, rgb, errors, lengths)
+    )
 
 
 def _point_starts(data: _Data, chunk: range) -> np.ndarray:
-    """Return the byte offsets of the records of a chunk and advance past them.
-
-    Each offset depends on the track length before it, hence the loop.
-    """
+    """Return the byte offsets of a chunk's records; each depends on the one before."""
     content, size = data.bytes, data.size
-    unpack, fixed, length_at = _COUNT.unpack_from, _POINT.itemsize, _POINT.itemsize - 8
+    unpack, fixed, length_at = _COUNT.unpack_from, POINT.itemsize, POINT.itemsize - 8
     starts = []
     at = data.offset
     for index in chunk:

@@ -4,8 +4,8 @@ Poses are world → camera, quaternions wxyz, pixel centres at + 0.5. Camera mod
 their numbers are those of COLMAP's `src/colmap/sensor/models.h`.
 """
 
-import math
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from gsjax.cameras.distortion import Distortion
 from gsjax.data.types import intrinsic_matrix, unexpected
 from gsjax.errors import InputError
 
+T = TypeVar("T")
 MAX_NAME_BYTES = 1024
 MAX_SIDE = 1 << 20
 # Keeps products of coordinates finite, and their results within float32.
@@ -23,8 +24,7 @@ class CameraKind(NamedTuple):
     """A camera model of COLMAP.
 
     Attributes:
-      name: as in cameras.txt.
-      number: as in cameras.bin.
+      name, number: as in cameras.txt, and in cameras.bin.
       size: number of parameters.
       focals: how many of them are focal lengths (1: fx = fy); cx and cy follow.
       lens: model of the `Distortion` that the remaining parameters describe, "" if
@@ -120,7 +120,7 @@ def kind_of(where: str, key: int | str) -> CameraKind:
 
 
 def make_colmap_camera(
-    where: str, kind: CameraKind, size: tuple[int, int], params: tuple[float, ...]
+    where: str, kind: CameraKind, size: Sequence[int], params: Sequence[float]
 ) -> ColmapCamera:
     """Check the values of a camera and convert them to K and distortion."""
     if kind.lens is None:
@@ -130,20 +130,19 @@ def make_colmap_camera(
             f"`gsjax sfm`; supported: {_SUPPORTED}"
         )
     if not all(1 <= side <= MAX_SIDE for side in size):
-        raise InputError(
-            f"{where}: expected an image size of 1 to {MAX_SIDE} px a side, got "
-            f"{size[0]} × {size[1]}; the file is damaged: export or copy it again"
-        )
-    if not all(math.isfinite(p) and abs(p) < MAX_COORDINATE for p in params):
-        raise unexpected(
-            where, "finite parameters", params, "estimate the camera again"
-        )
+        expected = f"an image size of 1 to {MAX_SIDE} px a side"
+        raise unexpected(where, expected, f"{size[0]} × {size[1]}")
+    if not all(abs(p) < MAX_COORDINATE for p in params):  # not even NaN
+        remedy = "estimate the camera again"
+        raise unexpected(where, "finite parameters", params, remedy)
     cx, cy = params[kind.focals : kind.focals + 2]
     K = intrinsic_matrix(where, (params[0], params[kind.focals - 1]), (cx, cy))
-    return ColmapCamera(*size, K, _distortion(kind, params[kind.focals + 2 :]))
+    return ColmapCamera(
+        size[0], size[1], K, _distortion(kind, params[kind.focals + 2 :])
+    )
 
 
-def _distortion(kind: CameraKind, rest: tuple[float, ...]) -> Distortion | None:
+def _distortion(kind: CameraKind, rest: Sequence[float]) -> Distortion | None:
     # A fisheye of zero coefficients is equidistant, not a pinhole.
     if not kind.lens or (kind.lens == _RADIAL and not any(rest)):
         return None
@@ -154,37 +153,35 @@ def _distortion(kind: CameraKind, rest: tuple[float, ...]) -> Distortion | None:
 
 
 def make_colmap_image(
-    where: str, name: str, camera: int, pose: tuple[float, ...]
+    where: str, name: str, camera: int, pose: Sequence[float]
 ) -> ColmapImage:
     """Check a pose (qw, qx, qy, qz, tx, ty, tz) and normalise its quaternion."""
-    values = np.asarray(pose, np.float64)
+    values, remedy = np.asarray(pose, np.float64), "remove it from the model"
     if not (np.abs(values) < MAX_COORDINATE).all():
-        raise InputError(
-            f"{where}: expected a pose of finite numbers for {name!r}, got "
-            f"{values.tolist()}; remove the image from the model"
-        )
+        expected = f"a pose of finite numbers for {name!r}"
+        raise unexpected(where, expected, values.tolist(), remedy)
     quat = values[:4]
     if np.abs(quat).max() < 1e-30:
-        raise InputError(
-            f"{where}: the quaternion of {name!r} is zero; remove the image from the "
-            "model"
-        )
+        raise InputError(f"{where}: the quaternion of {name!r} is zero; {remedy}")
     if not name:
-        raise InputError(
-            f"{where}: the name of the image is empty; remove it from the model"
-        )
+        raise InputError(f"{where}: the name of the image is empty; {remedy}")
     norm = np.linalg.norm(quat)
     # Keeps the bits of the file if the norm is 1 up to rounding.
     quat = quat if abs(norm - 1) < 1e-12 else quat / norm
     return ColmapImage(name, camera, quat, values[4:])
 
 
-def duplicate_id(where: str, identity: int, what: str) -> InputError:
-    """Return the error for an id that another camera or image has."""
-    return InputError(
-        f"{where}: the id {identity} is that of another {what}; the file is damaged: "
-        "export or copy it again"
-    )
+def by_id(records: Iterable[tuple[str, int, T]], what: str) -> dict[int, T]:
+    """Return records, given as (place, id, record), by their ids, which must differ."""
+    found: dict[int, T] = {}
+    for where, identity, record in records:
+        if identity in found:
+            raise InputError(
+                f"{where}: the id {identity} is that of another {what}; the file is "
+                "damaged: export or copy it again"
+            )
+        found[identity] = record
+    return found
 
 
 def sorted_points(where: str, points: ColmapPoints) -> ColmapPoints:
@@ -200,15 +197,13 @@ def sorted_points(where: str, points: ColmapPoints) -> ColmapPoints:
     if len(again):
         raise InputError(
             f"{where}: {len(again)} points have the id of another point, the first: "
-            f"{points.ids[again[:5]].tolist()}; the file is damaged: export or copy it "
-            "again"
+            f"{points.ids[again[:5]].tolist()}; export or copy the file again"
         )
-    wild = ~(np.abs(points.xyz) < MAX_COORDINATE).all(axis=1)
+    wild = np.logical_not((np.abs(points.xyz) < MAX_COORDINATE).all(axis=1))
     if wild.any():
         raise InputError(
-            f"{where}: {wild.sum()} of {len(points.xyz)} points have coordinates that "
-            f"are not finite, the first: point {points.ids[wild][:5].tolist()}; remove "
-            "them from the model"
+            f"{where}: {wild.sum()} of {len(wild)} points have coordinates that are "
+            f"not finite, the first: point {points.ids[wild][:5].tolist()}; remove them"
         )
     return points
 

@@ -1,33 +1,17 @@
 """Strict parser of COLMAP's text files: cameras.txt, images.txt, points3D.txt."""
 
 import re
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 
-from gsjax.data.colmap_model import (
-    MAX_NAME_BYTES,
-    ColmapCamera,
-    ColmapImage,
-    ColmapPoints,
-    duplicate_id,
-    kind_of,
-    make_colmap_camera,
-    make_colmap_image,
-    sorted_points,
-)
+from gsjax.data import colmap_model as model
 from gsjax.data.text_file import blocks, lines, read_text, too_long
 from gsjax.data.types import unexpected
-from gsjax.errors import InputError
-from gsjax.io.numerals import (
-    find_words,
-    other_than_digits,
-    parse_number,
-    parse_numbers,
-)
+from gsjax.io import numerals
+from gsjax.io.common import warn
 
 _UINT32, _UINT64 = (1 << 32) - 1, (1 << 64) - 1
 # Bytes of a line: of a camera or an image; and of a point, which leaves space for
@@ -45,10 +29,7 @@ _FIELDS |= {"errors": ("<f8",), "track_lengths": ("<i8",)}
 def _records(
     text: Iterator[tuple[str, bytes]], declared: list[int], name: str
 ) -> Iterator[tuple[str, str]]:
-    """Yield the places and contents of lines that are neither blank nor comments.
-
-    The number of records that a comment states is appended to ``declared``.
-    """
+    """Yield the records; append the number that a comment states to ``declared``."""
     for where, line in text:
         if len(line) > _LONGEST:
             raise too_long(where, _LONGEST)
@@ -69,12 +50,9 @@ def _whole(where: str, what: str, text: str, most: int) -> int:
 
 def _floats(where: str, texts: list[str]) -> tuple[float, ...]:
     try:
-        return tuple(parse_number(text) for text in texts)
+        return tuple(numerals.parse_number(text) for text in texts)
     except ValueError as error:
-        raise InputError(
-            f"{where}: expected numbers, {str(error)[:80]}; export or copy the "
-            "file again"
-        ) from error
+        raise unexpected(where, "numbers", str(error)[:80]) from error
 
 
 def _words(where: str, line: str, least: int, expected: str, split: int = -1):
@@ -84,24 +62,20 @@ def _words(where: str, line: str, least: int, expected: str, split: int = -1):
     return words
 
 
-def read_cameras(path: Path) -> dict[int, ColmapCamera]:
+def read_cameras(path: Path) -> dict[int, model.ColmapCamera]:
     """Return the cameras of a cameras.txt by id."""
-    cameras: dict[int, ColmapCamera] = {}
     declared: list[int] = []
     text = lines(path, read_text(path, _EXPECTED))
-    for where, record in _records(text, declared, "cameras"):
-        identity, camera = _camera(where, record)
-        if identity in cameras:
-            raise duplicate_id(where, identity, "camera")
-        cameras[identity] = camera
+    records = _records(text, declared, "cameras")
+    cameras = model.by_id((_camera(*record) for record in records), "camera")
     _compare(path, "cameras", len(cameras), declared)
     return cameras
 
 
-def _camera(where: str, line: str) -> tuple[int, ColmapCamera]:
+def _camera(where: str, line: str) -> tuple[str, int, model.ColmapCamera]:
     words = _words(where, line, 4, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
     identity = _whole(where, "the camera id", words[0], _UINT32)
-    kind = kind_of(where, words[1][:40])
+    kind = model.kind_of(where, words[1][:40])
     size = (
         _whole(where, "the width", words[2], _UINT64),
         _whole(where, "the height", words[3], _UINT64),
@@ -109,34 +83,31 @@ def _camera(where: str, line: str) -> tuple[int, ColmapCamera]:
     params = _floats(where, words[4:])
     if len(params) != kind.size:
         raise unexpected(where, f"{kind.size} parameters of {kind.name}", len(params))
-    return identity, make_colmap_camera(where, kind, size, params)
+    return where, identity, model.make_colmap_camera(where, kind, size, params)
 
 
-def read_images(path: Path) -> list[ColmapImage]:
+def read_images(path: Path) -> list[model.ColmapImage]:
     """Return the images of an images.txt in file order; 2D points are skipped."""
-    images: list[ColmapImage] = []
-    identities: set[int] = set()
     declared: list[int] = []
-    text, observations = lines(path, read_text(path, _EXPECTED)), ("", b"")
+    text = lines(path, read_text(path, _EXPECTED))
+    images = model.by_id(_images(path, text, declared), "image")
+    _compare(path, "images", len(images), declared)
+    return [*images.values()]
+
+
+def _images(path: Path, text: Iterator[tuple[str, bytes]], declared: list[int]):
+    observations = ("", b"")
     for where, record in _records(text, declared, "images"):
-        identity, image = _image(where, record)
-        if identity in identities:
-            raise duplicate_id(where, identity, "image")
-        identities.add(identity)
-        images.append(image)
+        yield _image(where, record)
         # Each image is followed by a line of 2D points, which may be empty.
         observations = next(text, None)
         if observations is not None:
             _check_observations(*observations)
-    _compare(path, "images", len(images), declared)
     if observations is None:
-        warnings.warn(
+        warn(
             f"{path}: the last image has no line of 2D points (it may be empty); the "
-            "file may be truncated: export or copy it again",
-            UserWarning,
-            stacklevel=2,
+            "file may be truncated: export or copy it again"
         )
-    return images
 
 
 def _check_observations(where: str, line: bytes) -> None:
@@ -146,32 +117,24 @@ def _check_observations(where: str, line: bytes) -> None:
     last = (line[-80:].decode(errors="replace").split() or ["0"])[-1][-40:]
     number = last.removeprefix("-")
     if count % 3 or not (number.isascii() and number.isdecimal()):
-        raise InputError(
-            f"{where}: expected X Y POINT3D_ID of each 2D point or an empty line after "
-            f"an image, got {count} values, the last {last!r}; export or copy the file "
-            "again"
-        )
+        expected = "X Y POINT3D_ID of each 2D point or an empty line after an image"
+        raise unexpected(where, expected, f"{count} values, the last {last!r}")
 
 
-def _image(where: str, line: str) -> tuple[int, ColmapImage]:
+def _image(where: str, line: str) -> tuple[str, int, model.ColmapImage]:
     expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
     words = _words(where, line, 10, expected, 9)
     identity = _whole(where, "the image id", words[0], _UINT32)
     camera = _whole(where, "the camera id", words[8], _UINT32)
-    if len(words[9].encode()) > MAX_NAME_BYTES:
-        raise InputError(
-            f"{where}: expected a name of at most {MAX_NAME_BYTES} bytes; rename the "
-            "photograph"
-        )
+    if len(words[9].encode()) > model.MAX_NAME_BYTES:
+        expected = f"a name of at most {model.MAX_NAME_BYTES} bytes"
+        raise unexpected(where, expected, "more", "rename the photograph")
     pose = _floats(where, words[1:8])
-    return identity, make_colmap_image(where, words[9], camera, pose)
+    return where, identity, model.make_colmap_image(where, words[9], camera, pose)
 
 
-def read_points(path: Path) -> ColmapPoints:
-    """Return the points of a points3D.txt sorted by id; of tracks only the length.
-
-    A track may refer to images that were removed from the model.
-    """
+def read_points(path: Path) -> model.ColmapPoints:
+    """Return the points of a points3D.txt sorted by id; of tracks only the length."""
     count = 0
     declared: list[int] = []
     text = read_text(path, _EXPECTED)
@@ -192,19 +155,17 @@ def read_points(path: Path) -> ColmapPoints:
     del text
     _compare(path, "points", count, declared)
     if not count:
-        warnings.warn(
-            f"{path}: the file has no points to start from",
-            UserWarning,
-            stacklevel=2,
-        )
-    points = ColmapPoints(**{name: field[:count] for name, field in fields.items()})
-    return sorted_points(str(path), points)
+        warn(f"{path}: the file has no points to start from")
+    points = model.ColmapPoints(
+        **{name: field[:count] for name, field in fields.items()}
+    )
+    return model.sorted_points(str(path), points)
 
 
 def _points(block: bytes) -> dict[str, np.ndarray] | None:
     """Return the fields of the points in whole lines; None if a line is malformed."""
     raw = np.frombuffer(block, np.uint8)
-    starts, first, counts, ends = find_words(raw)
+    starts, first, counts, ends = numerals.find_words(raw)
     first, counts, ends = (values[counts > 0] for values in (first, counts, ends))
     if not len(counts):
         return {name: np.empty((0, *s), kind) for name, (kind, *s) in _FIELDS.items()}
@@ -213,7 +174,7 @@ def _points(block: bytes) -> dict[str, np.ndarray] | None:
     # Ends of the ids and starts of the tracks: both consist of digits only.
     second = starts[first + 1]
     tracks = np.where(counts > 8, np.append(starts, len(raw))[first + 8], ends)
-    other = other_than_digits(raw)
+    other = numerals.other_than_digits(raw)
     if (other[second] > other[starts[first]]).any() or (
         other[ends] > other[tracks]
     ).any():
@@ -222,7 +183,7 @@ def _points(block: bytes) -> dict[str, np.ndarray] | None:
     marks[tracks] += 1
     marks[ends] -= 1
     in_track = np.cumsum(marks[:-1], dtype=np.int8) > 0
-    values = parse_numbers(np.where(in_track, _SPACE, raw), 8 * len(counts))
+    values = numerals.parse_numbers(np.where(in_track, _SPACE, raw), 8 * len(counts))
     if values is None:
         return None
     values = values.reshape(-1, 8)
@@ -287,9 +248,5 @@ def _declared(line: str, records: str) -> list[int]:
 def _compare(path: Path, records: str, found: int, declared: list[int]) -> None:
     # Only a warning: files edited by hand keep their first comment.
     if declared and declared[-1] != found:
-        warnings.warn(
-            f"{path}: a comment says {declared[-1]} {records}, got {found}; the file "
-            "may be truncated",
-            UserWarning,
-            stacklevel=3,
-        )
+        got = f"a comment says {declared[-1]} {records}, got {found}"
+        warn(f"{path}: {got}; the file may be truncated")

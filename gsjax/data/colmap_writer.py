@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from gsjax.data.colmap_binary import POINT
 from gsjax.data.colmap_model import KIND_OF_NAME, MAX_NAME_BYTES
 from gsjax.data.types import Dataset, View
 from gsjax.errors import InputError
-from gsjax.runtime.files import make_folder, refuse_existing, write_file
+from gsjax.runtime.files import make_folder, reject_existing, write_file
 
 _UNKNOWN_ERROR = -1.0
 
@@ -39,7 +40,7 @@ def write_colmap(
         "images.bin": _images(dataset, numbers),
         "points3D.bin": _points(dataset),
     }
-    refuse_existing([folder / name for name in content], overwrite)
+    reject_existing([folder / name for name in content], overwrite)
     make_folder(folder)
     for name, data in content.items():
         write_file(folder / name, data)
@@ -71,32 +72,26 @@ def _camera(view: View) -> bytes:
 
 
 def _images(dataset: Dataset, numbers: Sequence[int]) -> bytes:
+    from scipy.spatial.transform import Rotation
+
     parts = [struct.pack("<Q", len(dataset.views))]
     for index, (view, camera) in enumerate(zip(dataset.views, numbers), 1):
         name = view.name.encode()
         if not name or b"\0" in name or len(name) > MAX_NAME_BYTES:
-            raise InputError(
-                f"view {view.name[:80]!r}: expected a name of 1 to {MAX_NAME_BYTES} "
-                "bytes without NUL; rename the photograph"
-            )
+            where, expected = f"view {view.name[:80]!r}", f"1 to {MAX_NAME_BYTES} bytes"
+            remedy = "without NUL; rename the photograph"
+            raise InputError(f"{where}: expected a name of {expected} {remedy}")
         rotation = view.viewmat[:3, :3]
         translation = view.viewmat[:3, 3] - rotation @ dataset.origin
-        pose = *_quat_of(rotation), *translation
+        quat = Rotation.from_matrix(rotation).as_quat(canonical=True)[[3, 0, 1, 2]]
+        pose = *quat, *translation
         parts.append(struct.pack("<I7dI", index, *pose, camera) + name + b"\0")
         parts.append(struct.pack("<Q", 0))  # no 2D points
     return b"".join(parts)
 
 
-def _quat_of(rotation: np.ndarray) -> np.ndarray:
-    """Return the unit quaternion wxyz, w ≥ 0, of a rotation matrix [3, 3]."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotation).as_quat(canonical=True)[[3, 0, 1, 2]]
-
-
 def _points(dataset: Dataset) -> bytes:
-    kinds = [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")]
-    table = np.zeros(len(dataset.points), np.dtype([*kinds, ("track", "<u8")]))
+    table = np.zeros(len(dataset.points), POINT)
     table["id"] = np.arange(1, len(table) + 1)
     table["xyz"] = dataset.points + dataset.origin
     table["rgb"] = dataset.colors

@@ -72,10 +72,8 @@ def load_dataset(
     try:
         return finish_dataset(_reader_of(path, readers).load(path, options))
     except OSError as error:  # a name that is too long, for instance
-        raise InputError(
-            f"{str(error.filename or path)[:200]}: {error.strerror or error}; check "
-            "the path and its permissions"
-        ) from error
+        where = f"{str(error.filename or path)[:200]}: {error.strerror or error}"
+        raise InputError(f"{where}; check the path and its permissions") from error
 
 
 def is_dataset(path: Path, readers: Sequence[Reader] = READERS) -> bool:
@@ -90,10 +88,7 @@ def _reader_of(path: Path, readers: Sequence[Reader]) -> Reader:
         if reader.detect(path):
             return reader
     if not path.is_dir():
-        raise InputError(
-            f"{path}: expected a dataset; pass the folder of a dataset, a .json or a "
-            ".npy"
-        )
+        raise InputError(f"{path}: expected the folder of a dataset, a .json or a .npy")
     names = sorted(entry.name for entry in path.iterdir())[:12]
     raise InputError(
         f"{path}: expected sparse/0 of COLMAP, transforms.json, transforms_train.json "
@@ -113,10 +108,8 @@ def finish_dataset(dataset: Dataset) -> Dataset:
         raise unexpected(dataset.source, "at least 1 view", "none", "add photographs")
     for before, after in pairwise(views):
         if before.name == after.name:
-            raise InputError(
-                f"{dataset.source}: the photograph {after.name!r} is listed more than "
-                "once; remove all but one"
-            )
+            where = f"{dataset.source}: the photograph {after.name!r}"
+            raise InputError(f"{where} is listed more than once; remove all but one")
     centres = np.stack([view.centre for view in views])
     _check_positions(dataset, [view.name for view in views], centres)
     near = near_plane(centres, least_extent(dataset))
@@ -126,10 +119,9 @@ def finish_dataset(dataset: Dataset) -> Dataset:
 
 
 def _with_one_position(dataset: Dataset) -> Dataset:
-    """Return the dataset with every camera at the position of the first.
+    """Return the dataset with all cameras where the first is: they differ by rounding.
 
-    Their differences were rounding, which `rebase` may have made the largest part of
-    the coordinates.
+    `rebase` may have made the differences the largest part of the coordinates.
     """
     centre, moved = dataset.views[0].centre, []
     for view in dataset.views:
@@ -140,10 +132,7 @@ def _with_one_position(dataset: Dataset) -> Dataset:
 
 
 def _check_positions(dataset: Dataset, names: list[str], centres: np.ndarray) -> None:
-    """Raise on a camera that is too far away or an extreme outlier.
-
-    A single outlier would set the extent, which every length of a training scales with.
-    """
+    """Raise on a camera too far away, or an outlier that alone would set the extent."""
     distances = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
     worst = int(np.argmax(distances))
     others = float(np.max(np.delete(distances, worst), initial=0))
@@ -151,14 +140,11 @@ def _check_positions(dataset: Dataset, names: list[str], centres: np.ndarray) ->
         raise InputError(
             f"{dataset.source}: the camera of {names[worst]!r} is "
             f"{distances[worst]:.3g} from the median position, all others within "
-            f"{others:.3g}; its pose is damaged: remove the photograph, or estimate "
-            "the cameras again"
+            f"{others:.3g}; remove the photograph, or estimate the cameras again"
         )
     worst = int(np.argmax(np.abs(centres).max(axis=1)))
     if np.abs(centres[worst]).max() > _MAX_DISTANCE:
         position = ", ".join(f"{value:.3g}" for value in centres[worst])
-        raise InputError(
-            f"{dataset.source}: the camera of {names[worst]!r} is at {position}; "
-            f"expected at most {_MAX_DISTANCE:g} from the origin: estimate the cameras "
-            "again"
-        )
+        where = f"{dataset.source}: the camera of {names[worst]!r} is at {position}"
+        remedy = "from the origin; estimate the cameras again"
+        raise InputError(f"{where}, expected at most {_MAX_DISTANCE:g} {remedy}")

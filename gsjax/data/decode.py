@@ -6,25 +6,16 @@ they could read and report that on stderr only, without the file's name.
 
 import os
 import re
-import sys
-import tempfile
-import threading
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from gsjax.data.image_header import (
-    check_image,
-    clear_grey,
-    has_tiff_alpha,
-    has_two_samples,
-    tiff_as_stored,
-)
+from gsjax.data import image_header
 from gsjax.errors import InputError
-from gsjax.io.images import opencv
+from gsjax.io.common import warn
+from gsjax.io.images import captured_stderr, opencv
 from gsjax.runtime.files import read_bytes
 
 # Messages of libjpeg, libpng and (through OpenCV) libtiff about damaged pixels. The
@@ -35,8 +26,6 @@ _DAMAGE = re.compile(
 )
 _HARMLESS = "libpng warning: "
 _SHOWN = 3
-_MAX_STDERR = 2**20
-_stderr_lock = threading.RLock()  # stderr belongs to the whole process
 
 
 def decode(
@@ -47,8 +36,7 @@ def decode(
     Args:
       path: the file; its header is checked before anything is decoded.
       flags: flags of cv2.imdecode.
-      check: called with the declared width and height in px before their allocation;
-        raises to reject them.
+      check: called with the declared width and height in px, which it may reject.
 
     Raises:
       InputError: as ``check``; if the file cannot be read, is not an image, is
@@ -56,37 +44,33 @@ def decode(
         transparent pixels, or of grey and another sample.
     """
     data = read_bytes(path, "a photograph")
-    size = check_image(path, data)
+    size = image_header.check_image(path, data)
     if check is not None:
         check(*size)
-    if has_two_samples(data):  # OpenCV drops one, or reads 16 bits as zeros
-        raise InputError(
-            f"{path}: a TIFF of two samples a pixel, grey and transparency, cannot be "
-            "read; convert it to PNG"
-        )
+    if image_header.has_two_samples(data):  # OpenCV drops one, or reads zeros
+        what = "a TIFF of two samples a pixel, grey and transparency"
+        raise InputError(f"{path}: {what}, cannot be read; convert it to PNG")
     cv2 = opencv()
     if flags & cv2.IMREAD_IGNORE_ORIENTATION:  # IMREAD_UNCHANGED includes it
-        data = tiff_as_stored(data)  # OpenCV ignores the flag in a TIFF
+        data = image_header.tiff_as_stored(data)  # OpenCV ignores the flag in a TIFF
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         raise InputError(f"{path}: cannot be decoded: {str(error)[:120]}") from error
     if pixels is None:
+        what = "the image is truncated, damaged or not supported by OpenCV"
         raise InputError(
-            f"{path}: cannot be decoded: the image is truncated, damaged or not "
-            "supported by OpenCV; convert it to PNG or JPEG"
+            f"{path}: cannot be decoded: {what}; convert it to PNG or JPEG"
         )
     most = 65535 if pixels.dtype == np.uint16 else 255
     # OpenCV 5.0 multiplies straight colours of 8 bits by alpha and keeps premultiplied
     # ones, without telling which.
-    if pixels.ndim == 3 and pixels.shape[2] == 4 and has_tiff_alpha(data):
+    if pixels.ndim == 3 and pixels.shape[2] == 4 and image_header.has_tiff_alpha(data):
         alpha = pixels[..., 3]
         if ((alpha > 0) & (alpha < most)).any():
-            raise InputError(
-                f"{path}: a TIFF with partly transparent pixels, whose colours may be "
-                "mixed with black, cannot be read; convert it to PNG"
-            )
-    grey = clear_grey(data) if flags == cv2.IMREAD_UNCHANGED else None
+            what = "a TIFF with partly transparent pixels, perhaps mixed with black"
+            raise InputError(f"{path}: {what}, cannot be read; convert it to PNG")
+    grey = image_header.clear_grey(data) if flags == cv2.IMREAD_UNCHANGED else None
     if grey is not None and pixels.ndim == 2:  # OpenCV only handles it in colour images
         alpha = np.where(pixels == round(grey * most), 0, most).astype(pixels.dtype)
         pixels = np.stack([pixels, alpha], -1)
@@ -120,38 +104,7 @@ def _warn_of_each(files: Sequence[Path]) -> None:
     if damage:
         some = "; ".join(f"{path}: {why}" for path, why in [*damage.items()][:_SHOWN])
         more = f"; and {len(damage) - _SHOWN} more" if len(damage) > _SHOWN else ""
-        warnings.warn(
+        warn(
             f"damaged photographs are read as far as possible: {some}{more}; copy or "
-            "export them again, or remove them",
-            UserWarning,
-            stacklevel=4,
+            "export them again, or remove them"
         )
-
-
-@contextmanager
-def captured_stderr() -> Iterator[list[str]]:
-    """Context in which nothing reaches stderr; afterwards the list holds its lines.
-
-    C libraries write to the file descriptor, past Python. Other threads wait for it.
-    """
-    captured: list[str] = []
-    with _stderr_lock, _scratch() as scratch:
-        if sys.stderr is not None:
-            sys.stderr.flush()
-        kept = os.dup(2)
-        try:
-            os.dup2(scratch.fileno(), 2)
-            yield captured
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            scratch.seek(0)
-            text = scratch.read(_MAX_STDERR).decode(errors="replace")
-            captured += [line for line in text.splitlines() if line.strip()]
-
-
-def _scratch():
-    """Return an anonymous file, in memory if the system has such files."""
-    if hasattr(os, "memfd_create"):
-        return os.fdopen(os.memfd_create("stderr"), "w+b")
-    return tempfile.TemporaryFile()

@@ -21,13 +21,8 @@ def cameras_coincide(centres: np.ndarray) -> bool:
 def scene_extent(centres: np.ndarray) -> float:
     """Return 1.1 times the largest distance of a camera from the mean position.
 
-    Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", 2023.
-
-    Args:
-      centres: [V, 3] camera positions.
-
-    Returns:
-      The extent, above 0; 1 if all cameras coincide.
+    It is 1 if all camera positions [V, 3] coincide. Kerbl et al., "3D Gaussian
+    Splatting for Real-Time Radiance Field Rendering", 2023.
     """
     if cameras_coincide(centres):
         return 1.0
@@ -61,20 +56,15 @@ def least_extent(dataset: Dataset) -> float:
 
 
 def near_plane(centres: np.ndarray, least: float = 0.0) -> float:
-    """Return the near plane of cameras: `NEAR`, or less in a scene of small extent.
+    """Return the near plane: a fixed share of the extent, at most `NEAR`.
 
     Args:
-      centres: [V, 3] camera positions.
-      least: lower bound of the extent, see `least_extent`.
-
-    Returns:
-      A fixed share of the extent, at most `NEAR`. `NEAR` if all cameras coincide and
-      there is no bound.
+      centres: [V, 3] camera positions. If all coincide, ``least`` is the extent.
+      least: lower bound of the extent, see `least_extent`; 0 for none.
     """
+    extent = max(scene_extent(centres), least)
     if cameras_coincide(centres):
         extent = least or USUAL_EXTENT
-    else:
-        extent = max(scene_extent(centres), least)
     return NEAR * min(1.0, extent / USUAL_EXTENT)
 
 
@@ -91,7 +81,5 @@ def has_points(dataset: Dataset) -> bool:
 def require_points(dataset: Dataset) -> None:
     """Raise `InputError` if the dataset has no usable points."""
     if not has_points(dataset):
-        raise InputError(
-            f"{dataset.source}: no points to start from; start from random ones "
-            "(--initial random)"
-        )
+        remedy = "start from random ones (--initial random)"
+        raise InputError(f"{dataset.source}: no points to start from; {remedy}")

@@ -2,13 +2,13 @@
 
 import re
 import unicodedata
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path, PurePosixPath
 
 from gsjax.data.types import ReadOptions, unexpected
 from gsjax.errors import InputError
+from gsjax.io.common import warn
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _SHOWN = 5
@@ -17,18 +17,16 @@ _ENDING = re.compile(f"({'|'.join(map(re.escape, SUFFIXES))})+$", re.IGNORECASE)
 
 
 def image_folder(folder: Path, options: ReadOptions) -> Path:
-    """Return the folder of the photographs, ``images_4`` for factor 4.
+    """Return the folder of a dataset's photographs, ``images_4`` for factor 4.
 
-    Args:
-      folder: folder of the dataset.
-      options: ``images`` is its name in the dataset or a path, by default "images";
-        with ``poses_only`` it need not exist.
+    ``options.images`` is its name in the dataset or a path, by default "images"; with
+    ``poses_only`` it need not exist.
 
     Raises:
       InputError: if there is no such folder; the message offers a factor that exists.
     """
     check_factor(options.factor)
-    suffix = f"_{options.factor}" if _is_scaled(options) else ""
+    suffix = f"_{options.factor}" if (options.factor or 1) > 1 else ""
     original = folder / ("images" if options.images is None else options.images)
     found = Path(f"{original}{suffix}")
     if found.is_dir() or options.poses_only:
@@ -37,25 +35,18 @@ def image_folder(folder: Path, options: ReadOptions) -> Path:
     remedy = "pass images=, the folder of the photographs (--images)"
     if suffix:
         remedy = "leave the factor out (photographs are scaled on load), or make it"
-    factors = _factors(original)
-    if factors:
-        copies, least = f"{original.name}_{factors[0]}", factors[0]
-        remedy = (
-            f"pass factor={least} (--factor {least}), as {copies} is there; or {remedy}"
-        )
+    for least in _factors(original)[:1]:
+        copies = f"pass factor={least} (--factor {least}), as {original.name}_{least}"
+        remedy = f"{copies} is there; or {remedy}"
     raise InputError(
         f"{found}: no such folder; {folder} has the folders "
         f"{', '.join(names[:12]) or '(none)'}; {remedy}"
     )
 
 
-def _is_scaled(options: ReadOptions) -> bool:
-    return options.factor is not None and options.factor > 1
-
-
 def original_folder(root: Path, options: ReadOptions) -> Path | None:
     """Return the folder of the originals if ``root`` has smaller copies, else None."""
-    if not _is_scaled(options):
+    if (options.factor or 1) <= 1:
         return None
     return root.with_name(root.name.removesuffix(f"_{options.factor}"))
 
@@ -78,10 +69,7 @@ def check_factor(factor: int | None) -> None:
 def inside(where: str, name: str, remedy: str = "") -> PurePosixPath:
     """Return a listed name as a relative path that stays in its folder.
 
-    Args:
-      where: source of the name, for messages.
-      name: the name as listed.
-      remedy: another remedy besides copying the file.
+    Messages begin with ``where``, and end with ``remedy`` beside copying the file.
 
     Raises:
       InputError: if the path is absolute, leaves the folder, or is not a usable name.
@@ -98,20 +86,24 @@ def inside(where: str, name: str, remedy: str = "") -> PurePosixPath:
     # The system would reject longer ones with an error that names no remedy.
     sizes = [len(part.encode()) for part in path.parts]
     if max(sizes) > _MAX_PART or sum(sizes) > _MAX_NAME:
-        raise InputError(
-            f"{where}: expected a name of at most {_MAX_NAME} bytes and "
-            f"{_MAX_PART} a part, got {name[:120]!r}… of {sum(sizes)} and "
-            f"{max(sizes)}; rename the file"
-        )
+        expected = f"a name of at most {_MAX_NAME} bytes and {_MAX_PART} a part"
+        got = f"{name[:120]!r}… of {sum(sizes)} and {max(sizes)}"
+        raise unexpected(where, expected, got, "rename the file")
     return path
 
 
-def last_parts(name: str) -> str:
-    """Return the part of a path after its root and its last ".."."""
-    path = PurePosixPath(re.sub("^[A-Za-z]:", "/", name.replace("\\", "/")))
-    parts = path.parts[1:] if path.is_absolute() else path.parts
-    ups = [index for index, part in enumerate(parts) if part == ".."]
-    return "/".join(parts[ups[-1] + 1 :] if ups else parts)
+def listed_path(where: str, name: str, moved: bool) -> PurePosixPath:
+    """Return a photograph's listed name as a path in its folder, see `inside`.
+
+    For photographs ``moved`` to another folder it is the part after the root and the
+    last "..".
+    """
+    if moved:
+        path = PurePosixPath(re.sub("^[A-Za-z]:", "/", name.replace("\\", "/")))
+        parts = path.parts[1:] if path.is_absolute() else path.parts
+        ups = [index for index, part in enumerate(parts) if part == ".."]
+        name = "/".join(parts[ups[-1] + 1 :] if ups else parts) or name
+    return inside(where, name, ", or pass images=, the folder that it is in (--images)")
 
 
 def find_files(
@@ -156,10 +148,9 @@ def find_files(
     owner: dict[Path, str] = {}
     for name, path in found.items():
         if owner.setdefault(path, name) != name:
-            raise InputError(
-                f"{source}: {owner[path]} and {name} are one photograph in {root}, "
-                f"{path.name}; put the missing one there, or remove one from the list"
-            )
+            both = f"{owner[path]} and {name} are one photograph in {root}, {path.name}"
+            remedy = "put the missing one there, or remove one from the list"
+            raise InputError(f"{source}: {both}; {remedy}")
     missing = [name for name in names if name not in found]
     if missing:
         _report_missing(source, root, missing, len(found), options.skip_missing)
@@ -170,24 +161,18 @@ def _report_missing(
     source: Path, root: Path, missing: list[str], found: int, skip: bool
 ) -> None:
     """Warn of missing photographs if they may be skipped, else raise."""
-    message = (
-        f"{source}: {len(missing)} of {len(missing) + found} photographs are missing "
-        f"in {root}"
-    )
+    count = f"{len(missing)} of {len(missing) + found} photographs"
+    message = f"{source}: {count} are missing in {root}"
+    if found and skip:
+        warn(f"{message} and left out: {', '.join(missing)}")
+        return
+    there = ", ".join(path.name for path in _photographs(root)[:_SHOWN])
+    remedy = "leave them out with skip_missing=True (--skip-missing)"
     if not found:
-        there = ", ".join(path.name for path in _photographs(root)[:_SHOWN])
-        raise InputError(
-            f"{message}, the first: {', '.join(missing[:_SHOWN])}; the folder has "
-            f"{there or 'none'}; put them there, or pass images=, the folder that they "
-            "are in (--images)"
-        )
-    if not skip:
-        raise InputError(
-            f"{message}, the first: {', '.join(missing[:_SHOWN])}; put them there, or "
-            "leave them out with skip_missing=True (--skip-missing)"
-        )
-    left = f"{message} and left out: {', '.join(missing)}"
-    warnings.warn(left, UserWarning, stacklevel=4)
+        message += f" (it has {there or 'none'})"
+        remedy = "pass images=, the folder that they are in (--images)"
+    first = ", ".join(missing[:_SHOWN])
+    raise InputError(f"{message}, the first: {first}; put them there, or {remedy}")
 
 
 def _find(
@@ -209,10 +194,7 @@ def _find(
 def _match_by_order(
     original: Path, root: Path, found: dict[str, Path]
 ) -> dict[str, Path]:
-    """Return the copies in ``root`` at the same position as the files ``found``.
-
-    The result is empty if the two folders have different numbers of photographs.
-    """
+    """Return the copies at the positions of ``found``; {} if there are not as many."""
     originals, copies = _photographs(original), _photographs(root)
     if len(originals) != len(copies):
         return {}
@@ -220,19 +202,17 @@ def _match_by_order(
     paired = {name: copy_of[path] for name, path in found.items() if path in copy_of}
     if paired:
         name = min(paired)
-        warnings.warn(
+        warn(
             f"{root}: none of the {len(copies)} photographs has a name as in "
             f"{original}; they are matched in the order of their names: "
-            f"{paired[name].name} is {name}",
-            UserWarning,
-            stacklevel=4,
+            f"{paired[name].name} is {name}"
         )
     return paired
 
 
 def _photographs(folder: Path) -> list[Path]:
     """Return all photographs in a folder and its subfolders, sorted by name."""
-    files = [p for p in folder.rglob("*") if is_photograph(p)]
+    files = filter(is_photograph, folder.rglob("*"))
     return sorted(files, key=lambda path: path.relative_to(folder).as_posix())
 
 
@@ -311,12 +291,9 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     found = {name: mask for name, mask in masks.items() if mask is not None}
     lacking = [name for name in masks if name not in found]
     if lacking:
-        warnings.warn(
+        warn(
             f"{folder}: {len(lacking)} of {len(masks)} photographs have no mask, the "
-            f"first: {', '.join(lacking[:_SHOWN])}; all of their pixels are used (a "
-            f"mask would be {PurePosixPath(lacking[0]).with_suffix('.png')})",
-            UserWarning,
-            stacklevel=3,
+            f"first: {', '.join(lacking[:_SHOWN])}; all of their pixels are used"
         )
     return found
 
@@ -337,22 +314,17 @@ def find_mask(
     name: str,
     listing: Callable[[Path], dict[str, Path]] = files_by_lowered_suffix,
 ) -> Path | None:
-    """Return the mask of a photograph, or None.
+    """Return the mask of a photograph in a folder, which need not exist, or None.
 
-    Args:
-      folder: folder of the masks; it need not exist.
-      name: name of the photograph. A mask has the same name, or ``.png`` appended
-        (COLMAP) or as its suffix. Upper and lower case of suffixes and the Unicode
-        composition may differ.
-      listing: returns the entries of a folder by `_lowered` name.
+    A mask has the photograph's name, or ``.png`` appended (COLMAP) or as its suffix;
+    case of suffixes and Unicode composition may differ. ``listing`` returns the entries
+    of a folder by `_lowered` name.
     """
     path = folder / inside(str(folder), name)
-    candidates = (path.name, path.name + ".png", path.stem + ".png")
-    exact = [path.with_name(mask) for mask in candidates]
-    found = next((mask for mask in exact if mask.is_file()), None)
-    if found is None:
-        files = listing(path.parent)
-        keys = [_lowered(mask) for mask in candidates]
-        loose = [files[key] for key in keys if key in files]
-        found = next((mask for mask in loose if mask.is_file()), None)
-    return found
+    names = (path.name, path.name + ".png", path.stem + ".png")
+    exact = next((p for p in map(path.with_name, names) if p.is_file()), None)
+    if exact is not None:
+        return exact
+    files = listing(path.parent)
+    loose = (files.get(_lowered(mask)) for mask in names)
+    return next((mask for mask in loose if mask and mask.is_file()), None)

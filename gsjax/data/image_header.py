@@ -56,25 +56,19 @@ def check_image(path: Path, data: Buffer) -> tuple[int, int]:
         raise InputError(f"{path}: the file is empty; {_REMEDY}")
     reader = _reader(data[:12])
     if reader is None:
-        raise InputError(
-            f"{path}: expected a PNG, JPEG, WebP, TIFF or BMP, got a file that starts "
-            f"with {data[:8]!r}; convert the photograph to PNG or JPEG"
-        )
+        got = f"a file that starts with {data[:8]!r}; convert it to PNG or JPEG"
+        raise InputError(f"{path}: expected a PNG, JPEG, WebP, TIFF or BMP, got {got}")
     try:
         width, height = reader(data)
     except (struct.error, IndexError, _Truncated) as error:
         detail = f" ({error})" if isinstance(error, _Truncated) else ""
-        raise InputError(
-            f"{path}: the image is truncated or damaged{detail}, got {len(data)} "
-            f"bytes; {_REMEDY}"
-        ) from error
+        what = f"the image is truncated or damaged{detail}, got {len(data)} bytes"
+        raise InputError(f"{path}: {what}; {_REMEDY}") from error
     if width < 1 or height < 1:
         raise InputError(f"{path}: got an image of {width} × {height} px; {_REMEDY}")
     if width * height > MAX_PIXELS:
-        raise InputError(
-            f"{path}: expected at most {MAX_PIXELS} pixels, got {width} × {height} px; "
-            "make it smaller"
-        )
+        got = f"{width} × {height} px; make it smaller"
+        raise InputError(f"{path}: expected at most {MAX_PIXELS} pixels, got {got}")
     return width, height
 
 

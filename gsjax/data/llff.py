@@ -18,9 +18,9 @@ from gsjax.data.types import (
     ReadOptions,
     View,
     intrinsic_matrix,
+    inverted,
     unexpected,
 )
-from gsjax.errors import InputError
 from gsjax.io.npy import read_npy
 from gsjax.runtime.files import read_bytes
 
@@ -43,10 +43,9 @@ def load_llff(path: Path, options: ReadOptions | None = None) -> Dataset:
     if options.poses_only and len(files) != len(table):
         files = [root / f"row_{index:04d}.png" for index in range(len(table))]
     if len(files) != len(table):
-        raise InputError(
-            f"{path}: expected {len(table)} photographs in {root}, one per row, got "
-            f"{len(files)}; rows have no names: put exactly their photographs there"
-        )
+        expected = f"{len(table)} photographs in {root}, one per row"
+        remedy = "rows have no names: put exactly their photographs there"
+        raise unexpected(path, expected, len(files), remedy)
     for file in files:
         check_name(file)
     views = [
@@ -58,22 +57,17 @@ def load_llff(path: Path, options: ReadOptions | None = None) -> Dataset:
 
 def _view(where: str, row: np.ndarray, file: Path) -> View:
     if not (np.abs(row) < MAX_COORDINATE).all():
-        raise unexpected(
-            where, "finite numbers", row.tolist(), "remove the row and its photograph"
-        )
+        remedy = "remove the row and its photograph"
+        raise unexpected(where, "finite numbers", row.tolist(), remedy)
     matrix = row[:15].reshape(3, 5)
     height, width, focal = matrix[:, 4].tolist()
-    sides = (width, height)
-    if not all(1 <= v <= MAX_SIDE and v % 1 == 0 for v in sides):
-        raise InputError(
-            f"{where}: expected a whole height and width from 1 to {MAX_SIDE}, got "
-            f"{height:g}, {width:g}; export the poses again"
-        )
+    if not all(1 <= side <= MAX_SIDE and side % 1 == 0 for side in (width, height)):
+        expected = f"a whole height and width from 1 to {MAX_SIDE}"
+        raise unexpected(where, expected, f"{height:g}, {width:g}")
     # Down, right, back → right, down, forward.
     block = matrix[:, [1, 0, 2]] * (1, 1, -1)
     rotation, _ = rigid(where, block)
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ matrix[:, 3]
+    viewmat = inverted(rotation, matrix[:, 3])
     K = intrinsic_matrix(where, (focal, focal), (width / 2, height / 2))
     return View(file.name, file, viewmat, K, int(width), int(height))
 
@@ -82,17 +76,14 @@ def read_poses(path: Path) -> np.ndarray:
     """Return the [N, 17] float64 table of a .npy file, whose size is checked first."""
     table = read_npy(str(path), read_bytes(path, "a poses_bounds.npy"))
     if table.shape[1:] != (_COLUMNS,) or table.dtype.kind != "f":
-        raise InputError(
-            f"{path}: expected floats of shape [N, {_COLUMNS}] in the header, got "
-            f"{table.dtype} {list(table.shape)}; pass a poses_bounds.npy"
-        )
+        expected = f"floats of shape [N, {_COLUMNS}] in the header"
+        got, remedy = f"{table.dtype} {list(table.shape)}", f"pass a {_FILE}"
+        raise unexpected(path, expected, got, remedy)
     return table.astype(np.float64)
 
 
-def _detect(path: Path) -> bool:
-    if path.is_dir():
-        return (path / _FILE).exists()
-    return path.suffix.lower() == ".npy"
-
-
-LLFF = Reader("LLFF", _detect, load_llff)
+LLFF = Reader(
+    "LLFF",
+    lambda p: (p / _FILE).exists() if p.is_dir() else p.suffix.lower() == ".npy",
+    load_llff,
+)

@@ -5,35 +5,15 @@ already in one frame.
 """
 
 import os
-import warnings
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from gsjax.cameras.distortion import Distortion
-from gsjax.data.image_files import (
-    check_factor,
-    find_file,
-    find_files,
-    image_folder,
-    inside,
-    last_parts,
-    original_folder,
-)
+from gsjax.data import image_files
 from gsjax.data.image_header import image_size
-from gsjax.data.transforms_fields import (
-    Frame,
-    first_number,
-    intrinsics_of,
-    model_of,
-    pose_of,
-    read_frames,
-    shown,
-    size_of,
-    text_of,
-    warn_of_scaled,
-)
+from gsjax.data.transforms_fields import Frame, read_frames, shown, warn_of_scaled
 from gsjax.data.types import (
     Dataset,
     Reader,
@@ -43,6 +23,7 @@ from gsjax.data.types import (
     unexpected,
 )
 from gsjax.errors import InputError
+from gsjax.io.common import warn
 from gsjax.io.point_cloud import read_point_cloud
 
 _PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -61,9 +42,8 @@ def find_transforms(folder: Path) -> list[Path]:
     """
     if (folder / "transforms.json").exists():
         return [folder / "transforms.json"]
-    train, test, val = (
-        folder / f"transforms_{s}.json" for s in ("train", "test", "val")
-    )
+    names = (f"transforms_{split}.json" for split in ("train", "test", "val"))
+    train, test, val = (folder / name for name in names)
     held_out = val if train.exists() and not test.exists() else test
     return [path for path in (train, held_out) if path.exists()]
 
@@ -75,20 +55,20 @@ def load_nerf(path: Path, options: ReadOptions | None = None) -> Dataset:
       InputError: see `load_dataset`.
     """
     options = options or ReadOptions()
-    check_factor(options.factor)
+    image_files.check_factor(options.factor)
     paths = find_transforms(path) if path.is_dir() else [path]
     if not paths:
         raise unexpected(path, "a transforms.json", "none", "pass its folder")
     folder = root = paths[0].parent
     elsewhere = options.images is not None or (options.factor or 1) > 1
     if elsewhere:  # nerfstudio stores smaller copies in a folder of their own, images_4
-        root = image_folder(folder, options)
+        root = image_files.image_folder(folder, options)
     views: list[View] = []
     lists = [read_frames(path) for path in paths]
     for path, frames in zip(paths, lists):
         moved = options.images is not None or options.poses_only
         names = [_file_path(frame, moved) for frame in frames]
-        files = find_files(path, root, names, options, elsewhere=elsewhere)
+        files = image_files.find_files(path, root, names, options, elsewhere=elsewhere)
         # A second list, transforms_val.json too, is held out.
         default = _SPLITS.get(path.stem) if path == paths[0] else "test"
         splits = _splits(path, frames, default)
@@ -96,11 +76,11 @@ def load_nerf(path: Path, options: ReadOptions | None = None) -> Dataset:
         for index, (frame, name) in enumerate(zip(frames, names)):
             if name not in files or splits[index] == _UNUSED:
                 continue
-            viewmat, scale = pose_of(frame)
+            viewmat, scale = frame.pose()
             if scale != 1:
                 scaled.append((index, scale))
             file = files[name]
-            size = size_of(frame) or _size_of_file(frame, folder, root, file, options)
+            size = frame.size() or _size_of_file(frame, folder, root, file, options)
             view = _view(frame, _name(file, folder, root), file, viewmat, size)
             mask = None if options.poses_only else _mask(frame, folder)
             views.append(replace(view, mask=mask, split=splits[index]))
@@ -113,18 +93,11 @@ def load_nerf(path: Path, options: ReadOptions | None = None) -> Dataset:
 
 
 def _file_path(frame: Frame, moved: bool) -> str:
-    """Return the path of a photograph in the folder, as the list has it.
-
-    For photographs ``moved`` to another folder it is the last part of the name that
-    does not leave the folder.
-    """
-    name = text_of(frame, "file_path")
+    """Return the listed path, or its last parts for photographs that were moved."""
+    name = frame.text("file_path")
     if not name:
-        raise unexpected(f"{frame.where}: file_path", "text", shown(name))
-    if moved:
-        return str(inside(frame.where, last_parts(name) or name))
-    offer = ", or pass images=, the folder that it is in (--images)"
-    return str(inside(frame.where, name, offer))
+        raise frame.unexpected("file_path", "text", name)
+    return str(image_files.listed_path(frame.where, name, moved))
 
 
 def _name(file: Path, folder: Path, root: Path) -> str:
@@ -137,32 +110,27 @@ def _name(file: Path, folder: Path, root: Path) -> str:
 def _splits(path: Path, frames: list[Frame], default: str | None) -> list[str | None]:
     """Return the split of each frame, from nerfstudio's lists of names or ``default``.
 
-    A frame in both lists is held out. If there is a training list, frames in no list
-    are unused.
+    A frame in both lists is held out; beside a training list, one in none is unused.
     """
     listed = {key: _listed(path, frames, key) for key in ("val", "train", "test")}
     # Validation views replace missing test views, else they are unused.
     held_out = listed["test"] or listed["val"]
     both = listed["train"] & held_out
     if both:
-        warnings.warn(
+        warn(
             f"{path}: {len(both)} of {len(frames)} frames are in the training and the "
-            f"test list, the first: {min(both)}; they are held out",
-            UserWarning,
-            stacklevel=3,
+            f"test list, the first: {min(both)}; they are held out"
         )
     named = dict.fromkeys(listed["val"], _UNUSED)
     named |= dict.fromkeys(listed["train"], "train")
     named |= dict.fromkeys(held_out, "test")
-    names = [_spelt(str(text_of(frame, "file_path"))) for frame in frames]
+    names = [_spelt(str(frame.text("file_path"))) for frame in frames]
     others = [name for name in names if name not in named]
     if listed["train"] and others:
         default = _UNUSED
-        warnings.warn(
+        warn(
             f"{path}: {len(others)} of {len(names)} frames are in no list, the first: "
-            f"{others[0]}; they are left out, as nerfstudio leaves them",
-            UserWarning,
-            stacklevel=3,
+            f"{others[0]}; they are left out, as nerfstudio leaves them"
         )
     return [named.get(name, default) for name in names]
 
@@ -173,12 +141,11 @@ def _listed(path: Path, frames: list[Frame], split: str) -> set[str]:
     if names is not None and not isinstance(names, list):
         raise unexpected(f"{path}: {split}_filenames", "a list", shown(names))
     found = {_spelt(str(name)) for name in names or ()}
-    strange = found - {_spelt(str(text_of(frame, "file_path"))) for frame in frames}
+    strange = found - {_spelt(str(frame.text("file_path"))) for frame in frames}
     if strange:
         raise InputError(
             f"{path}: {split}_filenames: {len(strange)} of {len(found)} names are not "
-            f"the file_path of a frame, the first: {min(strange)!r}; export the file "
-            "again"
+            f"the file_path of a frame, the first: {min(strange)!r}; export it again"
         )
     return found
 
@@ -192,18 +159,10 @@ def _view(
     frame: Frame, name: str, file: Path, viewmat: np.ndarray, size: tuple[int, int]
 ) -> View:
     lens = _distortion(frame)
-    width, height = size
     model = "fisheye" if lens is not None and lens.model == "fisheye" else "pinhole"
-    fx, fy, cx, cy = intrinsics_of(frame, width, height, model)
-    return View(
-        name=name,
-        image=file,
-        viewmat=viewmat,
-        K=intrinsic_matrix(frame.where, (fx, fy), (cx, cy)),
-        width=width,
-        height=height,
-        lens=lens,
-    )
+    fx, fy, cx, cy = frame.intrinsics(*size, model)
+    K = intrinsic_matrix(frame.where, (fx, fy), (cx, cy))
+    return View(name, file, viewmat, K, *size, lens)
 
 
 def _size_of_file(
@@ -213,39 +172,44 @@ def _size_of_file(
 
     Intrinsics in px refer to the original; an angle of view holds for any copy.
     """
-    if any(first_number(frame, key) is not None for key in _IN_PIXELS):
-        original = find_file(folder, str(text_of(frame, "file_path")))
-        originals = original_folder(root, options)
+    where = f"{frame.where}: no image size: w and h are missing, and"
+    if any(frame.number(key) is not None for key in _IN_PIXELS):
+        original = image_files.find_file(folder, str(frame.text("file_path")))
+        originals = image_files.original_folder(root, options)
         if original is None and originals is not None:
-            original = find_file(originals, file.relative_to(root).as_posix())
+            name = file.relative_to(root).as_posix()
+            original = image_files.find_file(originals, name)
             if original is None:
                 raise InputError(
-                    f"{frame.where}: no image size: w and h are missing, and the "
-                    f"original of the smaller copy {file} does not exist; give w and h "
-                    "in the file, the size that fl_x, cx and cy refer to"
+                    f"{where} the original of the smaller copy {file} does not exist; "
+                    "give w and h in the file, the size that fl_x, cx and cy refer to"
                 )
         file = original or file
     if not file.exists():  # with poses_only
         raise InputError(
-            f"{frame.where}: no image size: w and h are missing, and {file} does not "
-            "exist; give w and h in the file, or render from the file itself with a "
-            "size (--cameras FILE --size WxH)"
+            f"{where} {file} does not exist; give w and h in the file, or render from "
+            "the file itself with a size (--cameras FILE --size WxH)"
         )
     return image_size(file)
 
 
 def _mask(frame: Frame, folder: Path) -> Path | None:
     """Return the mask that a frame names, if any."""
-    name = text_of(frame, "mask_path")
+    name = frame.text("mask_path")
     if name is None:
         return None
-    mask = folder / inside(frame.where, name)
-    if not mask.is_file():
+    return _file(frame, "mask_path", name, folder)
+
+
+def _file(frame: Frame, key: str, name: str, folder: Path, remedy: str = "") -> Path:
+    """Return the file that a key names, which must exist."""
+    path = folder / image_files.inside(frame.where, name)
+    if not path.is_file():
         raise InputError(
-            f"{frame.where}: mask_path {shown(name)}: no such file in {folder}; put it "
-            "there"
+            f"{frame.where}: {key} {shown(name)}: no such file in {folder}; put it "
+            f"there{remedy}"
         )
-    return mask
+    return path
 
 
 def _warn_of_dynamic_masks(views: list[View]) -> None:
@@ -253,35 +217,30 @@ def _warn_of_dynamic_masks(views: list[View]) -> None:
     masks = [v.image.with_name(f"dynamic_mask_{v.image.stem}.png") for v in views]
     there = [mask for mask in masks if mask.is_file()]
     if there:
-        warnings.warn(
+        warn(
             f"{there[0].parent}: {len(there)} masks of instant-ngp are ignored, the "
             f"first: {there[0].name}; to use them, invert them (black is excluded) and "
-            "name them in the list by mask_path",
-            UserWarning,
-            stacklevel=3,
+            "name them in the list by mask_path"
         )
 
 
 def _distortion(frame: Frame) -> Distortion | None:
-    model = model_of(frame)
-    if model not in (*_PERSPECTIVE, *_FISHEYE):
+    model, supported = frame.model(), (*_PERSPECTIVE, *_FISHEYE)
+    if model not in supported:
         raise InputError(
             f"{frame.where}: camera_model {shown(model)} is not supported; undistort "
-            f"the photographs to a pinhole first; supported: "
-            f"{', '.join((*_PERSPECTIVE, *_FISHEYE))}"
+            f"the photographs to a pinhole first; supported: {', '.join(supported)}"
         )
     k1, k2, k3, k4, p1, p2 = _coefficients(frame)
     if model in _FISHEYE:
         if p1 or p2:
-            raise InputError(
-                f"{frame.where}: a fisheye has no p1, p2, got {p1}, {p2}; undistort "
-                "the photographs first"
-            )
+            what = f"{frame.where}: a fisheye has no p1, p2, got {p1}, {p2}"
+            raise InputError(f"{what}; undistort the photographs first")
         return Distortion("fisheye", (k1, k2, k3, k4))
     if not any((k1, k2, k3, k4, p1, p2)):
         return None
     # nerfstudio and instant-ngp read no rational denominator either.
-    higher = {key: first_number(frame, key) for key in ("k5", "k6")} | {"k4": k4}
+    higher = {key: frame.number(key) for key in ("k5", "k6")} | {"k4": k4}
     if any(higher.values()):
         raise InputError(
             f"{frame.where}: {', '.join(k for k, v in higher.items() if v)} of a "
@@ -294,14 +253,12 @@ def _coefficients(frame: Frame) -> list[float]:
     """Return k1 k2 k3 k4 p1 p2; missing ones are 0."""
     given = frame.sources[0].get("distortion_params")
     if given is None:
-        return [first_number(frame, key) or 0.0 for key in _COEFFICIENTS]
+        return [frame.number(key) or 0.0 for key in _COEFFICIENTS]
     if not isinstance(given, list) or len(given) != len(_COEFFICIENTS):
-        raise InputError(
-            f"{frame.where}: distortion_params: expected the numbers "
-            f"{' '.join(_COEFFICIENTS)}, got {shown(given)}; export the file again"
-        )
+        expected = f"the numbers {' '.join(_COEFFICIENTS)}"
+        raise frame.unexpected("distortion_params", expected, given)
     named = Frame(frame.where, (dict(zip(_COEFFICIENTS, given)), {}))
-    return [first_number(named, key) or 0.0 for key in _COEFFICIENTS]
+    return [named.number(key) or 0.0 for key in _COEFFICIENTS]
 
 
 def _points(frame: Frame, folder: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -310,20 +267,13 @@ def _points(frame: Frame, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     if path is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not isinstance(path, str):
-        raise unexpected(f"{frame.where}: ply_file_path", "text", shown(path))
-    cloud = folder / inside(f"{folder}: ply_file_path", path)
-    if not cloud.is_file():
-        raise InputError(
-            f"{frame.where}: ply_file_path {shown(path)}: no such file in {folder}; "
-            "put it there, or remove ply_file_path from the list to go without points"
-        )
-    return read_point_cloud(cloud)
+        raise frame.unexpected("ply_file_path", "text", path)
+    remedy = ", or remove ply_file_path from the list to go without points"
+    return read_point_cloud(_file(frame, "ply_file_path", path, folder, remedy))
 
 
-def _detect(path: Path) -> bool:
-    if path.is_dir():
-        return bool(find_transforms(path))
-    return path.suffix.lower() == ".json"
-
-
-TRANSFORMS = Reader("transforms.json", _detect, load_nerf)
+TRANSFORMS = Reader(
+    "transforms.json",
+    lambda p: bool(find_transforms(p)) if p.is_dir() else p.suffix.lower() == ".json",
+    load_nerf,
+)

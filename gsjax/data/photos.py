@@ -19,8 +19,9 @@ from gsjax.data.decode import decode, warn_of_damage
 from gsjax.data.image_header import image_size
 from gsjax.data.types import Photo, View, unexpected
 from gsjax.errors import InputError
+from gsjax.io.common import to_bytes
 from gsjax.io.images import opencv
-from gsjax.runtime.machine import all_of, usable_cores
+from gsjax.runtime.machine import map_concurrently, usable_cores
 
 # Relative deviation of an aspect ratio, besides rounding by 1 px a side.
 _ASPECT_TOLERANCE = 0.01
@@ -63,9 +64,8 @@ def _files(views: Sequence[View]) -> list[Path]:
 
 def _load(view: View, max_size: int | None) -> Photo:
     if max_size is not None and max_size < 1:
-        raise unexpected(
-            "max_size", "at least 1 px", max_size, "pass None to keep the size"
-        )
+        remedy = "pass None to keep the size"
+        raise unexpected("max_size", "at least 1 px", max_size, remedy)
     as_stored = opencv().IMREAD_UNCHANGED  # does not rotate
     stored = decode(view.image, as_stored, partial(_ratio, view))
     pixels, alpha = _to_rgb(view.image, stored)
@@ -73,11 +73,6 @@ def _load(view: View, max_size: int | None) -> Photo:
     K = scaled_intrinsics(view.K, *_ratio(view, width, height))
     invalid = None if view.mask is None else _masked(view.mask, width, height)
     if view.lens is not None:
-        if max(width, height) > _MAX_REMAP:
-            raise InputError(
-                f"{view.image}: expected at most {_MAX_REMAP} px a side to undistort, "
-                f"got {width} × {height}; make it smaller"
-            )
         given = (pixels, alpha, invalid)
         pixels, alpha, invalid = _undistorted(view.image, view.lens, K, *given)
     if max_size is not None and max(width, height) > max_size:
@@ -112,7 +107,9 @@ def load_photos(
         for start in range(0, len(views), _BATCH * workers):
             batch = views[start : start + _BATCH * workers]
             with warn_of_damage(_files(batch)):
-                photos += all_of(pool, lambda view: _load(view, max_size), batch)
+                photos += map_concurrently(
+                    pool, lambda view: _load(view, max_size), batch
+                )
             if progress is not None:
                 for done in range(start, len(photos)):
                     progress(done + 1, len(views))
@@ -125,10 +122,8 @@ def _to_rgb(path: Path, stored: np.ndarray) -> tuple[np.ndarray, np.ndarray | No
         # Rounds 255·v/65535 = v/257; 257 is odd, so there are no ties.
         stored = ((stored.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if stored.dtype != np.uint8:
-        raise InputError(
-            f"{path}: expected samples of 8 or 16 bits, got {stored.dtype}; convert "
-            "the photograph to PNG or JPEG"
-        )
+        remedy = "convert the photograph to PNG or JPEG"
+        raise unexpected(path, "samples of 8 or 16 bits", stored.dtype, remedy)
     channels = 1 if stored.ndim == 2 else stored.shape[2]
     if channels == 1:
         return np.repeat(stored.reshape(*stored.shape[:2], 1), 3, axis=2), None
@@ -144,6 +139,7 @@ def _to_rgb(path: Path, stored: np.ndarray) -> tuple[np.ndarray, np.ndarray | No
 def _ratio(view: View, width: int, height: int) -> tuple[float, float]:
     """Return the size of the file over the size that the camera refers to."""
     sx, sy = width / view.width, height / view.height
+    camera, got = f"{view.width} × {view.height}", f"{width} × {height} px"
     # Rounding moves either side by up to 1 px.
     tolerance = _ASPECT_TOLERANCE + 1 / width + 1 / height
     if abs(np.log(sx / sy)) > tolerance:
@@ -151,16 +147,11 @@ def _ratio(view: View, width: int, height: int) -> tuple[float, float]:
         remedy = "use the photographs that the cameras were estimated from"
         if turned:
             remedy = f"it was rotated, or its EXIF (ignored here) rotates it: {remedy}"
-        raise InputError(
-            f"{view.image}: expected the aspect ratio of its camera, {view.width} × "
-            f"{view.height}, got {width} × {height} px; {remedy}"
-        )
+        expected = f"the aspect ratio of its camera, {camera}"
+        raise unexpected(view.image, expected, got, remedy)
     if max(sx, sy) > _MAX_RATIO:
-        raise InputError(
-            f"{view.image}: expected at most {_MAX_RATIO} times the size of its "
-            f"camera, {view.width} × {view.height}, got {width} × {height} px; "
-            "make it smaller"
-        )
+        expected = f"at most {_MAX_RATIO} times the size of its camera, {camera}"
+        raise unexpected(view.image, expected, got, "make it smaller")
     return sx, sy
 
 
@@ -191,11 +182,12 @@ def _check_mask(path: Path, size: tuple[int, int], across: int, down: int) -> No
     rounding = 1 / across + 1 / down + 1 / width + 1 / height
     stretched = abs(np.log(across / width * height / down))
     if stretched > _ASPECT_TOLERANCE + rounding or across > _MAX_RATIO * width:
-        raise InputError(
-            f"{path}: expected a mask of the aspect ratio of its photograph, {width} × "
-            f"{height} px, and at most {_MAX_RATIO} times as wide, got {across} × "
-            f"{down} px; make one of the photograph's size"
+        expected = (
+            f"a mask of the aspect ratio of its photograph, {width} × {height} px"
         )
+        expected += f", and at most {_MAX_RATIO} times as wide"
+        remedy = "make one of the photograph's size"
+        raise unexpected(path, expected, f"{across} × {down} px", remedy)
 
 
 def _masked(path: Path, width: int, height: int) -> np.ndarray:
@@ -220,10 +212,8 @@ def _filtered(
     weight = alpha.astype(np.float32)
     mean = filter_(weight)[..., None]
     colors = filter_(pixels * weight[..., None])
-    mean_or_1 = np.where(mean > 0, mean, 1)
-    colors = np.where(mean > 0, colors / mean_or_1, filter_(pixels))
-    clipped = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
-    return clipped, np.clip(np.rint(mean[..., 0]), 0, 255).astype(np.uint8)
+    colors = np.where(mean > 0, colors / np.where(mean > 0, mean, 1), filter_(pixels))
+    return to_bytes(colors), to_bytes(mean[..., 0])
 
 
 _KEPT = 2  # maps are several times as large as a photograph
@@ -261,22 +251,19 @@ def _undistorted(
     invalid: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     height, width = pixels.shape[:2]
+    if max(width, height) > _MAX_REMAP:
+        expected = f"at most {_MAX_REMAP} px a side to undistort"
+        raise unexpected(path, expected, f"{width} × {height}", "make it smaller")
     map_x, map_y, seen = _maps(lens, K, width, height)
     if seen.mean() < _MIN_VALID:
         values = ", ".join(f"{value:g}" for value in lens.coefficients)
         raise InputError(
             f"{path}: {int(seen.sum())} of {seen.size:,} pixels are left after "
-            f"undistortion ({lens.model}, {values}); estimate the camera again, or "
-            "remove the photograph"
+            f"undistortion ({lens.model}, {values}); estimate the camera again"
         )
     cv2 = opencv()
-    remap = partial(
-        cv2.remap,
-        map1=map_x,
-        map2=map_y,
-        interpolation=cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    options = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REPLICATE}
+    remap = partial(cv2.remap, map1=map_x, map2=map_y, **options)
     pixels, alpha = _filtered(remap, pixels, alpha)
     if invalid is None:
         return pixels, alpha, ~seen

@@ -1,8 +1,4 @@
-"""Registry of the dataset formats.
-
-A reader from outside of the package is passed to `load_dataset` as
-``readers=(*READERS, mine)``.
-"""
+"""Registry of dataset formats; `load_dataset` takes ``readers=(*READERS, mine)``."""
 
 from gsjax.data.colmap import COLMAP, NERFSTUDIO_COLMAP
 from gsjax.data.llff import LLFF

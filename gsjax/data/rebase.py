@@ -49,10 +49,8 @@ def far_origin(centres: np.ndarray, points: np.ndarray) -> np.ndarray:
     """
     middle = np.median(centres, axis=0)
     spread = _spread(centres, middle)
-    if len(points):
-        spread = max(spread, _spread(points, middle))
-    else:
-        spread *= _VIEW_SPREAD
+    farther = _spread(points, middle) if len(points) else _VIEW_SPREAD * spread
+    spread = max(spread, farther)
     # A single camera has no spread; 1 world unit is then as good a guess as any.
     spread = spread or 1.0
     # A multiple of a power of two near the spread has few significant bits.

@@ -4,11 +4,11 @@ Bytes take a fraction of the memory of Python's strings.
 """
 
 import codecs
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 from gsjax.errors import InputError
+from gsjax.io.common import warn
 from gsjax.io.numerals import BLOCK
 from gsjax.runtime.files import read_bytes
 
@@ -16,12 +16,8 @@ from gsjax.runtime.files import read_bytes
 def read_text(path: Path, expected: str) -> bytes:
     """Return the UTF-8 text of a file, without byte order mark and carriage returns.
 
-    Args:
-      path: path of the file.
-      expected: kind of file to pass instead, for the message.
-
     Raises:
-      InputError: if the file cannot be read or is not UTF-8.
+      InputError: if the file, ``expected`` in the message, cannot be read or decoded.
     """
     data = read_bytes(path, expected).removeprefix(codecs.BOM_UTF8)
     decoder = codecs.getincrementaldecoder("utf-8")()
@@ -75,17 +71,11 @@ def blocks(path: Path, data: bytes, most: int) -> Iterator[tuple[int, bytes]]:
 
 def _warn_if_unterminated(path: Path, data: bytes) -> None:
     if data and not data.endswith(b"\n"):
-        warnings.warn(
-            f"{path}: the last line has no end; the file may be truncated: export or "
-            "copy it again",
-            UserWarning,
-            stacklevel=3,
-        )
+        what = "the last line has no end; the file may be truncated"
+        warn(f"{path}: {what}: export or copy it again")
 
 
 def too_long(where: str, most: int) -> InputError:
     """Return the error for a line that is longer than any record."""
-    return InputError(
-        f"{where}: expected a line of at most {most} bytes; the file is damaged or of "
-        "another kind: export or copy it again"
-    )
+    what = "the file is damaged or of another kind: export or copy it again"
+    return InputError(f"{where}: expected a line of at most {most} bytes; {what}")

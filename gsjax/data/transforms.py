@@ -1,12 +1,13 @@
-"""Cameras to render, from the `transforms.json` of NeRF, instant-ngp or nerfstudio.
+"""Cameras from and to the `transforms.json` of NeRF, instant-ngp or nerfstudio.
 
 The files have camera → world matrices in OpenGL axes (x right, y up, z backward): flip
 columns 1 and 2 and invert for world → camera in OpenCV axes. Everything is float64 on
 the host until `make_camera`.
 """
 
+import json
 import re
-import warnings
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -18,18 +19,14 @@ from gsjax.data.extent import near_plane
 from gsjax.data.rebase import far_origin, shifted
 from gsjax.data.transforms_fields import (
     Frame,
-    first_number,
-    intrinsics_of,
-    model_of,
-    pose_of,
+    no_size,
     read_frames,
     shown,
-    size_of,
-    text_of,
     warn_of_scaled,
 )
-from gsjax.data.types import unexpected
+from gsjax.data.types import inverted, unexpected
 from gsjax.errors import InputError
+from gsjax.io.common import warn
 
 # `camera_model` of the file → lens of `make_camera`; distortion is not rendered.
 _MODELS = {
@@ -95,7 +92,7 @@ def _load(
     ):
         raise unexpected("size", "whole (width, height) ≥ 1", size, "pass (800, 600)")
     frames = read_frames(path)
-    poses = [pose_of(frame) for frame in frames]
+    poses = [frame.pose() for frame in frames]
     centres = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose, _ in poses])
     origin = far_origin(centres, np.zeros((0, 3))) if near_origin else np.zeros(3)
     near = near_plane(centres)
@@ -109,80 +106,50 @@ def _load(
     factors = enumerate(factor for _, factor in poses)
     warn_of_scaled(path, [(index, factor) for index, factor in factors if factor != 1])
     if distorted:
-        warnings.warn(
-            f"{path}: lens distortion ({', '.join(sorted(distorted))}) is ignored; "
-            "images are rendered without it",
-            UserWarning,
-            stacklevel=3,
-        )
+        keys = ", ".join(sorted(distorted))
+        warn(f"{path}: lens distortion ({keys}) is ignored and not rendered")
     return entries, origin
-
-
-# --- intrinsics ---
 
 
 def _camera(
     frame: Frame, viewmat: np.ndarray, size: tuple[int, int] | None, near: float
 ) -> Camera:
-    model = _model(frame)
-    width, height = _size(frame, size)
-    fx, fy, cx, cy = intrinsics_of(frame, width, height, model)
-    out_width, out_height = (width, height) if size is None else size
-    sx, sy = out_width / width, out_height / height
-    K = np.asarray([[sx * fx, 0, sx * cx], [0, sy * fy, sy * cy], [0, 0, 1]])
-    try:
-        with np.errstate(over="ignore"):
-            return make_camera(
-                viewmat=viewmat,
-                K=K,
-                width=int(out_width),
-                height=int(out_height),
-                near=near,
-                lens=model,
-            )
-    except InputError as error:
-        raise InputError(f"{frame.where}: {error}") from error
-
-
-def _model(frame: Frame) -> str:
-    name = model_of(frame)
+    name = frame.model()
     model = _MODELS.get(name)
     if model is None:
         raise InputError(
             f"{frame.where}: camera_model {shown(name)} cannot be rendered; supported: "
             f"{', '.join(_MODELS)}; undistort the images to a pinhole first"
         )
-    return model
-
-
-def _size(frame: Frame, size: tuple[int, int] | None) -> tuple[int, int]:
-    """Return the width and height that the intrinsics of the file refer to."""
-    found = size_of(frame) or size
+    found = frame.size() or size
     if found is None:
-        raise InputError(
-            f"{frame.where}: no image size: w is missing, h is missing; give both in "
-            "the file, or pass size=(width, height), on the command line --size WxH"
-        )
-    return found
+        raise no_size(frame.where)
+    width, height = found
+    fx, fy, cx, cy = frame.intrinsics(width, height, model)
+    out_width, out_height = (width, height) if size is None else size
+    sx, sy = out_width / width, out_height / height
+    K = np.asarray([[sx * fx, 0, sx * cx], [0, sy * fy, sy * cy], [0, 0, 1]])
+    try:
+        with np.errstate(over="ignore"):
+            pixels = {"width": int(out_width), "height": int(out_height)}
+            return make_camera(viewmat=viewmat, K=K, **pixels, near=near, lens=model)
+    except InputError as error:
+        raise InputError(f"{frame.where}: {error}") from error
 
 
 def _distortion(frame: Frame) -> list[str]:
     """Return the keys of nonzero distortion coefficients."""
-    found = [key for key in _DISTORTION if first_number(frame, key)]
+    found = [key for key in _DISTORTION if frame.number(key)]
     coefficients = frame.get("distortion_params")  # nerfstudio, per frame
     if isinstance(coefficients, list) and any(coefficients):
         found.append("distortion_params")
     return found
 
 
-# --- names ---
-
-
 def _unique_name(frame: Frame, index: int, used: dict[str, int]) -> str:
     """Return a file name without suffix, unique even if case is ignored."""
-    base = Path(
-        (text_of(frame, "file_path") or "").replace("\\", "/").rpartition("/")[2]
-    ).stem
+    path = (frame.text("file_path") or "").replace("\\", "/")
+    base = Path(path.rpartition("/")[2]).stem
     base = re.sub(r"[^\w.\- ]", "_", base).strip(". ")
     base = base.encode()[:_MAX_NAME_BYTES].decode(errors="ignore").strip(". ")
     base = base or f"frame_{index:05d}"
@@ -192,3 +159,53 @@ def _unique_name(frame: Frame, index: int, used: dict[str, int]) -> str:
         name = f"{base}_{used[key]}"
     used[name.casefold()] = 0
     return name
+
+
+def transforms_json(
+    entries: Sequence[CameraEntry], *, ply_file_path: str | None = None
+) -> str:
+    """Return the text of a `transforms.json` with one frame per camera.
+
+    Values that all cameras share (intrinsics, size, lens) are at the top level, the
+    others in the frames. The format has no near and far planes.
+
+    Args:
+      entries: names and single (unbatched) cameras.
+      ply_file_path: name of a point cloud beside the file, for nerfstudio.
+
+    Raises:
+      InputError: if a camera is a batch.
+    """
+    frames = [_frame_of(entry) for entry in entries]
+    shared = {
+        key: value
+        for key, value in (frames[0].items() if frames else ())
+        if key not in ("file_path", "transform_matrix")
+        and all(frame[key] == value for frame in frames)
+    }
+    frames = [{k: v for k, v in f.items() if k not in shared} for f in frames]
+    if ply_file_path is not None:
+        shared["ply_file_path"] = ply_file_path
+    return json.dumps({**shared, "frames": frames}, indent=1, allow_nan=False) + "\n"
+
+
+def _frame_of(entry: CameraEntry) -> dict:
+    camera = entry.camera
+    if camera.batched:
+        where, remedy = f"camera {entry.name!r}", "pass them one by one"
+        raise unexpected(where, "a single camera", "a batch", remedy)
+    viewmat = np.asarray(camera.viewmat, np.float64)
+    matrix = inverted(viewmat[:3, :3], viewmat[:3, 3])
+    matrix[:3, 1:3] *= -1  # OpenCV axes to OpenGL axes
+    K = np.asarray(camera.K, np.float64)
+    return {
+        "camera_model": camera.lens.name.upper(),
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": K[0, 0],
+        "fl_y": K[1, 1],
+        "cx": K[0, 2],
+        "cy": K[1, 2],
+        "file_path": f"{entry.name}.png",
+        "transform_matrix": matrix.tolist(),
+    }

@@ -32,28 +32,26 @@ def unexpected(
 def intrinsic_matrix(
     where: str, focals: tuple[float, float], centre: tuple[float, float]
 ) -> np.ndarray:
-    """Return the [3, 3] intrinsics of two focal lengths and a principal point, in px.
-
-    Args:
-      where: source of the numbers, for messages.
-      focals: fx and fy.
-      centre: cx and cy.
+    """Return the [3, 3] intrinsics of focal lengths (fx, fy) and a centre (cx, cy), px.
 
     Raises:
-      InputError: if a value is outside of the range that can be rendered.
+      InputError: beginning with ``where``, if a value cannot be rendered.
     """
-    (fx, fy), (cx, cy) = focals, centre
+    (fx, fy), (cx, cy), remedy = focals, centre, "estimate the camera again"
     if not all(_MIN_LENGTH < focal < _MAX_LENGTH for focal in focals):
-        raise InputError(
-            f"{where}: expected focal lengths above {_MIN_LENGTH:g} and below "
-            f"{_MAX_LENGTH:g} px, got {fx:g}, {fy:g}; estimate the camera again"
-        )
+        expected = f"focal lengths above {_MIN_LENGTH:g} and below {_MAX_LENGTH:g} px"
+        raise unexpected(where, expected, f"{fx:g}, {fy:g}", remedy)
     if not all(abs(value) < _MAX_LENGTH for value in centre):
-        raise InputError(
-            f"{where}: expected a principal point within {_MAX_LENGTH:g} px, got "
-            f"{cx:g}, {cy:g}; estimate the camera again"
-        )
+        expected = f"a principal point within {_MAX_LENGTH:g} px"
+        raise unexpected(where, expected, f"{cx:g}, {cy:g}", remedy)
     return np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
+
+
+def inverted(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return the [4, 4] inverse of a pose: a rotation [3, 3] and a position [3]."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation.T, -rotation.T @ position
+    return matrix
 
 
 @dataclass(frozen=True)
@@ -126,10 +124,9 @@ class ReadOptions(NamedTuple):
 
 
 class Reader(NamedTuple):
-    """A dataset format, as a pair of functions.
+    """A named dataset format, as a pair of functions.
 
     Attributes:
-      name: name of the format.
       detect: returns whether an existing path is a dataset of this format. It looks at
         file names only and does not raise on damaged files.
       load: reads the cameras and points of that path. `load_dataset` then sorts the
@@ -158,14 +155,7 @@ class Photo(NamedTuple):
     K: np.ndarray
 
     def require(self, name: str) -> None:
-        """Check the shapes and types of the arrays.
-
-        Args:
-          name: name of the view, for messages.
-
-        Raises:
-          InputError: if an array does not match the attributes above.
-        """
+        """Raise `InputError`, for view ``name``, if an array is not as above."""
         size = np.shape(self.pixels)[:2]
         arrays = {
             "pixels": ((*size, 3), np.dtype(np.uint8)),
@@ -180,9 +170,7 @@ class Photo(NamedTuple):
             array = np.asarray(value)
             fits = array.shape == shape and dtype in (None, array.dtype)
             if not fits or array.size == 0:
-                raise unexpected(
-                    f"{name}: {part} of the photo",
-                    f"{dtype or 'numbers'} of shape {shape}",
-                    f"{array.dtype} of shape {array.shape}",
-                    "use `load_photo` or `make_dataset`",
-                )
+                expected = f"{dtype or 'numbers'} of shape {shape}"
+                got = f"{array.dtype} of shape {array.shape}"
+                remedy = "use `load_photo` or `make_dataset`"
+                raise unexpected(f"{name}: {part} of the photo", expected, got, remedy)

@@ -1,18 +1,17 @@
 """Selection of the sharpest video frame in each of several time windows."""
 
 import os
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from gsjax.data.decode import captured_stderr
 from gsjax.data.image_files import SUFFIXES
 from gsjax.data.types import unexpected
 from gsjax.errors import InputError
-from gsjax.io.images import opencv, shrink
+from gsjax.io.common import warn
+from gsjax.io.images import captured_stderr, opencv, shrink
 
 _COMPLETE = 0.9  # share of the frames: declared numbers are often slightly off
 _JUDGED_AT = 640  # px: keeps the noise of single pixels out of the sharpness
@@ -50,9 +49,8 @@ def sharpest_frames(path: Path, windows: int, max_size: int = 0) -> Iterator[Fra
     """
     total = _count(path)
     if total < 2:
-        raise unexpected(
-            path, "a video of at least 2 frames", total, "pass a longer one"
-        )
+        expected = "a video of at least 2 frames"
+        raise unexpected(path, expected, total, "pass a longer one")
     return _sharpest(path, min(windows, total), total, max_size)
 
 
@@ -69,12 +67,8 @@ def _sharpest(path: Path, windows: int, total: int, max_size: int) -> Iterator[F
     if best is not None:
         yield best
     if index + 1 < _COMPLETE * total:
-        warnings.warn(
-            f"{path}: ends after {index + 1} of {total} frames; copy it again if it is "
-            "truncated",
-            UserWarning,
-            stacklevel=2,
-        )
+        what = f"ends after {index + 1} of {total} frames"
+        warn(f"{path}: {what}; copy it again if it is truncated")
 
 
 def _frames(path: Path) -> Iterator[np.ndarray]:
@@ -96,13 +90,8 @@ def _count(path: Path) -> int:
     capture = _opened(path)
     try:
         declared = int(capture.get(opencv().CAP_PROP_FRAME_COUNT))
-        if declared > 0:
-            return declared
-        counted = 0
         with captured_stderr():
-            while capture.grab():
-                counted += 1
-        return counted
+            return declared if declared > 0 else sum(iter(capture.grab, False))
     finally:
         capture.release()
 
@@ -114,8 +103,6 @@ def _opened(path: Path):
     with captured_stderr():  # FFmpeg takes a relative "10:30.mp4" for a URL
         capture = cv2.VideoCapture(os.path.abspath(path))
     if not capture.isOpened():
-        raise InputError(
-            f"{path}: is neither a folder of photos nor a video that OpenCV reads; "
-            "convert it to MP4"
-        )
+        what = "is neither a folder of photos nor a video that OpenCV reads"
+        raise InputError(f"{path}: {what}; convert it to MP4")
     return capture

@@ -1,5 +1,6 @@
 """The protocol of a file format, and functions that the formats share."""
 
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -32,17 +33,16 @@ class Format(NamedTuple):
 
 
 def warn(message: str) -> None:
-    """Warn on behalf of the caller of the calling function."""
-    warnings.warn(message, UserWarning, stacklevel=3)
+    """Warn at the line outside of this package that led here."""
+    frame, level = sys._getframe(1), 2
+    inside = ("gsjax", "contextlib")
+    while frame.f_back and frame.f_globals["__name__"].partition(".")[0] in inside:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, UserWarning, stacklevel=level)
 
 
 def require_new(path: Path, overwrite: bool) -> None:
-    """Check that a file may be written.
-
-    Raises:
-      InputError: if it exists and ``overwrite`` is not set, if it is a folder, or if
-        its folder is missing.
-    """
+    """Raise `InputError` if a file exists without ``overwrite``, or has no folder."""
     if path.is_dir():
         raise InputError(f"{path}: expected a file, got a folder; pass a file name")
     if path.exists() and not overwrite:
@@ -82,8 +82,7 @@ def visible_rows(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
     if bad.any():
         raise InputError(
             f"{path}: {bad.sum()} of {len(bad)} Gaussians are NaN or infinite, which "
-            f"{path.suffix} cannot store; write a .ply, or leave them out "
-            "(gsjax.select)"
+            f"{path.suffix} cannot store; write a .ply, or drop them (gsjax.select)"
         )
     quats = rows["quats"].astype(np.float64)
     quats /= np.maximum(np.abs(quats).max(1, initial=0), _TINY)[:, None]
@@ -93,12 +92,8 @@ def visible_rows(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
     if visible.all():
         return rows
     if not visible.any():
-        raise InputError(
-            f"{path}: the quaternions of all {len(visible)} Gaussians are zero, so "
-            "nothing would be drawn; check the scene"
-        )
-    warn(
-        f"{path}: {(~visible).sum()} of {len(visible)} quaternions are zero; these "
-        "Gaussians are never drawn and are left out"
-    )
+        what = f"the quaternions of all {len(visible)} Gaussians are zero"
+        raise InputError(f"{path}: {what}, so nothing would be drawn; check the scene")
+    lost = f"{(~visible).sum()} of {len(visible)} quaternions are zero"
+    warn(f"{path}: {lost}; these Gaussians are never drawn and are left out")
     return {name: array[visible] for name, array in rows.items()}

@@ -1,6 +1,6 @@
 """Load and save Gaussians in the format that the suffix of the file name selects."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
 
@@ -30,8 +30,8 @@ def load(
       InputError: if the suffix is unknown, or the file is missing or invalid; see
         `gsjax.io.ply.read_ply` and `gsjax.io.spz.read_spz`.
     """
-    path = _checked_path(path)
-    return _choose(path, {s: f.load for f in formats for s in f.suffixes})(path)
+    path, read = _chosen(path, formats, "load")
+    return read(path)
 
 
 def save(
@@ -56,23 +56,17 @@ def save(
       InputError: if the suffix is unknown, the file exists and ``overwrite`` is
         not set, or it cannot be written.
     """
-    path = _checked_path(path)
+    path, write = _chosen(path, formats, "save")
     check_gaussians(gaussians)
-    write = _choose(path, {s: f.save for f in formats for s in f.suffixes})
     write(path, gaussians, overwrite=overwrite)
 
 
-def _checked_path(path) -> Path:
+def _chosen(path, formats: Sequence[Format], action: str) -> tuple[Path, Callable]:
     if not isinstance(path, (str, PathLike)):
-        raise InputError(
-            f"path: expected the name of a file, got {type(path).__name__}; call "
-            "load(path) or save(path, gaussians)"
-        )
-    return Path(path)
-
-
-def _choose(path: Path, by_suffix: dict):
-    known = {suffix: one for suffix, one in by_suffix.items() if one is not None}
+        got, remedy = type(path).__name__, "call load(path) or save(path, gaussians)"
+        raise InputError(f"path: expected the name of a file, got {got}; {remedy}")
+    path, known = Path(path), {s: f for f in formats for s in f.suffixes}
+    known = {s: getattr(f, action) for s, f in known.items() if getattr(f, action)}
     suffix = path.suffix.lower()
     if suffix not in known:
         raise InputError(
@@ -80,4 +74,4 @@ def _choose(path: Path, by_suffix: dict):
             f"{path.suffix!r}; convert the file, for example with SuperSplat, or pass "
             "formats=(*gsjax.io.formats.FORMATS, yours)"
         )
-    return known[suffix]
+    return path, known[suffix]

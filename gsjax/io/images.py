@@ -1,6 +1,12 @@
 """Images as bytes of files: PNG and .npy. OpenCV encodes, and is loaded when needed."""
 
 import io
+import os
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +14,8 @@ import numpy as np
 from gsjax.errors import InputError, MissingExtraError
 
 _MAX_16 = 65535
+_MAX_STDERR = 2**20
+_stderr_lock = threading.RLock()  # stderr belongs to the whole process
 
 
 class DepthPicture(NamedTuple):
@@ -24,18 +32,13 @@ class DepthPicture(NamedTuple):
 
 
 def opencv():
-    """Return the module cv2.
-
-    Raises:
-      MissingExtraError: if it is absent or does not load.
-    """
+    """Return the module cv2, or raise `MissingExtraError` if it does not load."""
     try:
         import cv2
     except ImportError as error:
-        raise MissingExtraError(
-            f"OpenCV, which reads and writes images, does not load ({error}); install "
-            "it: pip install opencv-contrib-python-headless"
-        ) from error
+        what = f"OpenCV, which reads and writes images, does not load ({error})"
+        remedy = "pip install opencv-contrib-python-headless"
+        raise MissingExtraError(f"{what}; install it: {remedy}") from error
     return cv2
 
 
@@ -73,10 +76,8 @@ def encode_png(pixels: np.ndarray) -> bytes:
     stored = pixels[..., ::-1] if pixels.ndim == 3 else pixels  # OpenCV has BGR
     done, data = cv2.imencode(".png", np.ascontiguousarray(stored))
     if not done:
-        raise InputError(
-            f"pixels: OpenCV cannot encode {pixels.dtype} {pixels.shape} as PNG; pass "
-            "uint8 or uint16 of [H, W] or [H, W, 3]"
-        )
+        what = f"pixels: OpenCV cannot encode {pixels.dtype} {pixels.shape} as PNG"
+        raise InputError(f"{what}; pass uint8 or uint16 of [H, W] or [H, W, 3]")
     return data.tobytes()
 
 
@@ -85,3 +86,32 @@ def encode_npy(image: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, np.asarray(image, np.float32), allow_pickle=False)
     return buffer.getvalue()
+
+
+@contextmanager
+def captured_stderr() -> Iterator[list[str]]:
+    """Context in which nothing reaches stderr; afterwards the list holds its lines.
+
+    C libraries write to the file descriptor, past Python. Other threads wait for it.
+    """
+    captured: list[str] = []
+    with _stderr_lock, _scratch() as scratch:
+        if sys.stderr is not None:
+            sys.stderr.flush()
+        kept = os.dup(2)
+        try:
+            os.dup2(scratch.fileno(), 2)
+            yield captured
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            scratch.seek(0)
+            text = scratch.read(_MAX_STDERR).decode(errors="replace")
+            captured += [line for line in text.splitlines() if line.strip()]
+
+
+def _scratch():
+    """Return an anonymous file, in memory if the system has such files."""
+    if hasattr(os, "memfd_create"):
+        return os.fdopen(os.memfd_create("stderr"), "w+b")
+    return tempfile.TemporaryFile()

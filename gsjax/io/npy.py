@@ -19,6 +19,7 @@ _FIELDS = {
     "shape": r"\(((?: *[0-9]{1,18} *,)* *(?:[0-9]{1,18})? *)\)",
 }
 _MAX_AXES = 32
+_REMEDY = "the file is truncated or damaged: export or copy it again"
 
 
 def read_npy(where: str, data: bytes) -> np.ndarray:
@@ -45,8 +46,7 @@ def read_npy(where: str, data: bytes) -> np.ndarray:
     if start + length > len(data) or wrong:
         raise InputError(
             f"{where}: expected the header of an array of numbers, got {text[:120]!r} "
-            f"(byte {start}; invalid: {', '.join(wrong) or 'its length'}); the file is "
-            "truncated or damaged: export or copy it again"
+            f"(byte {start}; invalid: {', '.join(wrong) or 'its length'}); {_REMEDY}"
         )
     descr, order, axes = (match[1] for match in found if match)
     shape = tuple(int(size) for size in re.findall("[0-9]+", axes))
@@ -55,7 +55,6 @@ def read_npy(where: str, data: bytes) -> np.ndarray:
     if len(data) - start != expected or len(shape) > _MAX_AXES:
         raise InputError(
             f"{where}: expected {expected} bytes after the header for {descr} {shape}, "
-            f"got {len(data) - start}; the file is truncated or damaged: export or "
-            "copy it again"
+            f"got {len(data) - start}; {_REMEDY}"
         )
     return np.ndarray(shape, kind, data, start, order="F" if order == "True" else "C")

@@ -36,11 +36,7 @@ class Words(NamedTuple):
 
 
 def find_words(block: np.ndarray) -> Words:
-    """Find words and lines.
-
-    Args:
-      block: uint8; a last line without a newline counts as one.
-    """
+    """Find the words and lines of a uint8 block; the last line may lack its newline."""
     inked = block > _SPACE
     starts = np.flatnonzero(inked & ~np.append(False, inked)[:-1])
     ends = np.flatnonzero(block == _NEWLINE)
@@ -52,14 +48,9 @@ def find_words(block: np.ndarray) -> Words:
 
 
 def parse_numbers(block: np.ndarray, count: int) -> np.ndarray | None:
-    """Parse all words of a block as Python's float does.
+    """Parse all words of a uint8 block as Python's float does, to [W] float64.
 
-    Args:
-      block: uint8.
-      count: number of words W, at least 1.
-
-    Returns:
-      [W] float64, or None if there are not ``count`` words or one is not a number.
+    The result is None if there are not ``count`` ≥ 1 words or one is not a number.
     """
     if not _PLAIN[block].all():
         return None
@@ -79,11 +70,7 @@ def other_than_digits(block: np.ndarray) -> np.ndarray:
 
 
 def parse_number(word: str) -> float:
-    """Parse one number.
-
-    Raises:
-      ValueError: if it is not a number in ASCII.
-    """
+    """Parse one number; raise ValueError if it is not a number in ASCII."""
     if "_" in word or not word.isascii():
         raise ValueError(f"could not convert {word[:40]!r} to a number")
     return float(word)

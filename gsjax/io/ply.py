@@ -158,15 +158,12 @@ def _check_values(
     if rows.any():
         which = ", ".join(f"{k}: {v.sum()}" for k, v in bad.items() if v.any())
         message = (
-            f"{path}: expected finite values, got NaN or infinite ones in {rows.sum()} "
-            f"of {len(rows)} Gaussians ({which}), the first: "
-            f"{np.flatnonzero(rows)[:5].tolist()}"
+            f"{path}: values are not finite in {rows.sum()} of {len(rows)} Gaussians "
+            f"({which}), the first: {np.flatnonzero(rows)[:5].tolist()}"
         )
         if not drop_nonfinite:
-            raise InputError(
-                f"{message}; repair the file, or drop them with "
-                "gsjax.io.ply.read_ply(path, drop_nonfinite=True)"
-            )
+            remedy = "drop them with gsjax.io.ply.read_ply(path, drop_nonfinite=True)"
+            raise InputError(f"{message}; repair the file, or {remedy}")
         warn(f"{message}; dropped")
         for name in fields:
             fields[name] = fields[name][~rows]
@@ -186,8 +183,8 @@ def _warn_of_values(path: Path, fields: Mapping[str, np.ndarray]) -> None:
     if len(opacities) and probabilities and (fields["log_scales"] > 0).all():
         warn(
             f"{path}: all opacities lie in [0, 1] and all scales are positive, which "
-            "looks like activated values; a 3DGS PLY stores logit(opacity) and "
-            "log(scale), and they are read as such: check how the file was exported"
+            "looks like activated values, but they are read as logits and logarithms; "
+            "check how the file was exported"
         )
 
 
@@ -199,11 +196,7 @@ def write_ply(
     The file is binary, little-endian float32: x y z nx ny nz f_dc f_rest opacity scale
     rot, with normals of zero. Means are written as float64 if float32 would round them.
     Values that are not finite are written with a warning.
-
-    Args:
-      path: the file to write; it appears complete or not at all.
-      gaussians: the scene; inactive slots are left out.
-      overwrite: replace an existing file.
+    Arguments as `gsjax.io.formats.save`.
 
     Raises:
       InputError: if the file exists and ``overwrite`` is not set, if its folder is

@@ -47,8 +47,7 @@ class Header(NamedTuple):
       path: the file, for messages.
       order: byte order of the body, "<", ">", or "" for ascii.
       before, vertex, after: the elements, in the order of the body.
-      body: byte at which the body starts.
-      size: bytes of the file.
+      body, size: byte at which the body starts, and bytes of the file.
     """
 
     path: Path
@@ -66,10 +65,9 @@ def read_header(file: BinaryIO, path: Path) -> Header:
     size = os.fstat(file.fileno()).st_size
     magic = re.match(rb"ply[ \t]*(\r\n|\n|\r)", head)
     if magic is None:
-        raise InputError(
-            f"{path}: byte 0: expected a PLY file, which starts with the line 'ply', "
-            f"got {head[:16]!r}; export the file again"
-        )
+        expected = "a PLY file, which starts with the line 'ply'"
+        got = f"{head[:16]!r}; export the file again"
+        raise InputError(f"{path}: byte 0: expected {expected}, got {got}")
     eol = magic[1]
     pattern = re.compile(re.escape(eol) + rb"end_header[ \t]*" + re.escape(eol))
     end = pattern.search(head, magic.end() - len(eol))
@@ -82,10 +80,8 @@ def read_header(file: BinaryIO, path: Path) -> Header:
     order, elements = _parse_header(path, text.split(eol) if text else [], eol)
     names = [element.name for element in elements]
     if "vertex" not in names:
-        raise InputError(
-            f"{path}: the header has no 'element vertex'; found {names[:8]}; export "
-            "the scene as a 3DGS PLY"
-        )
+        found = f"found {names[:8]}; export the scene as a 3DGS PLY"
+        raise InputError(f"{path}: the header has no 'element vertex'; {found}")
     at = names.index("vertex")
     before, after = elements[:at], elements[at + 1 :]
     return Header(path, order, before, elements[at], after, end.end(), size)
@@ -124,7 +120,7 @@ def _parse_header(
                 )
     if order is None:
         raise InputError(
-            f"{path}: the header has no 'format'; expected one of {[*_FORMATS]}"
+            f"{path}: no 'format' in the header; pass one of {[*_FORMATS]}"
         )
     return order, list(elements.values())
 
@@ -138,17 +134,11 @@ def _property_type(where: str, kinds: list[str]) -> str | None:
 
 
 def check_properties(header: Header, required: Collection[str]) -> int:
-    """Check that the vertices are Gaussians.
-
-    Args:
-      header: of the file.
-      required: properties of a Gaussian of degree 0, without f_rest.
-
-    Returns:
-      The number K of SH bases.
+    """Return the number K of SH bases, after a check that the vertices are Gaussians.
 
     Raises:
-      InputError: if a property is missing, or f_rest is not a whole degree.
+      InputError: if one of the ``required`` properties, those of degree 0, is missing,
+        or f_rest is not a whole degree.
     """
     path, found = header.path, header.vertex.types
     lists = [name for name, kind in found.items() if kind is None]
@@ -187,9 +177,11 @@ def check_size(header: Header) -> None:
     path, order = header.path, header.order
     for element in header.before:
         if element.has_list:
+            what = (
+                f"element {element.name} has a list property and stands before vertex"
+            )
             raise InputError(
-                f"{path}: element {element.name} has a list property and stands before "
-                "vertex, so its size is unknown; put vertex first"
+                f"{path}: {what}, so its size is unknown; put vertex first"
             )
     elements = [*header.before, header.vertex]
     open_end = not order or any(element.has_list for element in header.after)
@@ -200,13 +192,11 @@ def check_size(header: Header) -> None:
         expected = max(0, expected - 1)  # the last line may lack its newline
     actual = header.size - header.body
     if actual < expected:
-        sizes = ", ".join(
-            f"{e.rows} {e.name} × {e.min_bytes(order)} bytes" for e in elements
-        )
+        parts = [f"{e.rows} {e.name} × {e.min_bytes(order)} bytes" for e in elements]
         raise InputError(
             f"{path}: the body (from byte {header.body}) is truncated: expected "
-            f"{'' if order else 'at least '}{expected} bytes ({sizes}), got {actual}; "
-            "export or download the file again"
+            f"{'' if order else 'at least '}{expected} bytes ({', '.join(parts)}), got "
+            f"{actual}; export or download the file again"
         )
     if actual > expected and not open_end:
         warn(

@@ -38,10 +38,8 @@ def _binary_rows(file: BinaryIO, header: Header) -> Iterator[tuple[int, np.ndarr
         size = min(CHUNK_ROWS, vertex.rows - start)
         data = file.read(size * dtype.itemsize)
         if len(data) < size * dtype.itemsize:
-            raise InputError(
-                f"{header.path}: vertex {start}: the file became shorter while it was "
-                "read; wait until it is complete"
-            )
+            what = f"{header.path}: vertex {start}: the file became shorter"
+            raise InputError(f"{what} while it was read; wait until it is complete")
         yield size, np.frombuffer(data, dtype)
 
 

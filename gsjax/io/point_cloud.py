@@ -13,11 +13,8 @@ from gsjax.runtime.files import opened
 from gsjax.runtime.memory import Estimate, require
 
 _GREY = 128
-_COLORS = (  # names of red, green and blue
-    ("red", "green", "blue"),
-    ("diffuse_red", "diffuse_green", "diffuse_blue"),
-    ("r", "g", "b"),
-)
+_RGB = ("red", "green", "blue")
+_COLORS = (_RGB, tuple(f"diffuse_{color}" for color in _RGB), ("r", "g", "b"))
 
 
 def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -40,30 +37,24 @@ def read_point_cloud(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]
         header = read_header(file, path)
         types = header.vertex.types
         if not all(types.get(name) for name in "xyz") or None in types.values():
-            raise InputError(
-                f"{path}: expected scalar properties x, y, z of element vertex, got "
-                f"{', '.join([*types][:20])}; export the points as a PLY"
-            )
+            what = "expected scalar properties x, y, z of element vertex, got "
+            what += ", ".join([*types][:20])
+            raise InputError(f"{path}: {what}; export the points as a PLY")
         check_size(header)
         names = next((names for names in _COLORS if types.keys() >= {*names}), ())
         kinds = {types[name] or "" for name in names}
         unit = bool(names) and all(kind.startswith("f") for kind in kinds)
         narrow = unit or kinds <= {"u1"}
-        require(
-            Estimate(
-                {"coordinates and colours": header.vertex.rows * (28 if narrow else 34)}
-            ),
-            f"{path}: {header.vertex.rows:,} points",
-            "leave out some of them where the file was made",
-        )
+        rows = header.vertex.rows
+        estimate = Estimate({"coordinates and colours": rows * (28 if narrow else 34)})
+        remedy = "leave out some of them where the file was made"
+        require(estimate, f"{path}: {rows:,} points", remedy)
         points, colors, (darkest, brightest) = _read(file, header, names, unit, narrow)
     bad = np.isnan(points[:, 0])
     if bad.any():
-        raise InputError(
-            f"{path}: expected finite coordinates and colours, got others in "
-            f"{bad.sum()} of {len(points)} points, the first: "
-            f"{np.flatnonzero(bad)[:5].tolist()}; remove them"
-        )
+        which = f"{bad.sum()} of {len(bad)} points, the first: "
+        which += f"{np.flatnonzero(bad)[:5].tolist()}; remove them"
+        raise InputError(f"{path}: coordinates or colours are not finite in {which}")
     most = 1.01 if unit else 65535
     if brightest > most or (darkest < 0 and not unit):
         raise InputError(

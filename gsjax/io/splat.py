@@ -13,21 +13,14 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
-from gsjax.io.common import (
-    MAX_SHIFT,
-    Format,
-    opacity_bytes,
-    require_new,
-    to_bytes,
-    visible_rows,
-    warn,
-)
+from gsjax.io import common
 from gsjax.math.sh import C0
 from gsjax.runtime.files import replacing
 
 _ROW = np.dtype(
     [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]
 )
+_NEARER = "move the scene nearer to the origin, or write a .ply"
 
 
 def write_splat(
@@ -37,19 +30,15 @@ def write_splat(
 
     Colours are clipped and rounded to 8 bits, and harmonics above degree 0 are left
     out, each with a warning.
-
-    Args:
-      path: the file to write; it appears complete or not at all.
-      gaussians: the scene; inactive slots are left out.
-      overwrite: replace an existing file.
+    Arguments as `gsjax.io.formats.save`.
 
     Raises:
       InputError: as `write_ply`; if a value is NaN, or infinite and not a logit, if a
         mean exceeds float32, or if nothing would be drawn.
     """
     path = Path(path)
-    require_new(path, overwrite)
-    rows = visible_rows(path, gaussians)
+    common.require_new(path, overwrite)
+    rows = common.visible_rows(path, gaussians)
     table = np.zeros(len(rows["means"]), _ROW)
     logs = rows["log_scales"].astype(np.float64)
     table["scales"] = np.exp(np.clip(logs, -80, 80))
@@ -59,13 +48,13 @@ def write_splat(
     if far.any():
         raise InputError(
             f"{path}: {far.sum()} of {len(far)} means exceed float32, which .splat "
-            "stores; move the scene nearer to the origin, or write a .ply"
+            f"stores; {_NEARER}"
         )
     colors = 0.5 + C0 * rows["sh"][:, 0].astype(np.float64)
     _warn_of_losses(path, gaussians.sh_degree, colors, rows["means"], table)
-    table["rgba"][:, :3] = to_bytes(255 * colors)
-    table["rgba"][:, 3] = opacity_bytes(rows["logit_opacities"])
-    table["quats"] = to_bytes(128 + 128 * rows["quats"])
+    table["rgba"][:, :3] = common.to_bytes(255 * colors)
+    table["rgba"][:, 3] = common.opacity_bytes(rows["logit_opacities"])
+    table["quats"] = common.to_bytes(128 + 128 * rows["quats"])
     logits = rows["logit_opacities"].astype(np.float64)
     covered = logs.sum(1) - np.logaddexp(0, -logits)
     with replacing(path, durable=True) as file:
@@ -76,24 +65,19 @@ def _warn_of_losses(
     path: Path, degree: int, colors: np.ndarray, means: np.ndarray, table: np.ndarray
 ) -> None:
     if degree:
-        warn(
-            f"{path}: .splat stores one colour for all directions; harmonics of degree "
-            f"1 to {degree} are left out"
-        )
+        lost = f"harmonics of degree 1 to {degree} are left out"
+        common.warn(f"{path}: .splat stores one colour for all directions; {lost}")
     clipped = np.any(np.abs(colors - 0.5) > 0.5 + 0.5 / 255, axis=1)
     if clipped.any():
-        warn(
-            f"{path}: {clipped.sum()} of {len(clipped)} colours are out of [0, 1] and "
-            "clipped"
-        )
+        lost = f"{clipped.sum()} of {len(clipped)} colours"
+        common.warn(f"{path}: {lost} are out of [0, 1] and clipped")
     shift = np.abs(table["means"] - means.astype(np.float64)).max(1, initial=0)
-    moved = shift > MAX_SHIFT * table["scales"].max(1, initial=0)
+    moved = shift > common.MAX_SHIFT * table["scales"].max(1, initial=0)
     if moved.any():
-        warn(
+        common.warn(
             f"{path}: {moved.sum():,} of {len(moved):,} Gaussians have means rounded "
-            "by a tenth of their size or more; move the scene nearer to the origin, or "
-            "write a .ply"
+            f"by a tenth of their size or more; {_NEARER}"
         )
 
 
-FORMAT = Format("splat", (".splat",), None, write_splat)
+FORMAT = common.Format("splat", (".splat",), None, write_splat)

@@ -19,21 +19,14 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, make_gaussians
-from gsjax.io.common import (
-    MAX_SHIFT,
-    Format,
-    opacity_bytes,
-    require_new,
-    to_bytes,
-    visible_rows,
-    warn,
-)
+from gsjax.io import common
 from gsjax.io.ply_rows import CHUNK_ROWS
 from gsjax.math.sh import num_bases, sh_basis
 from gsjax.runtime.files import opened, replacing
 from gsjax.runtime.memory import Estimate, require
 
 _MAGIC = b"NGSP"
+_REMEDY = "export or download it again"
 _HEADER = Struct("<4sIIBBBB")
 # Flags: trained with antialiasing; data follow the harmonics.
 _ANTIALIASED, _EXTENSIONS = 1, 2
@@ -66,19 +59,15 @@ def read_spz(path: str | PathLike[str]) -> Gaussians:
         size = file.seek(0, 2)
         file.seek(0)
         if file.read(4) == _MAGIC:
-            raise InputError(
-                f"{path}: expected SPZ of version 2 or 3, got 4 or later; convert it, "
-                "for example with SuperSplat"
-            )
+            what = "expected SPZ of version 2 or 3, got 4 or later"
+            raise InputError(f"{path}: {what}; convert it, for example with SuperSplat")
         file.seek(0)
         try:
             with gzip.GzipFile(fileobj=file) as stream:
                 return _read(cast(BinaryIO, stream), path, size)
         except (gzip.BadGzipFile, zlib.error, EOFError) as error:
-            raise InputError(
-                f"{path}: not an SPZ file, or damaged or truncated: {error}; export or "
-                "download it again"
-            ) from error
+            what = f"not an SPZ file, or damaged or truncated: {error}"
+            raise InputError(f"{path}: {what}; {_REMEDY}") from error
 
 
 def _read(stream: BinaryIO, path: Path, size: int) -> Gaussians:
@@ -90,32 +79,28 @@ def _read(stream: BinaryIO, path: Path, size: int) -> Gaussians:
     if count * sum(widths.values()) > _MAX_RATIO * size:
         raise InputError(
             f"{path}: the header declares {count:,} Gaussians, which {size:,} bytes "
-            "cannot hold; the file is truncated or damaged: export or download it again"
+            f"cannot hold; the file is truncated or damaged: {_REMEDY}"
         )
-    require(
-        Estimate({"values as read": count * (220 + 16 * 3 * bases)}),
-        f"{path}: {count:,} Gaussians",
-        "reduce the file with the tool that made it",
-    )
+    estimate = Estimate({"values as read": count * (220 + 16 * 3 * bases)})
+    remedy = "reduce the file with the tool that made it"
+    require(estimate, f"{path}: {count:,} Gaussians", remedy)
     parts: dict[str, np.ndarray] = {}
     for name, width in widths.items():
         raw = stream.read(count * width)
         if len(raw) < count * width:
             raise InputError(
                 f"{path}: expected {count * width:,} bytes of {name}, got {len(raw):,}"
-                "; the file is truncated: export or download it again"
+                f"; the file is truncated: {_REMEDY}"
             )
         parts[name] = np.frombuffer(raw, np.uint8).reshape(count, width)
     if stream.read(1):
         what = "bytes after the last Gaussian are ignored"
         if flags & _EXTENSIONS:
             what = "extensions are ignored, and may change colours"
-        warn(f"{path}: {what}")
+        common.warn(f"{path}: {what}")
     if flags & _ANTIALIASED:
-        warn(
-            f"{path}: the scene was trained with antialiasing; render it with "
-            "RasterConfig(antialias=True)"
-        )
+        remedy = "render it with RasterConfig(antialias=True)"
+        common.warn(f"{path}: the scene was trained with antialiasing; {remedy}")
     sh = np.zeros((count, bases, 3), np.float32)
     sh[:, 0] = (parts["colors"] / 255 - 0.5) / _COLOR
     rest = parts["sh"].reshape(count, bases - 1, 3)
@@ -137,7 +122,7 @@ def _read_header(stream: BinaryIO, path: Path) -> tuple[int, int, int, int, int]
     if len(raw) < _HEADER.size or raw[:4] != _MAGIC:
         raise InputError(
             f"{path}: expected an SPZ header of {_HEADER.size} bytes that starts with "
-            f"{_MAGIC!r}, got {raw[:8]!r}; export or download it again"
+            f"{_MAGIC!r}, got {raw[:8]!r}; {_REMEDY}"
         )
     _, version, rows, degree, fraction, flags, _ = _HEADER.unpack(raw)
     for name, value, least, most in (
@@ -146,9 +131,9 @@ def _read_header(stream: BinaryIO, path: Path) -> tuple[int, int, int, int, int]
         ("fraction", fraction, 0, 24),
     ):
         if not least <= value <= most:
+            expected = f"a header with {name} {least} to {most}, got {value}"
             raise InputError(
-                f"{path}: expected a header with {name} {least} to {most}, got {value}"
-                "; export the file in another version"
+                f"{path}: expected {expected}; export it in another version"
             )
     return version, rows, degree, fraction, flags
 
@@ -187,12 +172,10 @@ def _unpack_quats(raw: np.ndarray) -> np.ndarray:
 
 
 def _pack_quats(wxyz: np.ndarray) -> np.ndarray:
-    """Pack the three smallest components and the index of the largest in 4 bytes.
-
-    The largest is made positive, as -q is the same rotation as q.
-    """
+    """Pack the three smallest components and the index of the largest in 4 bytes."""
     xyzw = wxyz[:, [1, 2, 3, 0]] * [*_HALF_TURN, 1]
     largest = np.abs(xyzw).argmax(1)
+    # The largest is made positive: -q is the rotation q.
     xyzw = xyzw * np.where(np.take_along_axis(xyzw, largest[:, None], 1) < 0, -1, 1)
     packed = largest.astype(np.int64)
     for axis in range(4):
@@ -227,9 +210,7 @@ def write_spz(
     5 above. Values out of range are clipped with a warning.
 
     Args:
-      path: the file to write; it appears complete or not at all.
-      gaussians: the scene, of SH degree 0 to 3; inactive slots are left out.
-      overwrite: replace an existing file.
+      path, gaussians, overwrite: as `gsjax.io.formats.save`; SH degree 0 to 3.
       antialias: record that the scene was trained with antialiasing.
 
     Raises:
@@ -238,7 +219,7 @@ def write_spz(
       CapacityError: if memory is too small.
     """
     path = Path(path)
-    require_new(path, overwrite)
+    common.require_new(path, overwrite)
     rows, fraction = _checked_rows(path, gaussians)
     _warn_of_losses(path, rows, fraction)
     count, degree = len(rows["means"]), gaussians.sh_degree
@@ -252,9 +233,9 @@ def write_spz(
         stream.write(_HEADER.pack(_MAGIC, 3, count, degree, fraction, flags, 0))
         integers = np.ascontiguousarray(means.astype("<i4")).view(np.uint8)
         stream.write(integers.reshape(-1, 4)[:, :3].tobytes())
-        stream.write(opacity_bytes(rows["logit_opacities"]).tobytes())
-        stream.write(to_bytes(255 * (0.5 + _COLOR * rows["sh"][:, 0])).tobytes())
-        stream.write(to_bytes(scales).tobytes())
+        stream.write(common.opacity_bytes(rows["logit_opacities"]).tobytes())
+        stream.write(common.to_bytes(255 * (0.5 + _COLOR * rows["sh"][:, 0])).tobytes())
+        stream.write(common.to_bytes(scales).tobytes())
         stream.write(_pack_quats(rows["quats"]).tobytes())
         for start in range(0, count, CHUNK_ROWS):
             some = rows["sh"][start : start + CHUNK_ROWS]
@@ -272,12 +253,10 @@ def _checked_rows(
             "it with gsjax.with_sh_degree (--sh-degree)"
         )
     slots, bases = gaussians.capacity, num_bases(degree)
-    require(
-        Estimate({"values to be written": slots * (300 + 16 * 3 * bases)}),
-        f"{path}: {slots:,} Gaussians",
-        "leave some out (export --min-opacity), or write a .ply",
-    )
-    rows = visible_rows(path, gaussians)
+    estimate = Estimate({"values to be written": slots * (300 + 16 * 3 * bases)})
+    remedy = "leave some out (export --min-opacity), or write a .ply"
+    require(estimate, f"{path}: {slots:,} Gaussians", remedy)
+    rows = common.visible_rows(path, gaussians)
     largest = float(np.abs(rows["means"]).max(initial=0))
     if largest > _MAX_MEAN:
         raise InputError(
@@ -294,7 +273,7 @@ def _harmonics(sh: np.ndarray, degree: int) -> np.ndarray:
     first, above = _BITS
     steps = np.full((turned.shape[1], 1), 2.0 ** (8 - above))
     steps[:3] = 2.0 ** (8 - first)
-    return to_bytes(np.rint(128 * (1 + turned) / steps) * steps)
+    return common.to_bytes(np.rint(128 * (1 + turned) / steps) * steps)
 
 
 def _warn_of_losses(path: Path, rows: dict[str, np.ndarray], fraction: int) -> None:
@@ -305,11 +284,13 @@ def _warn_of_losses(path: Path, rows: dict[str, np.ndarray], fraction: int) -> N
         "colours beyond -0.44 to 1.44": (np.abs(sh[:, 0]) > 3.35).any(1),
         "harmonics beyond -1 to 1": (np.abs(sh[:, 1:]) > 1.05).any((1, 2)),
         "means rounded by a tenth of their size": 2.0**-fraction / 2
-        > MAX_SHIFT * sizes,
+        > common.MAX_SHIFT * sizes,
     }
     for what, lost in losses.items():
         if lost.any():
-            warn(f"{path}: {lost.sum():,} of {len(lost):,} Gaussians have {what}")
+            common.warn(
+                f"{path}: {lost.sum():,} of {len(lost):,} Gaussians have {what}"
+            )
 
 
-FORMAT = Format("spz", (".spz",), read_spz, write_spz)
+FORMAT = common.Format("spz", (".spz",), read_spz, write_spz)

@@ -16,11 +16,9 @@ from gsjax.viewer.splats import Cut, within
 from gsjax.viewer.viser_server import require_viser
 
 THUMBNAIL = 320  # px, longest side
-UPS = {
-    f"{sign}{axis}": value * np.eye(3)[index]
-    for sign, value in (("+", 1.0), ("-", -1.0))
-    for index, axis in enumerate("xyz")
-}
+_AXES = dict(zip("xyz", np.eye(3)))
+UPS = {f"+{name}": axis for name, axis in _AXES.items()}
+UPS |= {f"-{name}": -axis for name, axis in _AXES.items()}
 _MAX_FRUSTA = 200
 _BEHIND, _ABOVE = 1.4, np.radians(12.0)
 _FOV = np.radians(50.0)
@@ -77,12 +75,7 @@ class Viewpoint(NamedTuple):
 
 
 def frusta_of(views: Sequence[View], photos: Sequence[Photo] = ()) -> list[Frustum]:
-    """Return at most 200 cameras to draw, evenly chosen.
-
-    Args:
-      views: of the dataset.
-      photos: one for each view, of any size; or none.
-    """
+    """Return at most 200 cameras to draw, evenly chosen; ``photos`` may be none."""
     few = np.linspace(0, len(views) - 1, min(len(views), _MAX_FRUSTA))
     out = []
     for index in np.unique(few.astype(int)):
@@ -123,8 +116,7 @@ def viewpoint_of_gaussians(gaussians: Gaussians, up: np.ndarray) -> Viewpoint:
     """
     shown = within(gaussians, Cut(min_opacity=0.1))
     means = np.asarray(gaussians.params.means, np.float64)[shown]
-    if not len(means):
-        means = np.zeros((1, 3))
+    means = means if len(means) else np.zeros((1, 3))
     target = np.median(means, axis=0)
     radius = float(np.percentile(np.linalg.norm(means - target, axis=1), 80)) or 1.0
     across = np.cross(np.eye(3)[np.abs(up).argmin()], up)
@@ -144,12 +136,7 @@ def set_viewpoint(server: Any, viewpoint: Viewpoint) -> None:
 
 
 def add_cameras(scene: Any, frusta: Sequence[Frustum], size: float) -> list[Any]:
-    """Draw frusta into a `viser.SceneApi`.
-
-    Args:
-      scene: the scene of a server, or that of one browser.
-      frusta: the cameras.
-      size: of a pyramid, world units.
+    """Draw frusta of a ``size`` in world units into a `viser.SceneApi`.
 
     Returns:
       Their handles; the first is the parent of the others.

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsjax.cameras.camera import NEAR, Camera, make_camera
+from gsjax.data.types import inverted
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.io import images
 from gsjax.plots.contact_sheets import depth_colors
@@ -25,16 +26,13 @@ def camera_of(
     """Return the pinhole camera of a browser.
 
     Args:
-      wxyz: [4] rotation camera → world, OpenCV axes.
-      position: [3] in the world.
+      wxyz, position: [4] rotation camera → world, OpenCV axes, and [3] in the world.
       fov: vertical field of view, radians.
       width, height: size of the image, px.
       near: depth below which nothing is drawn.
     """
     world_from_camera = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix()
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = world_from_camera.T
-    viewmat[:3, 3] = -world_from_camera.T @ np.asarray(position, np.float64)
+    viewmat = inverted(world_from_camera, np.asarray(position, np.float64))
     focal = 0.5 * height / np.tan(fov / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return make_camera(viewmat=viewmat, K=K, width=width, height=height, near=near)
@@ -55,11 +53,7 @@ class ExactRenderer:
         self._lock = threading.Lock()
 
     def __call__(self, gaussians: Gaussians, camera: Camera) -> Render:
-        """Return the images on the host.
-
-        Raises:
-          CapacityError: if the view needs more memory than can be addressed.
-        """
+        """Return the images on the host; raise `CapacityError` if they do not fit."""
         camera = jax.device_put(camera, gaussians.active.sharding)  # perhaps only one
         behind = jnp.asarray(self.background, jnp.result_type(float))
         with self._lock:

@@ -79,15 +79,11 @@ def write_page(content: ViewerContent, path: Path, *, title: str) -> Page:
     """
     gaussians = content.gaussians
     shown = within(gaussians, Cut(content.min_opacity))
-    if content.max_gaussians is not None:
-        shown = most_important(gaussians, shown, content.max_gaussians)
-    splats = pack(gaussians, shown)
+    splats = pack(gaussians, most_important(gaussians, shown, content.max_gaussians))
     drawn, found = len(splats.centers), int(num_active(gaussians))
     if found and not drawn:
-        raise InputError(
-            f"{path}: none of {found:,} Gaussians is opaque enough to be drawn; lower "
-            "--min-opacity"
-        )
+        what = f"none of {found:,} Gaussians is opaque enough to be drawn"
+        raise InputError(f"{path}: {what}; lower --min-opacity")
     server = open_server("127.0.0.1", 0)
     try:
         set_viewpoint(server, content.viewpoint)

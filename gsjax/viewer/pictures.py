@@ -38,9 +38,8 @@ class Picture:
         """
         path = Path(path)
         if path.suffix.lower() != ".png":
-            raise InputError(
-                f"{path}: expected the suffix .png, got {path.suffix!r}; rename it"
-            )
+            expected = f"expected the suffix .png, got {path.suffix!r}"
+            raise InputError(f"{path}: {expected}; rename it")
         write_file(path, self.png)
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:

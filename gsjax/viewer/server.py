@@ -1,35 +1,48 @@
-"""A server of the viewer: shared content, and a session for each browser."""
+"""A server of the viewer: shared content, and a session for each browser.
 
+A training in the browser is shown copies that are made between two steps, for at most a
+fiftieth of the time, so a run yields the same bits with and without a viewer.
+"""
+
+import contextlib
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
+from gsjax.data.types import Dataset, Photo
 from gsjax.gaussians import Gaussians
 from gsjax.runtime.console import note, one_line
+from gsjax.train.config import TrainConfig
+from gsjax.train.loop import Progress
+from gsjax.train.state import TrainState
+from gsjax.viewer import viser_server
 from gsjax.viewer.cameras import Frustum, set_viewpoint
+from gsjax.viewer.opening import training_content
 from gsjax.viewer.session import Session, ViewerContent
-from gsjax.viewer.viser_server import open_server, set_background, stop_server
+
+_INTERVAL = 2.0  # least seconds between two copies
+_SHARE = 0.02  # of the time, at most
 
 
 class ViewerServer:
-    """Serves content until it is closed.
-
-    Raises:
-      MissingExtraError, InputError: as `open_server`.
-    """
+    """Serves content until it is closed; raises errors as `open_server` does."""
 
     def __init__(
         self, content: ViewerContent, *, host: str = "127.0.0.1", port: int = 8080
     ):
         self.content = content
         self.sessions: dict[int, Session] = {}
-        self.server = open_server(host, port)
+        self.server = viser_server.open_server(host, port)
         self.left = threading.Event()  # set whenever a browser disconnects
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="viewer")
         self._pending: Future | None = None
         set_viewpoint(self.server, content.viewpoint)
-        set_background(self.server.scene, content.renderer.background)
+        viser_server.set_background(self.server.scene, content.renderer.background)
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(self._disconnected)
 
@@ -63,7 +76,7 @@ class ViewerServer:
         for session in list(self.sessions.values()):
             session.close()
         self._worker.shutdown(wait=True, cancel_futures=True)
-        stop_server(self.server)
+        viser_server.stop_server(self.server)
 
     def _for_each(self, act: Callable[[Session], None]) -> None:
         def work():
@@ -86,3 +99,60 @@ class ViewerServer:
         if session is not None:
             session.close()
         self.left.set()
+
+
+class LiveViewer:
+    """Shows one run on an address; raises `MissingExtraError` if viser is absent."""
+
+    def __init__(self, *, host: str = "127.0.0.1", port: int = 8080):
+        viser_server.require_viser()
+        self.host, self.port = host, port
+        self.server: ViewerServer | None = None
+        self.due = 0.0
+
+    def begin(
+        self, dataset: Dataset, photos: Sequence[Photo], config: TrainConfig
+    ) -> Callable[[TrainState, Progress], None]:
+        """Return the hook for `gsjax.Hooks.state`; its first call starts the server."""
+
+        def after_step(state: TrainState, progress: Progress) -> None:
+            step = int(progress.metrics.step)
+            server, now = self.server, time.monotonic()
+            early = server is not None and (now < self.due or server.busy)
+            if early and step != config.steps:
+                return
+            gaussians = copy_to_one_device(state.gaussians)
+            jax.block_until_ready(gaussians)
+            if server is None:
+                content = training_content(gaussians, dataset, photos, config)
+                server = ViewerServer(content, host=self.host, port=self.port)
+                self.server = server
+                note(f"viewer: {server.url}")
+            server.show(gaussians, f"step {step:,} of {config.steps:,}")
+            took = time.monotonic() - now
+            self.due = now + max(_INTERVAL, took / _SHARE)
+
+        return after_step
+
+    def wait_for_browsers(self) -> None:
+        """Block until no browser is connected, or Ctrl-C."""
+        server = self.server
+        if server is None or not server.has_browsers:
+            return
+        note(f"viewer: {server.url} stays until its last page is closed, or Ctrl-C")
+        with contextlib.suppress(KeyboardInterrupt):
+            while server.has_browsers:
+                server.left.wait(1.0)
+                server.left.clear()
+
+    def close(self) -> None:
+        """Stop serving."""
+        if self.server is not None:
+            self.server.close()
+
+
+def copy_to_one_device(gaussians: Gaussians) -> Gaussians:
+    """Copy to memory of the first device, which the next step does not reuse."""
+    # This alone copies nothing to a device that holds the array already.
+    local = jax.device_put(gaussians, jax.local_devices()[0])
+    return jax.tree.map(jnp.copy, local)

@@ -14,24 +14,8 @@ import numpy as np
 from gsjax.cameras.camera import NEAR
 from gsjax.gaussians import Gaussians, select
 from gsjax.runtime.console import note, one_line
-from gsjax.viewer.cameras import (
-    Frustum,
-    Viewpoint,
-    add_cameras,
-    frustum_size,
-    photo_distances,
-    wxyz_of,
-)
+from gsjax.viewer import cameras, splats
 from gsjax.viewer.exact import KINDS, ExactRenderer, camera_of, picture
-from gsjax.viewer.splats import (
-    MIN_DRAWN_OPACITY,
-    Cut,
-    longest_axes,
-    most_important,
-    opacities_of,
-    pack,
-    within,
-)
 from gsjax.viewer.viser_server import set_background
 
 _HEIGHTS = ("270", "360", "540", "720", "1080")
@@ -44,10 +28,8 @@ class ViewerContent:
     """Content that all browsers show; attributes are replaced as they change.
 
     Attributes:
-      gaussians: the scene.
-      renderer: renders exact images.
-      viewpoint: initial camera.
-      frusta: cameras of the dataset.
+      gaussians, renderer: the scene, and what renders exact images of it.
+      viewpoint, frusta: initial camera, and cameras of the dataset.
       status: a line about training, or "".
       max_gaussians: largest number in the browser; the most important ones are kept.
       min_opacity: initial value of the slider.
@@ -55,8 +37,8 @@ class ViewerContent:
 
     gaussians: Gaussians
     renderer: ExactRenderer
-    viewpoint: Viewpoint
-    frusta: list[Frustum] = field(default_factory=list)
+    viewpoint: cameras.Viewpoint
+    frusta: list[cameras.Frustum] = field(default_factory=list)
     status: str = ""
     max_gaussians: int | None = None
     min_opacity: float = 0.0
@@ -104,8 +86,6 @@ class Session:
         client.camera.on_update(lambda _: self._moved())
         self.refresh()
 
-    # --- the panel ---
-
     def _add_controls(self) -> None:
         gui, begin = self.client.gui, self.content.min_opacity
         self.counts = gui.add_markdown("")
@@ -118,22 +98,20 @@ class Session:
             hint="show this percentage of Gaussians, the smallest by longest axis",
         )  # fmt: skip
         for slider in (self.opacity, self.scale):
-            slider.on_update(lambda _: self._cut())
+            slider.on_update(lambda _: (self.refresh(), self._again()))
         with gui.add_folder("Exact image"):
             self.kind = gui.add_dropdown("Shows", KINDS)
             self.height = gui.add_dropdown("Height, px", _HEIGHTS, initial_value="540")
             self.place = gui.add_dropdown("Where", ("over the view", "in the panel"))
-            self.follow = gui.add_checkbox(
-                "Follow", False, hint="render again when the camera rests"
-            )
+            hint = "render again when the camera rests"
+            self.follow = gui.add_checkbox("Follow", False, hint=hint)
             self.button = gui.add_button("Render", hint="render this view with gsjax")
             self.message = gui.add_markdown("")
             self.pictures = gui.add_folder("Image", expand_by_default=True)
             self.pictures.visible = False
         self.button.on_click(lambda _: self.render())
-        for choice in (self.kind, self.height, self.place):
+        for choice in (self.kind, self.height, self.place, self.follow):
             choice.on_update(lambda _: self._again())
-        self.follow.on_update(lambda _: self._again())
         self.camera_folder = gui.add_folder("Cameras")
         self.go_to: Any = None
 
@@ -155,20 +133,16 @@ class Session:
                 self.go_to = self.client.gui.add_dropdown("Go to", names)
             self.drawn.on_update(lambda _: self.update_cameras())
             self.go_to.on_update(lambda _: self._go_to_chosen())
-        size = frustum_size(frusta, self.content.viewpoint.distance)
-        self.places = np.column_stack(
-            [[frustum.centre for frustum in frusta], photo_distances(frusta, size)]
-        )
-        self.cameras = add_cameras(self.client.scene, frusta, size)
+        size = cameras.frustum_size(frusta, self.content.viewpoint.distance)
+        distances = cameras.photo_distances(frusta, size)
+        self.places = np.column_stack([[f.centre for f in frusta], distances])
+        self.cameras = cameras.add_cameras(self.client.scene, frusta, size)
         for handle, frustum in zip(self.cameras[1:], frusta):
             handle.on_click(lambda _, chosen=frustum: self._go(chosen))
         self.update_cameras()
 
     def _update_cameras(self) -> None:
-        """Show the cameras, except over an exact image.
-
-        A camera that the view is in is hidden too: its photograph would cover the view.
-        """
+        """Show the cameras, not over an exact image, and none that the view is in."""
         if not self.cameras or self.closed:
             return
         away = np.linalg.norm(self.client.camera.position - self.places[:, :3], axis=1)
@@ -187,12 +161,12 @@ class Session:
         if self.go_to.value in names and self.go_to.value != self.camera_name:
             self._go(self.content.frusta[names.index(self.go_to.value)])
 
-    def _go(self, frustum: Frustum) -> None:
+    def _go(self, frustum: cameras.Frustum) -> None:
         """Move to where a photograph was taken, and show it in the panel."""
         camera = self.client.camera
         with self.client.atomic():
             camera.position = frustum.centre
-            camera.wxyz = wxyz_of(frustum.viewmat[:3, :3].T)
+            camera.wxyz = cameras.wxyz_of(frustum.viewmat[:3, :3].T)
             camera.fov = frustum.fov
         self.camera_name = self.go_to.value = frustum.name
         self.update_cameras()
@@ -204,50 +178,38 @@ class Session:
         self.photo.image = frustum.photo
         self.photo.label = frustum.name
 
-    # --- the splats ---
-
-    def _cut(self) -> None:
-        self.refresh()
-        self._again()
-
     def _draw(self) -> None:
         if self.closed:
             return
         content, gaussians = self.content, self.content.gaussians
-        longest = longest_axes(gaussians)[np.asarray(gaussians.active)]
+        longest = splats.longest_axes(gaussians)[np.asarray(gaussians.active)]
         longest = longest[np.isfinite(longest)]
         limit = float("inf")
         if self.scale.value < 100 and len(longest):
             limit = float(np.percentile(longest, self.scale.value))
-        shown = within(gaussians, Cut(self.opacity.value, limit))
+        shown = splats.within(gaussians, splats.Cut(self.opacity.value, limit))
         self.scene_shown = gaussians, shown
-        sent = shown
-        if content.max_gaussians is not None:
-            sent = most_important(gaussians, shown, content.max_gaussians)
-        splats = pack(gaussians, sent)
-        if len(splats.centers):
+        sent = splats.most_important(gaussians, shown, content.max_gaussians)
+        packed = splats.pack(gaussians, sent)
+        if len(packed.centers):
             self.splats = self.client.scene.add_gaussian_splats(
-                "/splats", **splats._asdict(), visible=not self.covered
+                "/splats", **packed._asdict(), visible=not self.covered
             )
         elif self.splats is not None:
             self.splats.remove()
             self.splats = None
         found = np.count_nonzero(np.asarray(gaussians.active))
-        faint = np.count_nonzero(opacities_of(gaussians)[shown] < MIN_DRAWN_OPACITY)
-        lines = [f"**{len(splats.centers):,}** of {found:,} Gaussians"]
-        if faint:
-            lines.append(
-                f"{faint:,} of opacity below {MIN_DRAWN_OPACITY} in exact images only"
-            )
-        if limit < float("inf"):
-            lines.append(f"scales up to {limit:.3g}")
-        if content.status:
-            lines.append(content.status)
-        self.counts.content = "<br/>".join(lines)
+        least = splats.MIN_DRAWN_OPACITY
+        faint = np.count_nonzero(splats.opacities_of(gaussians)[shown] < least)
+        lines = [
+            f"**{len(packed.centers):,}** of {found:,} Gaussians",
+            f"{faint:,} of opacity below {least} in exact images only" if faint else "",
+            f"scales up to {limit:.3g}" if limit < float("inf") else "",
+            content.status,
+        ]
+        self.counts.content = "<br/>".join(filter(None, lines))
         if self.follow.value:
             self.render()
-
-    # --- exact images ---
 
     def _render(self) -> None:
         """Render for the present camera, and show the image or the error."""
@@ -258,18 +220,11 @@ class Session:
         camera, height = self.client.camera, int(self.height.value)
         width = max(1, round(height * camera.aspect))
         begun, seen_from = time.perf_counter(), camera.update_timestamp
+        near, place = min(NEAR, self.content.viewpoint.near), camera.position
         try:
-            view = self.content.renderer(
-                select(gaussians, shown),  # pyright: ignore
-                camera_of(
-                    camera.wxyz,
-                    camera.position,
-                    camera.fov,
-                    width,
-                    height,
-                    near=min(NEAR, self.content.viewpoint.near),
-                ),
-            )
+            taken = camera_of(camera.wxyz, place, camera.fov, width, height, near=near)
+            some = select(gaussians, shown)  # pyright: ignore
+            view = self.content.renderer(some, taken)
         except Exception as error:  # also of XLA, when memory is short
             self.message.content = f"not rendered: {one_line(error)}"
             note(f"warning: {one_line(error)}")
@@ -295,22 +250,24 @@ class Session:
                     self.result = self.client.gui.add_image(pixels, format="png")
             self.result.image = pixels
             return
-        with self.client.atomic():
-            self.covered = True
-            self.client.scene.set_background_image(pixels, format="png")
-            if self.splats is not None:
-                self.splats.visible = False
-        self.update_cameras()
+        self._cover(pixels)
 
     def _uncover(self) -> None:
         """Show the splats of the browser again."""
-        if not self.covered:
-            return
+        if self.covered:
+            self._cover(None)
+
+    def _cover(self, pixels: np.ndarray | None) -> None:
+        """Show an image instead of splats and cameras, or these again."""
+        scene = self.client.scene
         with self.client.atomic():
-            self.covered = False
-            set_background(self.client.scene, self.content.renderer.background)
+            self.covered = pixels is not None
+            if pixels is None:
+                set_background(scene, self.content.renderer.background)
+            else:
+                scene.set_background_image(pixels, format="png")
             if self.splats is not None:
-                self.splats.visible = True
+                self.splats.visible = not self.covered
         self.update_cameras()
 
     def _moved(self) -> None:

@@ -68,26 +68,23 @@ def longest_axes(gaussians: Gaussians) -> np.ndarray:
 
 def within(gaussians: Gaussians, cut: Cut) -> np.ndarray:
     """Return a mask [N] of Gaussians that are active, finite, and within the cut."""
-    params = gaussians.params
-    leaves = [
-        params.means,
-        params.quats,
-        params.log_scales,
-        np.asarray(params.sh)[:, 0],
-    ]
+    p = gaussians.params
+    leaves = [p.means, p.quats, p.log_scales, np.asarray(p.sh)[:, 0]]
     finite = [np.isfinite(np.asarray(leaf)).all(axis=1) for leaf in leaves]
     shown = np.logical_and.reduce([np.asarray(gaussians.active), *finite])
     shown &= opacities_of(gaussians) >= cut.min_opacity  # False for NaN
     return shown & (longest_axes(gaussians) <= cut.max_scale)
 
 
-def most_important(gaussians: Gaussians, shown: np.ndarray, count: int) -> np.ndarray:
-    """Return a mask [N] of the ``count`` most important of those ``shown``.
+def most_important(
+    gaussians: Gaussians, shown: np.ndarray, count: int | None
+) -> np.ndarray:
+    """Return a mask [N] of the ``count`` (None: all) most important of those ``shown``.
 
     Importance is opacity times the area of the two longest axes, a heuristic that
     ignores cameras and occlusion.
     """
-    if shown.sum() <= count:
+    if count is None or shown.sum() <= count:
         return shown
     logs = np.asarray(gaussians.params.log_scales, np.float64)
     area = logs.sum(axis=1) - logs.min(axis=1)
@@ -118,16 +115,12 @@ def pack(gaussians: Gaussians, shown: np.ndarray) -> Splats:
 
 
 def _unit(longest: np.ndarray) -> float:
-    """Return the world units in which half precision holds these log scales [M].
-
-    The largest fits, unless the median would then be too small; the largest are
-    clipped in that case.
-    """
+    """Return the world units in which half precision holds these log scales [M]."""
     if not len(longest):
         return 1.0
-    log_unit = min(
-        longest.max() - np.log(_LARGEST), np.median(longest) - np.log(_TYPICAL)
-    )
+    # The largest fits, unless the median would then be too small.
+    fits, typical = longest.max() - np.log(_LARGEST), np.median(longest)
+    log_unit = min(fits, typical - np.log(_TYPICAL))
     return float(np.exp(np.clip(log_unit, -60, 60)))
 
 

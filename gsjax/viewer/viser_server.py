@@ -14,23 +14,16 @@ from gsjax.io import images
 
 
 def require_viser() -> Any:
-    """Return the module viser.
-
-    Raises:
-      MissingExtraError: if it is absent, does not load, or is too old.
-    """
+    """Return the module viser; raise `MissingExtraError` if absent or too old."""
     try:
         import viser
     except ImportError as error:
-        raise MissingExtraError(
-            f"viser, which shows scenes in the browser, does not load ({error}); "
-            "install it: pip install viser"
-        ) from error
+        what = f"viser, which shows scenes in the browser, does not load ({error})"
+        raise MissingExtraError(f"{what}; install it: pip install viser") from error
     has_page = hasattr(viser.SceneApi, "as_html")
     if not has_page or not hasattr(viser.ViserServer, "initial_camera"):
-        raise MissingExtraError(
-            f"viser {viser.__version__} is too old; pip install -U viser"
-        )
+        what = f"viser {viser.__version__} is too old"
+        raise MissingExtraError(f"{what}; pip install -U viser")
     return viser
 
 
@@ -55,21 +48,14 @@ def open_server(host: str, port: int) -> Any:
 
 
 def _sent_a_request(record: logging.LogRecord) -> bool:
-    """Filter out clients that connect and leave without a request, as Chromium does.
-
-    viser installs the same filter, but only after a first request.
-    """
+    """Filter out clients that leave without a request; viser does after the first."""
     error = record.exc_info[1] if record.exc_info else None
     silent = isinstance(getattr(error, "__cause__", None), EOFError)
     return not (silent and record.getMessage() == "opening handshake failed")
 
 
 def _free_port(host: str, port: int) -> int:
-    """Return the first free port from ``port`` on; viser waits forever if none is free.
-
-    Raises:
-      OSError, UnicodeError: if there is none, or no such host.
-    """
+    """Return the first free port from ``port`` on; viser waits forever if none is."""
     flags = socket.AI_PASSIVE
     found = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=flags)
     family, (address, *_) = found[0][0], found[0][4]

@@ -357,7 +357,7 @@ def test_missing_photographs(tmp_path):
         path.unlink()
     save_photo(tmp_path / "images/other.png")
     for skip_missing in (False, True):
-        expected = r"5 of 5 photographs are missing .* has other\.png; .*--images"
+        expected = r"5 of 5 photographs are missing .* has other\.png\), .*--images"
         with pytest.raises(InputError, match=expected) as caught:
             load_dataset(tmp_path, skip_missing=skip_missing)
         assert "skip" not in str(caught.value), "that would leave none"

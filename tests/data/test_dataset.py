@@ -128,7 +128,7 @@ def test_a_reader_from_outside(tmp_path):
     [
         ("", {}, r"expected sparse/0 of COLMAP.*got IMG_1\.JPG.*gsjax sfm"),
         ("none", {}, r"none: does not exist"),
-        ("IMG_1.JPG", {}, r"IMG_1\.JPG: expected a dataset; pass the folder"),
+        ("IMG_1.JPG", {}, r"IMG_1\.JPG: expected the folder of a dataset"),
         ("a" * 5000, {}, "a: File name too long; check the path"),
     ],
 )

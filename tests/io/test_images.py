@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import gsjax
-from gsjax.data.transforms import CameraEntry, load_transforms
-from gsjax.data.transforms_writer import transforms_json
+from gsjax.data.transforms import CameraEntry, load_transforms, transforms_json
 from gsjax.io import images
 
 

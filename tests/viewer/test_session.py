@@ -25,9 +25,8 @@ from gsjax.train.loop import Progress
 from gsjax.train.state import Metrics
 from gsjax.viewer.cameras import frusta_of, photo_distances
 from gsjax.viewer.exact import ExactRenderer
-from gsjax.viewer.live import LiveViewer
 from gsjax.viewer.opening import make_content
-from gsjax.viewer.server import ViewerServer
+from gsjax.viewer.server import LiveViewer, ViewerServer
 from gsjax.viewer.splats import MIN_DRAWN_OPACITY, longest_axes, opacities_of
 from gsjax.viewer.viser_server import open_server, stop_server
 

@@ -19,7 +19,7 @@ from gsjax.viewer.cameras import (
     viewpoint_of_gaussians,
 )
 from gsjax.viewer.exact import ExactRenderer, camera_of, picture
-from gsjax.viewer.live import copy_to_one_device
+from gsjax.viewer.server import copy_to_one_device
 from gsjax.viewer.splats import (
     MIN_DRAWN_OPACITY,
     Cut,
