@@ -121,14 +121,8 @@ PINHOLE = Lens(
     depth=z_depth,
     linearise=limit_to_image,
 )
-ORTHOGRAPHIC = Lens(
-    name="orthographic",
-    counts=(0,),
-    project=_orthographic_project,
-    unproject=_pinhole_unproject,
-    valid=everywhere,
-    depth=z_depth,
-    linearise=linearise_in_place,
+ORTHOGRAPHIC = PINHOLE._replace(
+    name="orthographic", project=_orthographic_project, linearise=linearise_in_place
 )
 
 
@@ -200,17 +194,6 @@ def _unproject_plane(plane: Callable, K: Array, c: Array, pixel) -> Point:
 
 def _plane_and_slopes(plane: Callable, c: Array, x: Array, y: Array):
     """Value of ``plane`` and its rows of slopes by x and y."""
-    if _namespace(x, y) is np:
-        step = 1e-6
-        value = plane(c, x, y)
-        by_x, by_y = (
-            [
-                (p - m) / (2 * step)
-                for p, m in zip(plane(c, x + i, y + j), plane(c, x - i, y - j))
-            ]
-            for i, j in ((step, 0.0), (0.0, step))
-        )
-        return value, (by_x[0], by_y[0]), (by_x[1], by_y[1])
     at, one, zero = partial(plane, c), jnp.ones_like(x), jnp.zeros_like(x)
     value, by_x = jax.jvp(at, (x, y), (one, zero))
     _, by_y = jax.jvp(at, (x, y), (zero, one))

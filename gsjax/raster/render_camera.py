@@ -26,7 +26,6 @@ from gsjax.raster.types import (
     Inputs,
     Primitive,
     RasterConfig,
-    nan_like,
 )
 from gsjax.runtime.devices import on_cpu, shard_rows
 
@@ -142,6 +141,6 @@ def mark_overflow(images: Images, overflowed: Array, config: RasterConfig) -> Im
 
     def one(image: Array) -> Array:
         flags = overflowed.reshape(-1, *(1,) * (image.ndim - 1))
-        return jnp.where(flags, nan_like(image), image)
+        return jnp.where(flags, jnp.nan, image)
 
     return {name: one(image) for name, image in images.items()}

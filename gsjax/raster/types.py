@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.experimental import checkify
@@ -356,8 +355,3 @@ class Render(NamedTuple):
                 f"and visible_capacity to at least {int(demand.visible)}"
             )
         return self
-
-
-def nan_like(image: Array) -> Array:
-    """Return an array of NaN."""
-    return jnp.full_like(image, jnp.nan)

@@ -100,7 +100,7 @@ def suits(task: Task) -> bool:
     touched = task.itemsize * pixels * (_ARRAYS + _PER_CHANNEL * channels)
     fits = pixels >= _FEWEST and touched <= KERNEL_BYTES
     on_cpu = task.platform == "cpu"
-    return on_cpu and task.gaussian_form and fits and loops.large_are_kernels()
+    return on_cpu and task.gaussian_form and fits and loops.large_loops_are_kernels()
 
 
 def block_capacity(capacity: int, grid: Grid) -> int:
