@@ -11,9 +11,22 @@ import pytest
 from gsjax.cameras.camera import look_at
 from gsjax.data.colmap_writer import write_colmap
 from gsjax.data.types import Dataset, View
+from gsjax.errors import InputError
 
 SIZE = (32, 24)
 PIXELS = {"fl_x": 40.0, "fl_y": 42.0, "cx": 15.5, "cy": 12.25, "w": 32, "h": 24}
+
+
+def rejects(expected: str, call, *args, **options) -> None:
+    """Check that a call raises an InputError with this message."""
+    with pytest.raises(InputError, match=expected):
+        call(*args, **options)
+
+
+def warned(expected: str, call, *args, **options):
+    """Return the result of a call that gives a warning with this message."""
+    with pytest.warns(UserWarning, match=expected):
+        return call(*args, **options)
 
 
 def save_photo(path: Path, pixels: np.ndarray | None = None) -> Path:
@@ -131,3 +144,33 @@ def synthetic_model(folder: Path) -> Path:
     model.write_binary(folder / "bin")
     model.write_text(folder / "txt")
     return folder
+
+
+def ply_file(
+    table: dict[str, np.ndarray],
+    *,
+    kind: str = "binary_little_endian",
+    types: dict[str, str] | None = None,
+    eol: str = "\n",
+    before: tuple[str, bytes] = ("", b""),
+    after: tuple[str, bytes] = ("", b""),
+) -> bytes:
+    """A PLY file; ``before`` and ``after`` are header lines and body of elements."""
+    count = len(next(iter(table.values())))
+    codes = {"float": "f4", "double": "f8", "uchar": "u1", "int": "i4"}
+    types = dict.fromkeys(table, "float") | (types or {})
+    lines = ["ply", f"format {kind} 1.0", "comment made by a test"]
+    lines += before[0].splitlines() + [f"element vertex {count}"]
+    lines += [f"property {types[name]} {name}" for name in table]
+    lines += after[0].splitlines() + ["end_header", ""]
+    header = eol.join(lines).encode()
+    if kind == "ascii":
+        rows = zip(*(table[name] for name in table))
+        text = "".join(" ".join(repr(float(v)) for v in row) + eol for row in rows)
+        return header + before[1] + text.encode() + after[1]
+    order = "<" if kind == "binary_little_endian" else ">"
+    dtype = [(name, order + codes[types[name]]) for name in table]
+    body = np.zeros(count, dtype)
+    for name, column in table.items():
+        body[name] = column
+    return header + before[1] + body.tobytes() + after[1]

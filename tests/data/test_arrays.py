@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from captures import dataset_of_views
+from captures import dataset_of_views, rejects
 
 import gsjax
 from gsjax.data.arrays import make_dataset
-from gsjax.errors import InputError
 from gsjax.train.health import check_photos
 
 MADE = dataset_of_views(3, points=20)
@@ -82,5 +81,4 @@ def test_names_sort_views_and_photos_and_alpha_and_masks_are_kept():
 )
 def test_bad_arrays(change, expected):
     given = {"images": IMAGES, "cameras": cameras(), **change}
-    with pytest.raises(InputError, match=expected):
-        make_dataset(**given)
+    rejects(expected, make_dataset, **given)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from captures import rejects
 
 from gsjax.cameras.camera import look_at
 from gsjax.data.camera_paths import (
@@ -16,7 +17,6 @@ from gsjax.data.camera_paths import (
     up_direction,
 )
 from gsjax.data.types import View
-from gsjax.errors import InputError
 
 TARGET = np.array([0.4, -0.3, 1.1])
 FRAMES = 40
@@ -235,5 +235,4 @@ def test_median_intrinsics():
     ],
 )
 def test_bad_input(make, given, expected):
-    with pytest.raises(InputError, match=expected):
-        make(given)
+    rejects(expected, make, given)

@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from captures import rejects
 
 from gsjax.data import colmap_text
 from gsjax.errors import InputError
@@ -84,5 +85,4 @@ def test_lines_of_2d_points_have_any_length(tmp_path):
         assert [found.name for found in images] == ["a.png", "b.png"]
         path.write_text(image.format(1, "a") + line.replace("\n", " 5\n"))
         expected = f"line 2: .* got {3 * count + 4} values, the last '5'"
-        with pytest.raises(InputError, match=expected):
-            colmap_text.read_images(path)
+        rejects(expected, colmap_text.read_images, path)

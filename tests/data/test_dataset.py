@@ -11,6 +11,7 @@ from captures import (
     frames_of,
     llff_dataset,
     nerfstudio_dataset,
+    rejects,
     save_photo,
     with_names,
     write_transforms,
@@ -36,23 +37,18 @@ def transforms(folder, dataset=None, name="transforms.json", **content):
     write_transforms(folder, frames, name, camera_angle_x=0.7, **content)
 
 
-# --- positions ---
-
-
 @pytest.mark.parametrize(("far", "expected"), [(1e29, "is at -1.4"), (1e9, "is 1.7")])
 def test_an_outlier_is_named(tmp_path, far, expected):
     dataset = dataset_of_views()
     dataset.views[2].viewmat[:3, 3] += far
     transforms(tmp_path, dataset)
-    with pytest.raises(InputError, match=rf"of 'images/view_02.png' {expected}"):
-        load_dataset(tmp_path)
+    rejects(rf"of 'images/view_02.png' {expected}", load_dataset, tmp_path)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_cameras_that_are_all_too_far_are_rejected(tmp_path, count):
     transforms(tmp_path, dataset_of_views(count=count, at=(0, 3e20, 0)))
-    with pytest.raises(InputError, match=r"is at .*3e\+20, .* at most 1e\+15"):
-        load_dataset(tmp_path)
+    rejects(r"is at .*3e\+20, .* at most 1e\+15", load_dataset, tmp_path)
 
 
 def test_cameras_on_a_tripod_and_one_elsewhere_are_read(tmp_path):
@@ -79,9 +75,6 @@ def test_cameras_on_a_tripod_coincide(tmp_path, at, points):
     assert scene_extent(centres) == 1.0
     extent = extent_of(loaded)
     assert extent == 1.0 if not points else 0.01 < extent < 1
-
-
-# --- formats ---
 
 
 def test_order_of_formats(tmp_path):
@@ -134,26 +127,11 @@ def test_a_reader_from_outside(tmp_path):
 )
 def test_paths_that_are_no_dataset(tmp_path, name, more, expected):
     (tmp_path / "IMG_1.JPG").write_bytes(b"")
-    with pytest.raises(InputError, match=expected):
-        load_dataset(tmp_path / name, **more)
-
-
-def test_a_folder_name_that_is_too_long(tmp_path):
-    transforms(tmp_path)
-    with pytest.raises(InputError, match="File name too long"):
-        load_dataset(tmp_path, images="a" * 5000)
-
-
-def test_a_single_view_without_points(tmp_path):
-    colmap_dataset(tmp_path, dataset_of_views(count=1, points=0))
-    dataset = load_dataset(tmp_path)
-    assert len(dataset.views) == 1
-    assert dataset.points.shape == (0, 3)
+    rejects(expected, load_dataset, tmp_path / name, **more)
 
 
 def masked_dataset(folder):
     frames = frames_of(dataset_of_views(5), "images/frame_{}.png")
-    nerfstudio_dataset(folder, frames=frames)
     frames[0]["mask_path"] = "masks/none.png"
     nerfstudio_dataset(folder, frames=frames)
 
@@ -195,8 +173,7 @@ def test_names_are_sorted_and_unique(tmp_path):
     assert found == sorted(names)
     twice = with_names(dataset_of_views(), [*names[:3], "b.png", *names[4:]])
     write_colmap(tmp_path / "sparse/0", twice, overwrite=True)
-    with pytest.raises(InputError, match=r"'b\.png' is listed more than once"):
-        load_dataset(tmp_path)
+    rejects(r"'b\.png' is listed more than once", load_dataset, tmp_path)
 
 
 def test_two_names_of_one_photograph(tmp_path):
@@ -204,13 +181,10 @@ def test_two_names_of_one_photograph(tmp_path):
     twice = with_names(dataset_of_views(count=2), ("a.jpg", "a.png"))
     write_colmap(tmp_path / "sparse", twice)
     save_photo(tmp_path / "images/a.png")
-    with pytest.raises(InputError, match=r"a\.jpg and a\.png are one photograph in"):
-        load_dataset(tmp_path)
+    rejects(r"a\.jpg and a\.png are one photograph in", load_dataset, tmp_path)
     save_photo(tmp_path / "images/a.jpg")
     assert len(load_dataset(tmp_path).views) == 2
 
-
-# --- coordinates far from 0 ---
 
 PLACES = [(500_123.4, 5_712_345.6, 118.2), (0, 0, -7e6), (1e7, 1e7, 1e7), (3e3, 0, 0)]
 

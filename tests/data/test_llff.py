@@ -4,11 +4,10 @@ import warnings
 
 import numpy as np
 import pytest
-from captures import SIZE, llff_dataset, save_photo
+from captures import SIZE, llff_dataset, rejects, save_photo
 
 from gsjax.data.dataset import load_dataset
 from gsjax.data.llff import read_poses
-from gsjax.errors import InputError
 
 
 def test_known_poses(tmp_path):
@@ -45,14 +44,12 @@ def test_smaller_copies(tmp_path):
     dataset = load_dataset(tmp_path, factor=4)
     assert dataset.views[0].name == "image000.png"
     assert (dataset.views[0].width, dataset.views[0].K[0, 0]) == (128, 160)
-    with pytest.raises(InputError, match=r"images_8: no such folder.* factor=4 "):
-        load_dataset(tmp_path, factor=8)
+    rejects(r"images_8: no such folder.* factor=4 ", load_dataset, tmp_path, factor=8)
     for name in ("images_16", "images_old", "images_8", "images_1"):
         (tmp_path / name).mkdir()
     (tmp_path / "images").rename(tmp_path / "originals")
     expected = r"images: no such folder.*pass factor=4 \(--factor 4\), as images_4 is"
-    with pytest.raises(InputError, match=expected):
-        load_dataset(tmp_path)
+    rejects(expected, load_dataset, tmp_path)
 
 
 def change(index, value):
@@ -87,18 +84,13 @@ def test_bad_values(tmp_path, edit, expected):
     llff_dataset(tmp_path)
     path = tmp_path / "poses_bounds.npy"
     np.save(path, edit(np.load(path)))
-    with pytest.raises(InputError, match=rf"poses_bounds\.npy: .*{expected}"):
-        load_dataset(tmp_path)
+    rejects(rf"poses_bounds\.npy: .*{expected}", load_dataset, tmp_path)
 
 
 def test_no_rows(tmp_path):
     np.save(tmp_path / "poses_bounds.npy", np.zeros((0, 17)))
     (tmp_path / "images").mkdir()
-    with pytest.raises(InputError, match="expected at least 1 view, got none"):
-        load_dataset(tmp_path)
-
-
-# --- the file ---
+    rejects("expected at least 1 view, got none", load_dataset, tmp_path)
 
 
 @pytest.mark.parametrize("dtype", ["<f8", ">f8", "<f4"])
@@ -115,5 +107,4 @@ def test_forms_of_the_file(tmp_path, dtype, order, version):
     assert found.dtype == np.float64
     np.testing.assert_array_equal(found, np.load(path))
     path.write_bytes(path.read_bytes() + b"\0")
-    with pytest.raises(InputError, match="header"):
-        read_poses(path)
+    rejects("header", read_poses, path)

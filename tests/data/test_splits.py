@@ -3,10 +3,9 @@
 from dataclasses import replace
 
 import pytest
-from captures import dataset_of_views, with_names
+from captures import dataset_of_views, rejects, with_names
 
 from gsjax.data.splits import split_views
-from gsjax.errors import InputError
 
 NAMES = [f"img_{n:02d}.jpg" for n in range(20)]
 
@@ -59,5 +58,4 @@ def test_splits(views, options, test):
     ],
 )
 def test_bad_splits(views, options, expected):
-    with pytest.raises(InputError, match=expected):
-        split_views(views, **options)
+    rejects(expected, split_views, views, **options)

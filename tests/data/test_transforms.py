@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from captures import to_opengl, write_transforms
+from captures import rejects, to_opengl, write_transforms
 
 from gsjax.cameras.camera import look_at
 from gsjax.data.transforms import load_near_transforms, load_transforms
@@ -30,9 +30,6 @@ def load_one(folder, *, size=None, frames=None, **content):
 def assert_K(camera, fx, fy, cx, cy):
     expected = np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     np.testing.assert_allclose(np.asarray(camera.K), expected, rtol=1e-6)
-
-
-# --- poses ---
 
 
 @pytest.mark.parametrize("rows", [3, 4])
@@ -85,9 +82,6 @@ def test_far_cameras_are_translated(tmp_path, count):
         pixels = seen_at(viewmat, camera.K, points)
         found = seen_at(camera.viewmat, camera.K, np.float32(points - origin))
         np.testing.assert_allclose(found, pixels, atol=1e-3)
-
-
-# --- intrinsics ---
 
 
 @pytest.mark.parametrize(
@@ -145,9 +139,6 @@ def test_distortion_gives_one_warning(tmp_path):
     assert len(caught) == 1
 
 
-# --- names ---
-
-
 def test_names_are_unique_and_safe(tmp_path):
     names = {
         "./train/r_0": "r_0",
@@ -177,8 +168,6 @@ def test_names_are_unique_and_safe(tmp_path):
     assert len(set(found)) == 300
     assert found[:3] == ["a", "a_1", "a_2"]
 
-
-# --- rejected files ---
 
 EYE = np.eye(4)
 RAGGED = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1], [0, 0, 0, 1]]
@@ -210,8 +199,7 @@ def test_bad_matrices(tmp_path, matrix, expected):
     frames = [frame(), {"transform_matrix": matrix}]
     path = write_transforms(tmp_path, frames, **PIXELS)
     place = r"transforms\.json: frames\[1\]: transform_matrix"
-    with pytest.raises(InputError, match=f"{place}.*{expected}"):
-        load_transforms(path)
+    rejects(f"{place}.*{expected}", load_transforms, path)
 
 
 @pytest.mark.parametrize(
@@ -249,12 +237,10 @@ def test_bad_intrinsics(tmp_path, more, expected):
 
 @pytest.mark.parametrize("size", [(0, 4), (4, 4.5), (4,), (4, -1), ("4", 4)])
 def test_bad_sizes(tmp_path, size):
-    with pytest.raises(InputError, match=r"size: expected"):
-        load_one(tmp_path, **PIXELS, size=size)
+    rejects(r"size: expected", load_one, tmp_path, **PIXELS, size=size)
 
 
 @pytest.mark.parametrize("frames", [None, {"0": 1}, [3]])
 def test_no_frames(tmp_path, frames):
     path = write_transforms(tmp_path, frames)
-    with pytest.raises(InputError, match=r"transforms\.json: .*frames.*expected"):
-        load_transforms(path)
+    rejects(r"transforms\.json: .*frames.*expected", load_transforms, path)

@@ -14,11 +14,11 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from captures import rejects, warned
 from scipy.spatial.transform import Rotation
 
 import gsjax
 from gsjax.cli.main import main
-from gsjax.errors import InputError
 from gsjax.io.common import to_bytes
 from gsjax.io.spz import write_spz
 
@@ -71,9 +71,6 @@ def assert_alike(found: gsjax.Gaussians, expected: gsjax.Gaussians, sh: float) -
         bound = {"means": 2.0**-13, "log_scales": 1 / 32, "sh": sh}.get(name, 0.5 / 255)
         np.testing.assert_allclose(*values, rtol=0, atol=bound + 1e-6)
     np.testing.assert_allclose(rotations(found), rotations(expected), atol=6e-3)
-
-
-# --- SPZ ---
 
 
 def test_reads_files_of_another_program(tmp_path):
@@ -223,8 +220,7 @@ def save_raw(path: Path, raw: bytes) -> Path:
 )
 def test_flags_and_trailing_bytes_are_warned_about(tmp_path, flags, tail, message):
     raw = THEIRS[:14] + bytes([flags]) + THEIRS[15:] + tail
-    with pytest.warns(UserWarning, match=message):
-        found = gsjax.load(save_raw(tmp_path / "a.spz", raw))
+    found = warned(message, gsjax.load, save_raw(tmp_path / "a.spz", raw))
     assert_alike(found, given(), 1 / 16)
     write_spz(tmp_path / "b.spz", given(0), antialias=flags == 1)
     assert gzip.decompress((tmp_path / "b.spz").read_bytes())[14] == (flags == 1)
@@ -236,8 +232,6 @@ def test_opacities_of_zero_and_one_round_trip(tmp_path):
     np.testing.assert_allclose(opacities(found), [0, 1, 0], atol=0.5 / 255)
     assert np.isfinite(found).all()
 
-
-# --- values out of range ---
 
 FEW = np.asarray([[1.0, 0, 0], [0, 0, 0], [1, 2, 3]])
 WHITE = np.zeros((3, 1, 3))
@@ -267,8 +261,7 @@ def test_values_are_clipped_to_the_nearest(tmp_path):
     sh = np.zeros((3, 4, 3))
     sh[0, :] = (9.0, -9.0, 0.5)
     scene = given(1, sh=sh, log_scales=[[9, -19, 0], [0, 0, 0], [1, 1, 1]])
-    with pytest.warns(UserWarning, match="beyond"):
-        gsjax.save(tmp_path / "a.spz", scene)
+    warned("beyond", gsjax.save, tmp_path / "a.spz", scene)
     found = gsjax.load(tmp_path / "a.spz").params
     np.testing.assert_array_equal(found.log_scales[0], [255 / 16 - 10, -10, 0])
     np.testing.assert_allclose(found.sh[0, 0], [10 / 3, -10 / 3, 0.5], atol=0.014)
@@ -310,12 +303,8 @@ def test_scenes_that_a_format_cannot_store_are_refused(tmp_path, row):
     with jax.enable_x64(True):
         scene = given(0, **changes)
         for suffix in suffixes:
-            with pytest.raises(InputError, match=message):
-                gsjax.save(tmp_path / f"a{suffix}", scene)
+            rejects(message, gsjax.save, tmp_path / f"a{suffix}", scene)
     assert list(tmp_path.iterdir()) == []
-
-
-# --- .splat ---
 
 
 def test_splat_files_follow_the_layout(tmp_path):

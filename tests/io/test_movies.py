@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from captures import rejects
 
 import gsjax
 from gsjax.io.movies import encode_animation, played_rate, write_movie
@@ -91,8 +92,7 @@ def test_folders_of_pngs(tmp_path, name):
     for file, frame in zip(names, expected):
         pixels = cv2.imread(str(folder / file))[..., ::-1]
         np.testing.assert_array_equal(pixels, frame)
-    with pytest.raises(gsjax.InputError, match="holds 3 frames"):
-        write_movie(tmp_path / name, iter(expected))
+    rejects("holds 3 frames", write_movie, tmp_path / name, iter(expected))
     assert write_movie(tmp_path / name, iter(expected[:2]), overwrite=True) == 2
     assert len(list(folder.iterdir())) == 2
     (folder / "notes.txt").touch()
@@ -107,8 +107,7 @@ def test_an_existing_file_is_replaced_only_when_asked(tmp_path, monkeypatch):
     path = Path("2026-11-24T10:30/a.webm")
     path.parent.mkdir()
     path.write_bytes(b"mine")
-    with pytest.raises(gsjax.InputError, match="exists; pass --overwrite"):
-        write_movie(path, pictures())
+    rejects("exists; pass --overwrite", write_movie, path, pictures())
     assert path.read_bytes() == b"mine"
     write_movie(path, pictures(), overwrite=True)
     assert len(video_of(tmp_path / path)[0]) == 6

@@ -46,9 +46,6 @@ def render_of(batch=(), overflowed=False, **images) -> Render:
     return Render(**fields | {"overflowed": jnp.bool(overflowed)})
 
 
-# --- pictures ---
-
-
 def test_one_picture_keeps_its_pixels(tmp_path):
     image = random_picture()
     eight = to_8_bit(image)
@@ -106,9 +103,6 @@ def test_refused_pictures(tmp_path):
     ):
         with pytest.raises(gsjax.InputError, match=message):
             call()
-
-
-# --- display methods ---
 
 
 def test_all_images_of_a_render_are_displayed():
@@ -226,9 +220,6 @@ def test_display_methods_are_attached_in_a_notebook():
     args = [sys.executable, "-c", code]
     done = subprocess.run(args, capture_output=True, text=True)
     assert done.stdout, done.stderr
-
-
-# --- the notebooks; CI executes them ---
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
