@@ -25,6 +25,9 @@ QUICK_FLAGS = (
 )
 
 
+# For `jax.stages.Lowered.compile`: kernels as users have them, and their memory.
+KERNELS_OF_USERS = {"xla_cpu_use_fusion_emitters": True}
+
 # Tests that need the kernels of users, and how they differ from the quick ones:
 # "as_users": compiled as for users, for bounds that rest on how kernels round.
 # "new_emitters": kernels of users, optimised little: bits do not depend on sizes.

@@ -1,4 +1,4 @@
-"""Elementary functions against NumPy's in float64."""
+"""Elementary functions and rotations against NumPy in float64."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from gsjax.math.rotations import covariance, quaternion_to_matrix, times_covaria
 pytestmark = pytest.mark.as_users
 
 
-def test_exponential_of_negative_numbers(report):
+def test_exponential_is_accurate(report):
     x = np.concatenate([-np.logspace(-20, np.log10(87), 100_000), [0.0]])
     x = x.astype(np.float32)
     found = np.asarray(jax.jit(exp_negative)(x))
@@ -33,14 +33,14 @@ def test_exponential_of_negative_numbers(report):
     assert np.isnan(exp_negative(jnp.float32(np.nan)))
 
 
-def test_exponential_of_negative_numbers_in_float64_is_the_usual_one():
+def test_exponential_is_exact_in_float64():
     with jax.enable_x64(True):
         x = -jnp.logspace(-20, 2.8, 1000)
         assert x.dtype == np.float64
         assert np.array_equal(exp_negative(x), jnp.exp(x))
 
 
-def test_exponential_of_negative_numbers_is_its_own_derivative():
+def test_exponential_is_its_own_derivative():
     x = -jnp.logspace(-5, 1.9, 100, dtype=jnp.float32)
     direction = jnp.cos(x)
     value, slope = jax.jvp(exp_negative, (x,), (direction,))
@@ -57,7 +57,7 @@ def components(rows):
 
 
 def test_near_one_rounds_nothing():
-    """Every magnitude, signs and orders mixed: times one power of two, to the bit."""
+    """Vectors of every magnitude are multiplied by one power of two, to the bit."""
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(4000, 3)) * np.logspace(-33, 37, 4000)[:, None]
     rows = rows.astype(np.float32)
@@ -77,7 +77,7 @@ def test_near_one_rounds_nothing():
 
 
 @pytest.mark.parametrize("bad", [0.0, 1e-40, np.inf, -np.inf, np.nan])
-def test_a_vector_of_no_direction_is_the_fallback(bad):
+def test_a_vector_without_direction_becomes_the_fallback(bad):
     def first(rows):
         return sum(c for c in safe_normalize(tuple(rows), FALLBACK)[0])
 
@@ -88,9 +88,9 @@ def test_a_vector_of_no_direction_is_the_fallback(bad):
     assert np.array_equal(jax.grad(first)(row), np.zeros(3))
 
 
-@pytest.mark.parametrize("norm", [1e-30, 1e-10, 1.0, 3e30])
+@pytest.mark.parametrize("norm", [1e-30, 3e30])
 def test_a_rotation_does_not_depend_on_the_norm(norm):
-    """Nor does its derivative along the quaternion itself exist."""
+    """And its derivative along the quaternion is zero."""
     quats = np.random.default_rng(1).normal(size=(50, 4))
     turned = np.asarray(quaternion_to_matrix(jnp.float32(quats * norm)), float)
     assert np.abs(turned - quaternion_to_matrix(jnp.float32(quats))).max() < 5e-7
@@ -102,8 +102,8 @@ def test_a_rotation_does_not_depend_on_the_norm(norm):
     assert np.abs(along).max() < 2e-6
 
 
-@pytest.mark.parametrize("norm", [1e-25, 1.0, 1e25])
-def test_times_a_covariance_is_so_without_its_matrix(norm):
+@pytest.mark.parametrize("norm", [1e-25, 1e25])
+def test_times_covariance_agrees_with_the_matrix(norm):
     rng = np.random.default_rng(4)
     quats = jnp.float32(norm * rng.normal(size=(2, 50, 4)))
     scales = jnp.exp(jnp.float32(rng.normal(size=(2, 50, 3))))
@@ -114,10 +114,8 @@ def test_times_a_covariance_is_so_without_its_matrix(norm):
     assert jnp.all(jnp.abs(found - wanted) < near)
 
 
-def test_slopes_of_a_rotation_by_what_is_zero():
-    """Exact: turned about z, a Gaussian seen along z has no reason to tilt, and an
-    optimiser that divides by the size of a slope would make a step of any rounding.
-    """
+def test_derivatives_by_zero_components_are_exactly_zero():
+    """An optimiser that normalises gradients would amplify rounding to full steps."""
     rng = np.random.default_rng(2)
     quats = jnp.float32(rng.normal(size=(500, 4)) * [1, 0, 0, 1])
     weights = jnp.float32(rng.normal(size=(500, 2, 2)))
@@ -132,7 +130,7 @@ def test_slopes_of_a_rotation_by_what_is_zero():
     assert np.abs(found[:, ::3]).min(0).max() > 0
 
 
-def test_what_is_worked_out_once_stays_as_it_is():
+def test_materialized_values_are_unchanged():
     values = jnp.float32([3e38, -1e-37, 1 / 3, 0.0, -0.0, np.inf, 5.0])
     mask = jnp.asarray([True, True, True, True, True, True, False])
     assert np.array_equal(jax.jit(materialize_mask)(mask), mask)
@@ -142,7 +140,7 @@ def test_what_is_worked_out_once_stays_as_it_is():
 
 
 @pytest.mark.parametrize("double", [False, True])
-def test_what_is_worked_out_once_has_the_slope_of_what_it_is(double):
+def test_materialized_values_are_differentiable(double):
     with jax.enable_x64(double):
         values = jnp.linspace(-3.0, 3.0, 7)
         mask = values > -2.5
@@ -154,7 +152,7 @@ def test_what_is_worked_out_once_has_the_slope_of_what_it_is(double):
         assert np.array_equal(jax.jit(jax.grad(total))(values), expected)
 
 
-def test_elsewhere_nothing_is_done_for_it(monkeypatch):
+def test_accelerators_do_not_materialize(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     mask, values = jnp.asarray([True, False]), (jnp.ones(2), jnp.zeros(2))
     assert materialize_mask(mask) is mask

@@ -1,6 +1,4 @@
-"""Linear maps with a transpose of their own: which of the two is run, where, and that
-all derivatives are those of the map.
-"""
+"""Linear maps with a custom transpose: derivatives of every kind, and batches."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +12,7 @@ A, B, X, Y = (jnp.asarray(RNG.normal(size=5)) for _ in range(4))
 
 
 def forward(a, b, x, y):
-    """Of x and y, linear in both; a and b are given."""
+    """A map of x and y, linear in both; a and b are given."""
     return [jnp.sin(a) * x + b * y, jnp.sum(a * b * y)]
 
 
@@ -77,7 +75,7 @@ def test_batches(axes):
     same(*of_each)
 
 
-def test_each_way_is_traced_where_it_is_wanted_alone():
+def test_an_unused_direction_is_not_traced():
     def never(*_):
         raise AssertionError("traced")
 
@@ -92,6 +90,5 @@ def test_each_way_is_traced_where_it_is_wanted_alone():
     same(jax.jvp(ahead, (X,), (Y,))[1], forward(A, B, Y, 0 * Y))
 
 
-def test_no_cotangent_is_zeros():
-    """Of a result that is not used."""
+def test_an_unused_result_has_a_zero_cotangent():
     same(jax.grad(lambda x, y: mapped(A, B, x, y)[1], (0, 1))(X, Y), (0 * X, A * B))

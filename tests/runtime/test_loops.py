@@ -1,4 +1,4 @@
-"""Loops over single numbers do what NumPy does, and each is one compiled kernel."""
+"""Loops over single numbers agree with NumPy, and each is one compiled kernel."""
 
 import re
 
@@ -14,7 +14,7 @@ ROOM = 40
 SIZE = 3 * loops.STRETCH + 5
 
 
-def dealt(value, first, count, lists):
+def scattered(value, first, count, lists):
     """(value, list) pairs, list by list."""
     out = [[] for _ in range(lists)]
     for v, f, c in zip(value, first, count):
@@ -31,21 +31,23 @@ def items_of(seed: int, items: int, lists: int):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_deal_is_a_counting_sort(seed):
+def test_scatter_items_is_a_counting_sort(seed):
     lists, used = 11, (0, 1, 50)[seed]
     value, first, count = items_of(seed, 50, lists)
-    wanted = dealt(value[:used], first, count, lists)
+    wanted = scattered(value[:used], first, count, lists)
     lengths = np.array([len(each) for each in wanted], np.int32)
     start = np.cumsum(lengths, dtype=np.int32) - lengths
     kept = np.stack([value, first, count], 1)
-    out = jax.jit(loops.scatter_items)(kept, np.int32(used), start, jnp.full(250, -1, jnp.int32))
+    out = jax.jit(loops.scatter_items)(
+        kept, np.int32(used), start, jnp.full(250, -1, jnp.int32)
+    )
     flat = [v for each in wanted for v in each]
     np.testing.assert_array_equal(out[: len(flat)], flat)
     assert (np.asarray(out[len(flat) :]) == -1).all()
 
 
 @pytest.mark.parametrize("share", [0, 0.02, 0.5, 1])
-def test_append_keeps_what_is_chosen_while_there_is_room(share):
+def test_append_keeps_chosen_rows_up_to_the_capacity(share):
     rng = np.random.default_rng(0)
     columns = rng.integers(0, 99, (2, 3 * ROOM)).astype(np.int32)
     chosen = rng.random(3 * ROOM) < share
@@ -60,7 +62,7 @@ def test_append_keeps_what_is_chosen_while_there_is_room(share):
 
 
 @pytest.mark.parametrize("share", [0, 0.001, 0.04, 1])
-def test_places_of_what_is_chosen(share):
+def test_places_are_the_indices_of_chosen_slots(share):
     chosen = np.random.default_rng(1).random(SIZE) < share
     some = np.pad(chosen, (0, -SIZE % loops.STRETCH)).reshape(-1, loops.STRETCH).any(1)
     past = jnp.full(ROOM + 1, SIZE, jnp.int32)
@@ -72,7 +74,7 @@ def test_places_of_what_is_chosen(share):
 
 
 def compiled(name: str) -> str:
-    """The program of one of the loops, as text."""
+    """Return the compiled program of a loop, as text."""
     many = jnp.zeros(SIZE, jnp.int32)
     one, some = jnp.zeros(1, jnp.int32), jnp.ones(SIZE, bool)
     rows = jnp.zeros((SIZE, 3), jnp.int32)
@@ -86,11 +88,8 @@ def compiled(name: str) -> str:
 
 
 @on_cpu
-def test_each_is_one_kernel_that_copies_nothing_in_a_turn(in_a_process):
-    """What XLA compiled: no `while` is left to be run turn by turn, and within one no
-    array is copied. Where this fails, a turn takes a hundred times as long. So it is
-    where XLA is told nothing, as in a program that has not called `use_all_cores`.
-    """
+def test_loops_are_single_kernels_without_copies(in_a_process):
+    """By XLA's default threshold. Otherwise an iteration takes 100 times as long."""
     names = "cumulative_sum", "append", "places", "scatter_items"
     code = "from runtime.test_loops import compiled; "
     code += f"print(chr(0).join(map(compiled, {names})))"
@@ -104,7 +103,7 @@ def test_each_is_one_kernel_that_copies_nothing_in_a_turn(in_a_process):
         assert not re.search(rf"\[({SIZE}|{padded})[^ ]* copy\(", inside)
 
 
-def test_a_batch_goes_one_after_another():
+def test_a_batch_runs_sequentially():
     chosen = np.random.default_rng(2).random((3, SIZE)) < 0.03
     some = jnp.ones((3, -(-SIZE // loops.STRETCH)), bool)
     past = jnp.full((3, ROOM + 1), SIZE, jnp.int32)

@@ -101,7 +101,7 @@ def test_sizes_are_formatted():
 def test_full_screen_splats_are_rejected_before_allocation(call, monkeypatch):
     """What they need is counted with small arrays."""
     monkeypatch.setattr(memory, "available", lambda: 0)
-    points = np.random.default_rng(0).uniform(-1, 1, (500, 3)) + [0, 0, 5]
+    points = np.random.default_rng(0).uniform(-1, 1, (2000, 3)) + [0, 0, 5]
     camera = camera_of(800, 600, viewmat=np.eye(4), focal=(700.0, 700.0))
     gaussians = gaussians_at(points, 100.0, 0.5, viewmat=np.eye(4), degree=0)
     with pytest.raises(CapacityError, match=r"800 × 600 px .* pairs"):
@@ -173,7 +173,7 @@ def test_estimates_of_the_loss_are_what_xla_reserves(report):
     config = RasterConfig(**{**LIGHT, "devices": devices})
     size = (width, height)
     parts = render_estimate(16, 1, size, config, gradients=True, width=8).parts
-    ratio = parts["for pictures"] / (devices * sizes.temp_size_in_bytes)
+    ratio = parts["for images"] / (devices * sizes.temp_size_in_bytes)
     report("memory of the loss", np.log(ratio), np.log(1.5))
     assert 1 < ratio < 1.5
 
