@@ -81,14 +81,10 @@ def to_opengl(viewmat: np.ndarray) -> np.ndarray:
 
 def frames_of(dataset: Dataset, form="images/{}.png", **more) -> list[dict]:
     """Frames of a transforms.json whose file_path is ``form`` of the view's index."""
-    return [
-        {
-            "file_path": form.format(index),
-            "transform_matrix": to_opengl(view.viewmat).tolist(),
-            **more,
-        }
-        for index, view in enumerate(dataset.views)
-    ]
+    matrices = [to_opengl(view.viewmat).tolist() for view in dataset.views]
+    names = [form.format(index) for index in range(len(matrices))]
+    rows = zip(names, matrices)
+    return [{"file_path": n, "transform_matrix": m, **more} for n, m in rows]
 
 
 def write_transforms(folder: Path, frames, name="transforms.json", **content) -> Path:

@@ -61,13 +61,7 @@ READ: dict[str, Callable[[Path], object]] = {
     "cameras.json": lambda path: load_cameras(SCENE, path),
 }
 # A prefix of text may be a valid shorter file, which gives a warning if it is detected.
-TEXT = (
-    "ascii.ply",
-    "cloud.ply",
-    "text/cameras.txt",
-    "text/images.txt",
-    "text/points3D.txt",
-)
+TEXT = ("ascii.ply", "cloud.ply", *(f"text/{name}.txt" for name in MODEL))
 
 
 def write_good_files(folder: Path) -> None:
@@ -80,9 +74,8 @@ def write_good_files(folder: Path) -> None:
     cloud = "ply\nformat ascii 1.0\nelement vertex 2\n"
     cloud += "".join(f"property float {axis}\n" for axis in "xyz")
     cloud += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
-    (folder / "cloud.ply").write_text(
-        cloud + "end_header\n0 0.5 1 9 8 7\n1 2 3 4 5 6\n"
-    )
+    cloud += "end_header\n0 0.5 1 9 8 7\n1 2 3 4 5 6\n"
+    (folder / "cloud.ply").write_text(cloud)
     write_colmap(folder / "sparse/0", SCENE)
     (folder / "text").mkdir()
     for name, text in COLMAP_TEXT.items():
@@ -97,10 +90,8 @@ def write_good_files(folder: Path) -> None:
     save_photo(folder / "mask.png", pixels[..., 0] // 128 * np.uint8(255))
     state = init_state(gaussians, TrainConfig(sh_degree=0), 1.0, 2)
     state = state.replace(step=state.step + 7)
-    made = save_checkpoint(
-        folder / "checkpoints", state, {"pair_capacity": 64, "seconds": 0.0}
-    )
-    assert made == folder / STEP
+    content = {"pair_capacity": 64, "seconds": 0.0}
+    assert save_checkpoint(folder / "checkpoints", state, content) == folder / STEP
     save_settings(folder, RunSettings(dataset=folder))
     (folder / "eval.json").write_text(json.dumps(EVAL))
     save_cameras(folder / "cameras.json", SCENE)
@@ -160,21 +151,5 @@ TRANSFORMS = {
     ],
 }
 # Down, right, back; position; height, width, focal length; near and far.
-POSES = np.concatenate(
-    [
-        np.tile(
-            np.concatenate(
-                [
-                    np.asarray([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]),
-                    [[1], [2], [3]],
-                    [[24], [32], [40]],
-                ],
-                axis=1,
-            ).ravel(),
-            (2, 1),
-        ),
-        [[1, 9], [1, 9]],
-    ],
-    axis=1,
-)
+POSES = np.asarray([[0, 1, 0, 1, 24, 1, 0, 0, 2, 32, 0, 0, -1, 3, 40, 1, 9]] * 2, float)
 EVAL = {"which": "test", "views": 2, "psnr": 30.5, "ssim": 0.9}

@@ -16,7 +16,7 @@ def scene(**changes) -> gsjax.Gaussians:
         "logit_opacities": np.zeros(3),
         "sh": np.zeros((3, 4, 3)),
     }
-    return gsjax.make_gaussians(**fields | changes, capacity=5)
+    return gsjax.make_gaussians(**{**fields, "capacity": 5, **changes})
 
 
 def test_repr_is_short():
@@ -99,42 +99,33 @@ def test_other_types_are_named(row):
             call(wrong)
 
 
-GOOD = {
-    "means": np.zeros((4, 3)),
-    "quats": np.ones((4, 4)),
-    "log_scales": np.zeros((4, 3)),
-    "logit_opacities": np.zeros(4),
-    "sh": np.zeros((4, 1, 3)),
-}
-
-
 @pytest.mark.parametrize(
     ("name", "value", "named"),
     [
-        ("means", np.zeros((4, 2)), "means"),
-        ("means", np.zeros(4), "means"),
-        ("means", np.zeros((5, 3)), "quats"),  # the others are one short
-        ("means", np.zeros((4, 3), complex), "means"),
-        ("quats", np.zeros((4, 3)), "quats"),
-        ("log_scales", np.zeros((4, 1)), "log_scales"),
-        ("logit_opacities", np.zeros((4, 2)), "logit_opacities"),
-        ("sh", np.zeros((4, 3)), "sh"),
-        ("sh", np.zeros((3, 1, 3)), "sh"),
-        ("sh", np.zeros((4, 5, 3)), "5"),
-        *(("capacity", v, "capacity") for v in (3, 100.5, "100", True)),
+        ("means", np.zeros((3, 2)), "means"),
+        ("means", np.zeros(3), "means"),
+        ("means", np.zeros((4, 3)), "quats"),  # the others are one short
+        ("means", np.zeros((3, 3), complex), "means"),
+        ("quats", np.zeros((3, 3)), "quats"),
+        ("log_scales", np.zeros((3, 1)), "log_scales"),
+        ("logit_opacities", np.zeros((3, 2)), "logit_opacities"),
+        ("sh", np.zeros((3, 3)), "sh"),
+        ("sh", np.zeros((2, 1, 3)), "sh"),
+        ("sh", np.zeros((3, 5, 3)), "5"),
+        *(("capacity", v, "capacity") for v in (2, 100.5, "100", True)),
     ],
     ids=str,
 )
 def test_gaussians_are_checked(name, value, named):
     with pytest.raises(gsjax.InputError, match=named):
-        gsjax.make_gaussians(**{**GOOD, name: value})
+        scene(**{name: value})
 
 
 def test_opacities_may_be_a_column_and_scenes_empty():
-    column = {**GOOD, "logit_opacities": np.arange(4.0)[:, None]}
-    flat = gsjax.make_gaussians(**column).params.logit_opacities
-    np.testing.assert_array_equal(flat, np.arange(4.0))
-    none = gsjax.make_gaussians(**{name: array[:0] for name, array in GOOD.items()})
+    column = scene(logit_opacities=np.arange(3.0)[:, None], capacity=None)
+    np.testing.assert_array_equal(column.params.logit_opacities, np.arange(3.0))
+    empty = {name: array[:0] for name, array in vars(column.params).items()}
+    none = gsjax.make_gaussians(**empty)
     assert none.capacity == 1
     assert gsjax.num_active(none) == 0
 

@@ -59,8 +59,7 @@ def make_dataset(
         size = camera.width, camera.height
         views.append(View(name, Path(name), pose, photo.K, *size))
     xyz, rgb = _points(points, colors)
-    dataset = Dataset(Path("arrays"), "arrays", tuple(views), xyz, rgb)
-    dataset = finish_dataset(dataset)
+    dataset = finish_dataset(Dataset(Path("arrays"), "arrays", tuple(views), xyz, rgb))
     return dataset, [photos[view.name] for view in dataset.views]
 
 

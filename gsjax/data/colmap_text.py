@@ -18,8 +18,7 @@ _UINT32, _UINT64 = (1 << 32) - 1, (1 << 64) - 1
 # a track of some 70 000 photographs.
 _LONGEST, _LONGEST_POINT = 1 << 14, 1 << 20
 _EXPECTED = "a file of COLMAP"
-# Bytes of a point without a track: "1 0 0 0 0 0 0 0" and the line end.
-_LEAST_POINT = 16
+_LEAST_POINT = 16  # bytes without a track: "1 0 0 0 0 0 0 0" and the line end
 _SPACE = np.uint8(32)
 _COMMENT = re.compile(rb"(?m)^[ \t]*(#.*)$")
 _FIELDS = {"ids": ("<u8",), "xyz": ("<f8", 3), "colors": ("u1", 3)}

@@ -13,8 +13,6 @@ from gsjax.data.types import Dataset, View
 from gsjax.errors import InputError
 from gsjax.runtime.files import make_folder, reject_existing, write_file
 
-_UNKNOWN_ERROR = -1.0
-
 
 def write_colmap(
     folder: str | PathLike[str], dataset: Dataset, *, overwrite: bool = False
@@ -95,5 +93,5 @@ def _points(dataset: Dataset) -> bytes:
     table["id"] = np.arange(1, len(table) + 1)
     table["xyz"] = dataset.points + dataset.origin
     table["rgb"] = dataset.colors
-    table["error"] = _UNKNOWN_ERROR
+    table["error"] = -1.0  # unknown
     return struct.pack("<Q", len(table)) + table.tobytes()

@@ -73,8 +73,8 @@ def _load(view: View, max_size: int | None) -> Photo:
     K = scaled_intrinsics(view.K, *_ratio(view, width, height))
     invalid = None if view.mask is None else _masked(view.mask, width, height)
     if view.lens is not None:
-        given = (pixels, alpha, invalid)
-        pixels, alpha, invalid = _undistorted(view.image, view.lens, K, *given)
+        loaded = (pixels, alpha, invalid)
+        pixels, alpha, invalid = _undistorted(view.image, view.lens, K, *loaded)
     if max_size is not None and max(width, height) > max_size:
         size = size_within(width, height, max_size)
         shrink = partial(opencv().resize, dsize=size, interpolation=opencv().INTER_AREA)
@@ -157,9 +157,7 @@ def _ratio(view: View, width: int, height: int) -> tuple[float, float]:
 
 def stored_size(view: View) -> tuple[int, int]:
     """Return the size in px of a photograph's file; without a file, of its camera."""
-    if view.image.exists():
-        return image_size(view.image)
-    return view.width, view.height
+    return image_size(view.image) if view.image.exists() else (view.width, view.height)
 
 
 def size_within(width: int, height: int, longest: int | None) -> tuple[int, int]:

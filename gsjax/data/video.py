@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -73,29 +74,23 @@ def _sharpest(path: Path, windows: int, total: int, max_size: int) -> Iterator[F
 
 def _frames(path: Path) -> Iterator[np.ndarray]:
     """Yield all frames, rotated as the file says."""
-    capture = _opened(path)
-    try:
+    with _opened(path) as capture:
         while True:
             with captured_stderr():
                 good, pixels = capture.read()
             if not good:
                 return
             yield pixels
-    finally:
-        capture.release()
 
 
 def _count(path: Path) -> int:
     """Return the number of frames, counting them if the file does not declare it."""
-    capture = _opened(path)
-    try:
+    with _opened(path) as capture, captured_stderr():
         declared = int(capture.get(opencv().CAP_PROP_FRAME_COUNT))
-        with captured_stderr():
-            return declared if declared > 0 else sum(iter(capture.grab, False))
-    finally:
-        capture.release()
+        return declared if declared > 0 else sum(iter(capture.grab, False))
 
 
+@contextmanager
 def _opened(path: Path):
     if path.suffix.lower() in SUFFIXES:
         raise InputError(f"{path}: is a single image; pass its folder, or a video")
@@ -105,4 +100,7 @@ def _opened(path: Path):
     if not capture.isOpened():
         what = "is neither a folder of photos nor a video that OpenCV reads"
         raise InputError(f"{path}: {what}; convert it to MP4")
-    return capture
+    try:
+        yield capture
+    finally:
+        capture.release()

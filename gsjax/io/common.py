@@ -20,8 +20,7 @@ class Format(NamedTuple):
     """A file format of Gaussians, for `gsjax.io.formats.load` and `save`.
 
     Attributes:
-      name: short name.
-      suffixes: of file names, in lower case with the dot: (".ply",).
+      name, suffixes: short name, and lower-case suffixes with the dot: (".ply",).
       load: ``load(path) -> Gaussians``, or None if the format is only written.
       save: ``save(path, gaussians, *, overwrite) -> None``, or None if it is only read.
     """

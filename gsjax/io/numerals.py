@@ -20,12 +20,11 @@ _DIGIT = np.isin(np.arange(256), [*b"0123456789"])
 
 
 class Words(NamedTuple):
-    """Positions of the words and lines of a block.
+    """Words and lines of a block.
 
     Attributes:
       starts: [W] byte at which each word begins.
-      first: [L] index of the first word of each line, if it has any.
-      counts: [L] number of words.
+      first, counts: [L] index of the first word of each line, and number of words.
       ends: [L] byte at which the line ends.
     """
 

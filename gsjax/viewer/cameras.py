@@ -31,8 +31,7 @@ class Frustum(NamedTuple):
     Attributes:
       name: of its photograph.
       viewmat: [4, 4] world → camera.
-      fov: vertical field of view.
-      aspect: width over height.
+      fov, aspect: vertical field of view, and width over height.
       photo: [h, w, 3] uint8, small; or None.
     """
 

@@ -57,8 +57,7 @@ class Movie:
     """A movie that a notebook plays in a loop.
 
     Attributes:
-      data: contents of the file.
-      kind: "webp", "gif" or "webm".
+      data, kind: contents of the file, "webp", "gif" or "webm".
       frames: number of frames.
       size: (width, height) in px at which it is shown.
     """

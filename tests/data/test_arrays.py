@@ -13,21 +13,13 @@ RNG = np.random.default_rng(0)
 IMAGES = RNG.integers(0, 256, (3, 24, 32, 3)).astype(np.uint8)
 
 
+def singles(**more):
+    size = {"width": 32, "height": 24} | more
+    return [gsjax.make_camera(viewmat=v.viewmat, K=v.K, **size) for v in MADE.views]
+
+
 def cameras(**more):
-    """A batch of the three cameras."""
-    given = {
-        "viewmat": np.stack([view.viewmat for view in MADE.views]),
-        "K": np.stack([view.K for view in MADE.views]),
-        **{"width": 32, "height": 24},
-    }
-    return gsjax.make_camera(**given | more)
-
-
-def singles():
-    return [
-        gsjax.make_camera(viewmat=v.viewmat, K=v.K, width=32, height=24)
-        for v in MADE.views
-    ]
+    return gsjax.stack_cameras(singles(**more))
 
 
 @pytest.mark.parametrize("images", [IMAGES, list(IMAGES), IMAGES / 255])

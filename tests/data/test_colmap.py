@@ -133,20 +133,14 @@ def test_camera_models_project_as_those_of_pycolmap(tmp_path, kind):
         np.testing.assert_allclose(pixels[:, :2], expected, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("name", "lens"),
-    [
-        ("SIMPLE_RADIAL", None),
-        ("OPENCV", None),
-        # Equidistant, not a pinhole.
-        ("OPENCV_FISHEYE", Distortion("fisheye", (0.0,) * 4)),
-    ],
-)
-def test_zero_coefficients_are_a_pinhole_but_for_a_fisheye(tmp_path, name, lens):
-    model = pycolmap.Reconstruction()
-    model.add_camera(pycolmap.Camera.create_from_model_name(1, name, 9, 640, 4))
-    model.write_binary(tmp_path)
-    assert colmap_binary.read_cameras(tmp_path / "cameras.bin")[1].lens == lens
+def test_zero_coefficients_are_a_pinhole_but_for_a_fisheye(tmp_path):
+    equidistant = Distortion("fisheye", (0.0,) * 4)
+    lenses = {"SIMPLE_RADIAL": None, "OPENCV": None, "OPENCV_FISHEYE": equidistant}
+    for name, lens in lenses.items():
+        model = pycolmap.Reconstruction()
+        model.add_camera(pycolmap.Camera.create_from_model_name(1, name, 9, 640, 4))
+        model.write_binary(tmp_path)
+        assert colmap_binary.read_cameras(tmp_path / "cameras.bin")[1].lens == lens
 
 
 @pytest.mark.parametrize("at", [(0, 0, 0), (5e5, -4.1e6, 120)])
@@ -200,6 +194,10 @@ def test_models_are_found_in_several_places(tmp_path, place):
 
 def test_smaller_copies_and_other_folders(tmp_path):
     made = colmap_dataset(tmp_path)
+    for factor in (0, -2, 1.5):
+        rejects(
+            "factor: expected a whole number", load_dataset, tmp_path, factor=factor
+        )
     with pytest.raises(InputError, match=r"images_4: no such folder.*has the folders"):
         load_dataset(tmp_path, factor=4)
     for view in made.views:
@@ -214,12 +212,6 @@ def test_smaller_copies_and_other_folders(tmp_path):
     shutil.move(tmp_path / "images", elsewhere)
     assert load_dataset(tmp_path, images=elsewhere).views[0].image.parent == elsewhere
     rejects(r"images: no such folder.*images_4.*images=", load_dataset, tmp_path)
-
-
-@pytest.mark.parametrize("factor", [0, -2, 1.5])
-def test_a_factor_is_a_whole_number(tmp_path, factor):
-    colmap_dataset(tmp_path)
-    rejects(r"factor: expected a whole number", load_dataset, tmp_path, factor=factor)
 
 
 def llff_copies(folder, count=5):

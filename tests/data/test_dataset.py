@@ -117,17 +117,17 @@ def test_a_reader_from_outside(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "more", "expected"),
+    ("name", "expected"),
     [
-        ("", {}, r"expected sparse/0 of COLMAP.*got IMG_1\.JPG.*gsjax sfm"),
-        ("none", {}, r"none: does not exist"),
-        ("IMG_1.JPG", {}, r"IMG_1\.JPG: expected the folder of a dataset"),
-        ("a" * 5000, {}, "a: File name too long; check the path"),
+        ("", r"expected sparse/0 of COLMAP.*got IMG_1\.JPG.*gsjax sfm"),
+        ("none", r"none: does not exist"),
+        ("IMG_1.JPG", r"IMG_1\.JPG: expected the folder of a dataset"),
+        ("a" * 5000, "a: File name too long; check the path"),
     ],
 )
-def test_paths_that_are_no_dataset(tmp_path, name, more, expected):
+def test_paths_that_are_no_dataset(tmp_path, name, expected):
     (tmp_path / "IMG_1.JPG").write_bytes(b"")
-    rejects(expected, load_dataset, tmp_path / name, **more)
+    rejects(expected, load_dataset, tmp_path / name)
 
 
 def masked_dataset(folder):
@@ -200,14 +200,11 @@ def test_far_datasets_are_translated_and_restored(tmp_path, at):
     # Bit for bit, also after writing.
     np.testing.assert_array_equal(dataset.points + dataset.origin, made.points)
     write_colmap(tmp_path / "again", dataset)
-    np.testing.assert_array_equal(
-        read_colmap(tmp_path / "again").points.xyz, made.points
-    )
+    again = read_colmap(tmp_path / "again").points.xyz
+    np.testing.assert_array_equal(again, made.points)
     for view, given in zip(dataset.views, made.views):
-        atol = 1e-15 * np.abs(at).max()
-        np.testing.assert_allclose(
-            view.centre + dataset.origin, given.centre, atol=atol
-        )
+        centre, atol = view.centre + dataset.origin, 1e-15 * np.abs(at).max()
+        np.testing.assert_allclose(centre, given.centre, atol=atol)
         rotations = view.viewmat[:3, :3], given.viewmat[:3, :3]
         np.testing.assert_allclose(*rotations, atol=1e-14)
     # A camera sees the same, in float32 too.

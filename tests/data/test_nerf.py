@@ -1,6 +1,5 @@
 """`transforms.json` as datasets: three dialects, their lenses, splits and points."""
 
-import json
 import math
 
 import numpy as np
@@ -351,11 +350,10 @@ def test_bad_top_level(tmp_path, more, expected):
     ],
 )
 def test_bad_frames(tmp_path, more, expected):
-    nerfstudio_dataset(tmp_path, frames=frames_of(dataset_of_views(3)))
-    path = tmp_path / "transforms.json"
-    data = json.loads(path.read_text())
-    data["frames"][1] |= more
-    path.write_text(json.dumps(data))
+    frames = frames_of(dataset_of_views(3))
+    nerfstudio_dataset(tmp_path, frames=frames)
+    frames[1] |= more
+    write_transforms(tmp_path, frames, **PIXELS)
     rejects(expected, load_dataset, tmp_path)
 
 

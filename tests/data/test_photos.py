@@ -388,8 +388,7 @@ def with_hole(path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "damage"),
-    [("a.jpg", "Corrupt JPEG data"), ("a.tiff", "LZWDecode")],
+    ("name", "damage"), [("a.jpg", "Corrupt JPEG data"), ("a.tiff", "LZWDecode")]
 )
 def test_repaired_photographs_give_a_warning(tmp_path, capfd, name, damage):
     path = with_hole(tmp_path / name)

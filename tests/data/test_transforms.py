@@ -89,11 +89,7 @@ def test_far_cameras_are_translated(tmp_path, count):
     [
         (PIXELS, None, (500, 510, 310, 245)),
         (PIXELS, (320, 120), (250, 127.5, 155, 61.25)),
-        (
-            {"fl_x": 500, "w": 640.0, "h": 480.0, "fl_y": None},
-            None,
-            (500, 500, 320, 240),
-        ),
+        ({"fl_x": 500, "w": 640.0, "h": 480.0}, None, (500, 500, 320, 240)),
         (ANGLE | {"w": 800, "h": 600}, None, (800 * FOCAL, 800 * FOCAL, 400, 300)),
         (ANGLE, (400, 200), (400 * FOCAL, 400 * FOCAL, 200, 100)),
         # instant-ngp writes both, and its trainer uses the pixels.
@@ -118,16 +114,11 @@ def test_frames_override_the_top_level(tmp_path):
     assert_K(entries[3].camera, 320, 320, 310, 245)
 
 
-@pytest.mark.parametrize(
-    ("model", "lens"),
-    [
-        *(("OPENCV", "pinhole"), ("opencv", "pinhole"), (None, "pinhole")),
-        ("ORTHOGRAPHIC", "orthographic"),
-    ],
-)
-def test_camera_models(tmp_path, model, lens):
-    camera = load_one(tmp_path, camera_model=model, k1=0, p2=0.0, **PIXELS)
-    assert camera.lens.name == lens
+def test_camera_models(tmp_path):
+    lenses = dict.fromkeys(["OPENCV", "opencv", None], "pinhole")
+    for model, lens in {**lenses, "ORTHOGRAPHIC": "orthographic"}.items():
+        camera = load_one(tmp_path, camera_model=model, k1=0, p2=0.0, **PIXELS)
+        assert camera.lens.name == lens
 
 
 def test_distortion_gives_one_warning(tmp_path):
@@ -169,6 +160,7 @@ def test_names_are_unique_and_safe(tmp_path):
     assert found[:3] == ["a", "a_1", "a_2"]
 
 
+ORTHOGRAPHIC = {"fl_x": None, "fl_y": None, "camera_model": "ORTHOGRAPHIC"}
 EYE = np.eye(4)
 RAGGED = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1], [0, 0, 0, 1]]
 SHEAR = np.asarray([[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -217,10 +209,7 @@ def test_bad_matrices(tmp_path, matrix, expected):
         ({"fl_x": None, "fl_y": None}, "a focal length, fl_x.*got none"),
         ({"fl_x": None, "camera_angle_x": 0}, "camera_angle_x: .*radians.* got 0"),
         ({"fl_x": None, "camera_angle_x": 40.0}, "radians.* got 40"),
-        (
-            {"fl_x": None, "fl_y": None, "camera_model": "ORTHOGRAPHIC", **ANGLE},
-            "a focal length, fl_x, got none",
-        ),
+        ({**ORTHOGRAPHIC, **ANGLE}, "a focal length, fl_x, got none"),
         ({"camera_model": "OPENCV_FISHEYE"}, "camera_model .* supported: OPENCV, PIN"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model .* cannot be rendered"),
         ({"camera_model": ["OPENCV"]}, "camera_model .* cannot be rendered"),
@@ -235,12 +224,9 @@ def test_bad_intrinsics(tmp_path, more, expected):
         load_one(tmp_path, **(PIXELS | more))
 
 
-@pytest.mark.parametrize("size", [(0, 4), (4, 4.5), (4,), (4, -1), ("4", 4)])
-def test_bad_sizes(tmp_path, size):
-    rejects(r"size: expected", load_one, tmp_path, **PIXELS, size=size)
-
-
-@pytest.mark.parametrize("frames", [None, {"0": 1}, [3]])
-def test_no_frames(tmp_path, frames):
-    path = write_transforms(tmp_path, frames)
-    rejects(r"transforms\.json: .*frames.*expected", load_transforms, path)
+def test_bad_sizes_and_frames(tmp_path):
+    for size in [(0, 4), (4, 4.5), (4,), (4, -1), ("4", 4)]:
+        rejects("size: expected", load_one, tmp_path, **PIXELS, size=size)
+    for frames in (None, {"0": 1}, [3]):
+        path = write_transforms(tmp_path, frames)
+        rejects(r"transforms\.json: .*frames.*expected", load_transforms, path)

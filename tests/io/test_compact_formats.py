@@ -83,10 +83,10 @@ def test_reads_files_of_another_program(tmp_path):
 
 def by_the_book(raw: bytes) -> list[dict[str, list[float]]]:
     """Each Gaussian of version 3, decoded after Niantic's README."""
-    magic, version, count, degree, fraction, flags, reserved = struct.unpack_from(
+    magic, version, count, degree, fraction, *rest = struct.unpack_from(
         "<4sIIBBBB", raw
     )
-    assert (magic, version, flags, reserved) == (b"NGSP", 3, 0, 0)
+    assert (magic, version, *rest) == (b"NGSP", 3, 0, 0)
     rest = 3 * ((degree + 1) ** 2 - 1)
     starts = np.cumsum([16, *(count * width for width in (9, 1, 3, 3, 4, rest))])
     assert len(raw) == starts[-1]
@@ -105,11 +105,8 @@ def by_the_book(raw: bytes) -> list[dict[str, list[float]]]:
                 bits >>= 10
         xyzw[largest] = math.sqrt(1 - sum(v * v for v in xyzw))
         found.append({
-            "means": [
-                int.from_bytes(means[3 * k : 3 * k + 3], "little", signed=True)
-                / 2**fraction
-                for k in range(3)
-            ],
+            "means": [int.from_bytes(means[3 * k :][:3], "little", signed=True)
+                      / 2**fraction for k in range(3)],
             "opacity": [alpha[0] / 255],
             "color": [0.5 + C0 * (c / 255 - 0.5) / 0.15 for c in color],
             "log_scales": [s / 16 - 10 for s in scale],
@@ -197,11 +194,10 @@ def test_version_2_is_read(tmp_path):
     quats = np.asarray([row["xyzw"] for row in by_the_book(THEIRS)])
     (tmp_path / "a.spz").write_bytes(gzip.compress(as_version_2(THEIRS, quats)))
     found = gsjax.load(tmp_path / "a.spz")
+    theirs = gsjax.load(save_raw(tmp_path / "b.spz", THEIRS)).params
     for name in NAMES:
-        theirs = gsjax.load(save_raw(tmp_path / "b.spz", THEIRS))
-        np.testing.assert_array_equal(
-            getattr(found.params, name), getattr(theirs.params, name)
-        )
+        values = getattr(found.params, name), getattr(theirs, name)
+        np.testing.assert_array_equal(*values)
     np.testing.assert_allclose(rotations(found), rotations(given()), atol=0.03)
 
 
@@ -316,13 +312,11 @@ def test_splat_files_follow_the_layout(tmp_path):
     assert len(raw) == 3 * 32
     params = given().params
     for place, index in enumerate((2, 1, 0)):
-        *floats, red, green, blue, alpha, w, x, y, z = struct.unpack_from(
-            "<6f8B", raw, 32 * place
-        )
+        row = struct.unpack_from("<6f8B", raw, 32 * place)
+        *floats, red, green, blue, alpha, w, x, y, z = row
         np.testing.assert_array_equal(floats[:3], params.means[index])
-        np.testing.assert_allclose(
-            floats[3:], np.exp(np.asarray(params.log_scales[index])), rtol=1e-6
-        )
+        scales = np.exp(np.asarray(params.log_scales[index]))
+        np.testing.assert_allclose(floats[3:], scales, rtol=1e-6)
         expected = 0.5 + C0 * np.asarray(params.sh[index, 0])
         found = np.asarray([red, green, blue]) / 255
         np.testing.assert_allclose(found, expected, atol=0.5 / 255)

@@ -1,6 +1,8 @@
 """Movies decode to the same frames at the same speed, and appear complete or not."""
 
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -142,22 +144,13 @@ def test_refused_frames_leave_nothing(tmp_path, name):
 def test_a_truncated_video_is_refused(tmp_path, monkeypatch):
     """The encoder does not report a full disk."""
 
-    class Truncated:
-        def __init__(self, path, *_):
-            self.path = path
+    def writer(path, *_):
+        release = partial(Path(path).write_bytes, b"\x1aE\xdf\xa3")
+        nothing = dict.fromkeys(["isOpened", "write"], lambda *_: True)
+        return SimpleNamespace(release=release, **nothing)
 
-        def isOpened(self):
-            return True
-
-        def write(self, _):
-            pass
-
-        def release(self):
-            Path(self.path).write_bytes(b"\x1aE\xdf\xa3")
-
-        fourcc = staticmethod(lambda *_: 0)
-
-    monkeypatch.setattr(cv2, "VideoWriter", Truncated)
+    writer.fourcc = lambda *_: 0
+    monkeypatch.setattr(cv2, "VideoWriter", writer)
     with pytest.raises(gsjax.InputError, match="of 6 frames could be written"):
         write_movie(tmp_path / "a.webm", pictures())
     assert not list(tmp_path.iterdir())

@@ -5,12 +5,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gsjax.io.numerals import (
-    find_words,
-    other_than_digits,
-    parse_number,
-    parse_numbers,
-)
+from gsjax.io.numerals import find_words, other_than_digits, parse_number, parse_numbers
 
 WORDS = st.one_of(
     st.floats().map(repr),

@@ -3,8 +3,6 @@
 import base64
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -212,14 +210,6 @@ def test_live_updates_one_display(monkeypatch):
         assert not np.array_equal(updates[0].pixels, updates[1].pixels)
     assert show(image) is None
     np.testing.assert_array_equal(first[-1][0].pixels, to_8_bit(image))
-
-
-def test_display_methods_are_attached_in_a_notebook():
-    code = "import sys, gsjax; sys.modules['ipykernel'] = sys; "
-    code += "print(gsjax.Gaussians._repr_png_.__name__)"
-    args = [sys.executable, "-c", code]
-    done = subprocess.run(args, capture_output=True, text=True)
-    assert done.stdout, done.stderr
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
