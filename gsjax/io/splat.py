@@ -17,9 +17,8 @@ from gsjax.io import common
 from gsjax.math.sh import C0
 from gsjax.runtime.files import replacing
 
-_ROW = np.dtype(
-    [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]
-)
+_FLOATS = [("means", "<f4", 3), ("scales", "<f4", 3)]
+_ROW = np.dtype([*_FLOATS, ("rgba", "u1", 4), ("quats", "u1", 4)])
 _NEARER = "move the scene nearer to the origin, or write a .ply"
 
 

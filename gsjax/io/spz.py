@@ -126,8 +126,7 @@ def _read_header(stream: BinaryIO, path: Path) -> tuple[int, int, int, int, int]
         )
     _, version, rows, degree, fraction, flags, _ = _HEADER.unpack(raw)
     for name, value, least, most in (
-        ("version", version, 2, 3),
-        ("degree", degree, 0, 4),
+        *(("version", version, 2, 3), ("degree", degree, 0, 4)),
         ("fraction", fraction, 0, 24),
     ):
         if not least <= value <= most:

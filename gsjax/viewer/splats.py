@@ -21,12 +21,7 @@ _LARGEST, _TYPICAL = 250.0, 0.1
 
 
 class Cut(NamedTuple):
-    """Limits of the Gaussians that are shown, both included.
-
-    Attributes:
-      min_opacity: in [0, 1).
-      max_scale: of the longest axis, world units.
-    """
+    """Limits, both included: opacity in [0, 1), and longest axis in world units."""
 
     min_opacity: float = 0.0
     max_scale: float = float("inf")

@@ -13,6 +13,7 @@ from captures import (
     ply_file,
     rejects,
     save_photo,
+    to_opengl,
     warned,
     write_transforms,
 )
@@ -158,6 +159,17 @@ def test_intrinsics_of_frames(tmp_path):
     assert (views[1].width, views[1].K[0, 0], views[1].K[1, 2]) == (64, 99, 20)
     expected = Distortion("opencv", (0.1, 0.2, 0.01, 0.02, 0.3))
     assert views[2].lens == expected
+
+
+def test_scaled_rotations_give_a_warning(tmp_path):
+    made = dataset_of_views(3)
+    frames = frames_of(made)
+    matrix = to_opengl(made.views[0].viewmat) * [2, 2, 2, 1]
+    frames[0]["transform_matrix"] = matrix.tolist()
+    nerfstudio_dataset(tmp_path, frames=frames)
+    expected = r"1 frames are scaled, the first: 0 \(× 2\)"
+    view = warned(expected, load_dataset, tmp_path).views[0]
+    np.testing.assert_allclose(view.viewmat, made.views[0].viewmat, atol=1e-14)
 
 
 @pytest.mark.parametrize("kept", ["images", "originals"])

@@ -63,6 +63,7 @@ def server(running):
     content = running.content
     content.gaussians, content.renderer = scene(), FakeRenderer()
     content.frusta, content.status = frusta_of(training.dataset().views), ""
+    content.min_opacity = 0.0
     yield running
     wait_for(lambda: not running.has_browsers)
 
@@ -209,6 +210,17 @@ def test_sliders_select_by_scale_and_opacity(server, joined):
     np.testing.assert_array_equal(rendered(), kept)
     session.scale.value = 100
     wait_for(lambda: sends(opacities >= 0.5))
+
+
+def test_the_initial_opacity_may_exceed_the_range_of_the_slider(server):
+    """As with `gsjax view PLY --min-opacity 0.995`."""
+    server.content.min_opacity = 0.995
+    params = scene().params.replace(logit_opacities=jax.numpy.linspace(0, 9, COUNT))
+    server.content.gaussians = scene().replace(params=params)
+    browser = Browser(server.url)
+    kept = (opacities_of(server.content.gaussians) >= 0.995).sum()
+    assert session_of(server).splats.buffer.shape == (kept, 8)
+    browser.close()
 
 
 @pytest.mark.timeout(60)  # viser would wait forever
