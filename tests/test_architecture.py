@@ -40,7 +40,6 @@ FLOORS = (
     "__init__ __main__",
 )
 FLOOR = {name: floor for floor, row in enumerate(FLOORS) for name in row.split()}
-unfinished = pytest.mark.xfail(strict=False, reason="being worked on")
 
 
 def sources(*folders: str) -> dict[Path, str]:
@@ -155,13 +154,11 @@ def docstrings() -> Iterator[tuple[str, str]]:
                 yield f"{path}:{getattr(node, 'lineno', 1)}", text
 
 
-@unfinished
 def test_docstrings_begin_with_a_verb_or_a_noun():
     begins = re.compile(r"(What|Of|Whose|Whether|Where|How)\b")
     assert not [place for place, text in docstrings() if begins.match(text)]
 
 
-@unfinished
 def test_nothing_is_wanted():
     files = sources("gsjax")
     for path in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]:
@@ -181,11 +178,15 @@ def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
                 yield f"{module_name(path)}.{node.name}", node
 
 
-# Public functions whose settings are passed by keyword.
-MANY_PARAMETERS: set[str] = set()
+# Each extension point of `fit` is an argument, passed by keyword.
+MANY_PARAMETERS = {"gsjax.train.loop.fit"}
+# The nested loops of one kernel share their values.
+LONG = {
+    "gsjax.raster.compositing.fused.composite_fused",
+    "gsjax.raster.compositing.fused_vjp.backward",
+}
 
 
-@unfinished
 def test_functions_take_few_parameters():
     def count(node):
         arguments = node.args
@@ -195,7 +196,6 @@ def test_functions_take_few_parameters():
     assert many <= MANY_PARAMETERS
 
 
-@unfinished
 def test_functions_are_short():
     """At most 65 lines of code; docstrings and decorators do not count."""
 
@@ -203,7 +203,7 @@ def test_functions_are_short():
         body = node.body[ast.get_docstring(node) is not None :] or node.body
         return (node.end_lineno or 0) - body[0].lineno + 1
 
-    assert not {name for name, node in functions() if lines(node) > 65}
+    assert {name for name, node in functions() if lines(node) > 65} <= LONG
 
 
 def test_the_rasteriser_has_few_doors():

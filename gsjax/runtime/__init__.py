@@ -1,4 +1,4 @@
-"""What gsjax needs of its process: devices, memory, compiled programs, files, console.
+"""The process: devices, memory, compiled programs, files and the console.
 
 `setup` prepares the process when gsjax is imported, and does not import JAX; `devices`
 is the one module that asks for JAX's backend. `machine` and `memory` read limits of the
