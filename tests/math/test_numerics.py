@@ -14,8 +14,6 @@ from gsjax.math.numerics import (
 )
 from gsjax.math.rotations import covariance, quaternion_to_matrix, times_covariance
 
-pytestmark = pytest.mark.as_users
-
 
 def test_exponential_is_accurate(report):
     x = np.concatenate([-np.logspace(-20, np.log10(87), 100_000), [0.0]])
