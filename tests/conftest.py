@@ -25,9 +25,6 @@ QUICK_FLAGS = (
 )
 
 
-# For `jax.stages.Lowered.compile`: kernels as users have them, and their memory.
-KERNELS_OF_USERS = {"xla_cpu_use_fusion_emitters": True}
-
 # Tests that need the kernels of users, and how they differ from the quick ones:
 # "as_users": compiled as for users, for bounds that rest on how kernels round.
 # "new_emitters": kernels of users, optimised little: bits do not depend on sizes.
@@ -106,7 +103,7 @@ _MAX_MEMORY = 2e9  # bytes
 
 def pytest_collection_modifyitems(items):
     """Run the slowest modules first, lest one process waits for another at the end."""
-    slow = {item.path for item in items if item.get_closest_marker("long")}
+    slow = {x.path for x in items if x.get_closest_marker("long") or _kind(x)}
     paths = list(dict.fromkeys(item.path for item in items))
     items.sort(key=lambda item: (item.path not in slow, paths.index(item.path)))
 

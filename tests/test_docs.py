@@ -1,4 +1,4 @@
-"""The pages: Python runs, commands parse, names exist, links resolve, and they build."""
+"""Pages: Python runs, commands parse, names exist, links resolve, and they build."""
 
 import importlib.util
 import io

@@ -175,7 +175,7 @@ def _coefficients(lens: Lens, values, batch: tuple[int, ...]):
             f"coefficients: expected {' or '.join(map(str, lens.counts))} for the "
             f"{lens.name} lens, got {max(count, 0)}"
         )
-    return _broadcast(values, (*batch, count)) if count else None
+    return None if values is None else _broadcast(values, (*batch, count))
 
 
 def _broadcast(value: Array | np.ndarray, shape: tuple[int, ...]):

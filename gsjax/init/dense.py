@@ -26,7 +26,7 @@ from gsjax.init.plane_sweep import (
     sweep,
     unproject,
 )
-from gsjax.runtime.machine import all_of, usable_cores
+from gsjax.runtime.machine import map_concurrently, usable_cores
 
 # Angles in degrees between the directions from which two views see a point: small ones
 # make depth uncertain, and windows do not match at large ones.
@@ -111,7 +111,7 @@ def find_points(
         return sweep(images[view], others, *overlap.depth_range(view))
 
     with ThreadPoolExecutor(min(_MAX_THREADS, usable_cores())) as pool:
-        maps = dict(zip(pairing, all_of(pool, swept, pairing)))
+        maps = dict(zip(pairing, map_concurrently(pool, swept, pairing)))
     found = [
         _consistent_points(v, images, maps, others) for v, others in pairing.items()
     ]

@@ -104,7 +104,7 @@ def require_ranges(settings: Any, checks: dict[str, str | tuple]) -> None:
             raise InputError(f"{where}: expected {expected}, got {found!r}")
 
 
-def _within(value: float | None, interval: str) -> bool:
+def _within(value: Any, interval: str) -> bool:
     match = re.fullmatch(r"([\[(])(.+), (.+)([\])])", interval)
     assert match is not None, interval
     opening, low, high, closing = match.groups()

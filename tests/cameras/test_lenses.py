@@ -29,7 +29,7 @@ def tables():
         return dict(file)
 
 
-@pytest.mark.parametrize("index", (0, 2))
+@pytest.mark.parametrize("index", [0, 2])
 @pytest.mark.parametrize("name", TABLES)
 def test_tables(tables, name, index, report):
     def table(field):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from captures import dataset_of_views, save_photo
-from conftest import KERNELS_OF_USERS, LIGHT, camera_of, gaussians_at, write_files
+from conftest import LIGHT, camera_of, gaussians_at, write_files
 
 import gsjax
 from gsjax import CapacityError, RasterConfig
@@ -116,9 +116,9 @@ def test_huge_images_are_rejected_at_once(monkeypatch):
 
 
 def reserved(function, *arguments) -> int:
-    """Return the bytes that XLA reserves for a program, with the kernels of users."""
+    """Return the bytes that XLA reserves for a program."""
     lowered = jax.jit(function).lower(*arguments)
-    sizes = lowered.compile(KERNELS_OF_USERS).memory_analysis()
+    sizes = lowered.compile().memory_analysis()
     return sizes.temp_size_in_bytes + sizes.output_size_in_bytes
 
 
@@ -169,7 +169,7 @@ def test_estimates_of_the_loss_are_what_xla_reserves(report):
 
     shape = jax.ShapeDtypeStruct((1, height, width, 3), jnp.float64)
     lowered = jax.jit(jax.value_and_grad(loss)).lower(shape, shape)
-    sizes = lowered.compile(KERNELS_OF_USERS).memory_analysis()
+    sizes = lowered.compile().memory_analysis()
     config = RasterConfig(**{**LIGHT, "devices": devices})
     size = (width, height)
     parts = render_estimate(16, 1, size, config, gradients=True, width=8).parts

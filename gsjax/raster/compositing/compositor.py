@@ -8,6 +8,7 @@ the first kernel that JAX differentiates, so that all of them agree to rounding.
 Axis legend: T tiles, P pixels of a tile, C channels, R ranks.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -107,11 +108,11 @@ def _composite_jvp(task, primals, tangents):
     return images, {"sums": sums}
 
 
-def _automatic(task: Task):
+def _automatic(task: Task) -> Callable[[Tiles], Images]:
     """Return the kernel that JAX differentiates, as a function of `Tiles`."""
     differentiable = choose_differentiable(task).differentiable
     assert differentiable is not None
-    return partial(differentiable, task=task)
+    return lambda tiles: differentiable(tiles, task)
 
 
 def _kinds(tiles: Tiles, active: list[int]) -> frozenset[str]:

@@ -138,7 +138,7 @@ def _wide_depth(means, camera: Camera) -> Array:
 
     if camera.lens.depth is z_depth:
         return coordinate(2)
-    return camera.lens.depth(tuple(coordinate(i) for i in range(3)))
+    return camera.lens.depth((coordinate(0), coordinate(1), coordinate(2)))
 
 
 def project(
@@ -198,7 +198,7 @@ def project(
 
     # Two sizes at most: each further one costs seconds of compiling.
     out = run_at_bucket(count, room, min(config.num_size_buckets, 2), run, step=16)
-    absolute = config.absgrad and probe is not None
+    absolute = probe if config.absgrad else None
     return Projection(
         footprint=Footprint(
             out.u, out.v, out.inv_sx, out.slope, out.var_y, out.det, out.reach
@@ -207,7 +207,7 @@ def project(
         channels=Channels(
             colors=out.colors,
             depth=out.depth,
-            probe=probe[order].T if absolute else None,
+            probe=None if absolute is None else absolute[order].T,
             alpha_min=inputs.alpha_min,
         ),
     )
