@@ -25,10 +25,13 @@ QUICK_FLAGS = (
 )
 
 
-# Tests that need the kernels of users, and how they differ from the quick ones:
-# "as_users": compiled as for users, for bounds that rest on how kernels round.
-# "new_emitters": kernels of users, optimised little: bits do not depend on sizes.
-KINDS = {"as_users": "0", "new_emitters": "1"}  # JAX_DISABLE_MOST_OPTIMIZATIONS
+# Undo these flags for one program: `jax.jit(…, compiler_options=AS_USERS)`. Tests
+# marked as_users run in a process without them, for what rests on how kernels round.
+AS_USERS = {
+    "xla_cpu_use_fusion_emitters": True,
+    "xla_backend_optimization_level": 3,
+    "xla_llvm_disable_expensive_passes": False,
+}
 
 
 def _set_up_environment():
@@ -103,31 +106,25 @@ _MAX_MEMORY = 2e9  # bytes
 
 def pytest_collection_modifyitems(items):
     """Run the slowest modules first, lest one process waits for another at the end."""
-    slow = {x.path for x in items if x.get_closest_marker("long") or _kind(x)}
+    slow = {x.path for x in items if x.get_closest_marker("long") or _marked(x)}
     paths = list(dict.fromkeys(item.path for item in items))
     items.sort(key=lambda item: (item.path not in slow, paths.index(item.path)))
 
 
-def _kind(item) -> str | None:
-    """Return the kind of `KINDS` that a test is marked as; the closest mark counts."""
-    return next((m.name for m in item.iter_markers() if m.name in KINDS), None)
+_OUTCOMES: dict[Path, dict] = {}  # of marked tests: by module, then by test
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item):
-    """Run the marked tests of a module in one process with XLA's flags of users."""
-    kind = _kind(item)
-    if kind is None or "GSJAX_TESTS_KIND" in os.environ:
+    """Run the tests of a module that are marked as_users in a process of their own."""
+    if not _marked(item) or "GSJAX_TESTS_OUTCOMES" in os.environ:
         return None
-    if (item.path, kind) not in _OUTCOMES:
-        of_kind = [
-            other.nodeid
-            for other in item.session.items
-            if (other.path, _kind(other)) == (item.path, kind)
-        ]
-        _OUTCOMES[item.path, kind] = _run_marked(item.config.rootpath, kind, of_kind)
-    outcomes = _OUTCOMES[item.path, kind]
-    failed = ("call", "failed", 0.0, outcomes.get("", "not run"))
+    if item.path not in _OUTCOMES:
+        tests = [x for x in item.session.items if x.path == item.path and _marked(x)]
+        names = [test.nodeid for test in tests]
+        _OUTCOMES[item.path] = _run_as_users(item.config.rootpath, names)
+    outcomes = _OUTCOMES[item.path]
+    failed = ("call", "failed", 0.0, outcomes[""])
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
     for when, outcome, duration, text in outcomes.get(item.nodeid, [failed]):
         if outcome == "skipped":
@@ -140,40 +137,41 @@ def pytest_runtest_protocol(item):
     return True
 
 
-_OUTCOMES: dict[tuple[Path, str], dict] = {}  # by module and kind, then by test
+def _marked(item) -> bool:
+    return item.get_closest_marker("as_users") is not None
 
 
-def _run_marked(root: Path, kind: str, tests: list[str]) -> dict:
-    """Run tests in a process; return their phases, and the output by ""."""
+def _run_as_users(root: Path, tests: list[str]) -> dict:
+    """Run tests in a process; return their phases by name, and the output by ""."""
     flags = os.environ["XLA_FLAGS"]
     for flag in QUICK_FLAGS:
         flags = flags.replace(flag, "")
     with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "outcomes"
+        path.touch()
         changes = {
-            "GSJAX_TESTS_KIND": kind,
-            "GSJAX_TESTS_OUTCOMES": f"{folder}/outcomes",
-            "JAX_DISABLE_MOST_OPTIMIZATIONS": KINDS[kind],
+            "GSJAX_TESTS_OUTCOMES": str(path),
+            "JAX_DISABLE_MOST_OPTIMIZATIONS": "0",
+            "PYTEST_XDIST_WORKER": "",
+            "PYTEST_XDIST_WORKER_COUNT": "",
             "XLA_FLAGS": flags,
         }
-        for name in ("PYTEST_XDIST_WORKER", "PYTEST_XDIST_WORKER_COUNT"):
-            changes[name] = ""
         done = subprocess.run(
-            [sys.executable, "-m", "pytest", "-n0", "-q", "--durations=0", *tests],
+            [sys.executable, "-m", "pytest", "-n0", "-q", *tests],
             cwd=root,
             env=os.environ | changes,
             capture_output=True,
             text=True,
         )
         outcomes: dict = {"": f"{done.stdout[-3000:]}\n{done.stderr[-3000:]}"}
-        with open(f"{folder}/outcomes", encoding="utf-8") as file:
-            for line in file:
-                name, *phase = json.loads(line)
-                outcomes.setdefault(name, []).append(phase)
+        for line in path.read_text(encoding="utf-8").splitlines():
+            name, *phase = json.loads(line)
+            outcomes.setdefault(name, []).append(phase)
     return outcomes
 
 
 def pytest_runtest_logreport(report):
-    """In a process of marked tests: store what the process that started it reports."""
+    """In the process of marked tests: write what its parent reports."""
     if "GSJAX_TESTS_OUTCOMES" in os.environ:
         text = report.longreprtext or None
         if report.outcome == "skipped":

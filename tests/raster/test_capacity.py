@@ -20,7 +20,6 @@ import gsjax
 from gsjax.errors import CapacityError, InputError
 
 BEHIND = jnp.float32(BACKGROUND)
-pytestmark = pytest.mark.new_emitters
 
 
 def test_capacity_of_exactly_the_need():

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import on_cpu
+from conftest import AS_USERS, on_cpu
 from pictures import assert_close
 
 from gsjax import RasterConfig
@@ -20,7 +20,7 @@ from gsjax.raster.lists.binning import Lists, corners, make_grid
 from gsjax.raster.types import Channels, Splat
 from gsjax.runtime import loops
 
-pytestmark = [on_cpu, pytest.mark.as_users]
+pytestmark = on_cpu
 
 WIDTH, HEIGHT, RANKS, COLORS = 24, 48, 90, 3
 DEVICES, DEVICE = 2, 1  # of whose tiles
@@ -256,7 +256,7 @@ def test_fused_kernels_are_chosen_with_the_option_of_xla(option, in_a_process):
 @pytest.mark.parametrize("size", [1, 2, 5, 32])
 def test_products_round_less_than_once_a_factor(size):
     """The error of 32 factors, in roundings: two small ones round once together."""
-    product = jax.jit(running_product)
+    product = jax.jit(running_product, compiler_options=AS_USERS)
     rng = np.random.default_rng(1)
     for largest, bound in ((0.004, 1.3), (0.2, 1.9), (0.6, 2.7), (1.0, 2.7)):
         alpha = rng.uniform(0, largest, (50, size, 40)).astype(np.float32)

@@ -80,7 +80,6 @@ def with_garbage(gaussians: gsjax.Gaussians, value: float):
     return gsjax.Gaussians(params=params, active=jnp.asarray(~dead)), live
 
 
-@pytest.mark.new_emitters
 def test_contents_of_dead_slots_are_bit_equal():
     gaussians, camera = cast(scene_of("random"), jnp.float32)
     wanted, first = images(gaussians, camera), None
@@ -110,7 +109,6 @@ def test_the_same_without_x64():
     assert out.demand == wanted.demand
 
 
-@pytest.mark.new_emitters
 def test_depths_that_differ_by_less_than_a_step_of_float32(report):
     """Slots are ordered by the depths of the stored numbers, not by float32 depths.
 

@@ -19,7 +19,6 @@ from conftest import (
 import gsjax
 
 TILE = COMPAT.tile_size
-pytestmark = pytest.mark.new_emitters
 
 
 def masks() -> dict[str, np.ndarray]:

@@ -39,7 +39,6 @@ def scene_behind(layers: int, across: float = 1.0):
     return gaussians_at(points, scales, opacities)
 
 
-@pytest.mark.new_emitters
 @pytest.mark.parametrize("preset", RULES)
 @pytest.mark.parametrize(
     ("layers", "across"), [(0, 1.0), (8, 1.0), (40, 0.3), ("wall", None)]
@@ -66,7 +65,6 @@ def test_bit_equal_with_and_without(preset, layers, across):
     assert pairs <= {8: 0.6, "wall": 0.4}.get(layers, 1)
 
 
-@pytest.mark.new_emitters
 def test_gradients_agree():
     gaussians, camera = scene_behind(8), camera_of()
 

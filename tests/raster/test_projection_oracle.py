@@ -102,7 +102,6 @@ def test_vector_jacobian_product_agrees(data, report):
         assert max(error, rows) <= DERIVATIVE, name
 
 
-@pytest.mark.as_users
 def test_colours_of_many_gaussians():
     """In float32 and compiled: some reductions of XLA go wrong for long arrays."""
     count = 40_000

@@ -7,13 +7,10 @@ for given cotangents. The rules are those of the preset "compat".
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from conftest import COMPAT, oracle_data
 from pictures import assert_close
 
 import gsjax
-
-pytestmark = pytest.mark.as_users
 
 VALUE, DERIVATIVE = 1e-9, 1e-7
 CONFIG = COMPAT.replace(outputs=("rgb", "alpha"), pair_capacity=65536)

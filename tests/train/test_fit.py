@@ -186,7 +186,6 @@ def test_a_resumed_run_is_bit_equal(whole, strategy, stop_at, tmp_path):
     assert second.pair_capacity == wanted.pair_capacity
 
 
-@pytest.mark.new_emitters
 @on_cpu
 def test_capacities_grow_without_changing_bits(shared_programs):
     """Until the first edit; from then on random draws depend on the slots."""
