@@ -273,6 +273,8 @@ def test_lens():
 def test_primitive():
     gaussians, camera = scene(), camera_of(19, 13, focal=(20.0, 21.0))
     config = CONFIG.replace(primitive=BUMP)
+    with pytest.raises(gsjax.InputError, match="absgrad"):
+        config.replace(absgrad=True)
     bumps = gsjax.render(gaussians, camera, config)
     ellipsoids = gsjax.render(gaussians, camera, CONFIG)
     assert not bumps.overflowed

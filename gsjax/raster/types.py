@@ -102,6 +102,7 @@ class RasterConfig:
         convert_fields(self)
         outputs = isinstance(self.outputs, tuple) and len(self.outputs) > 0
         outputs = outputs and set(self.outputs) <= set(OUTPUTS)
+        own = self.primitive is not None and self.primitive.alpha is not None
         checks = {
             "alpha_min": "(0, 1)",
             "alpha_max": f"({self.alpha_min}, 1]",
@@ -109,6 +110,7 @@ class RasterConfig:
             "stop_rule": STOP_RULES,
             "dilation": "[0, 1e9]",  # its square fits float32
             "outputs": (outputs, f"a tuple of {', '.join(OUTPUTS)}"),
+            "absgrad": (not (own and self.absgrad), "False for a primitive with own α"),
             "tile_size": "[1, inf)",
             "chunk_size": "[1, inf)",
             "tiles_per_step": "[1, inf)",
