@@ -1,6 +1,8 @@
 """Small datasets made by code, for the tests of their readers."""
 
 import json
+import struct
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -105,41 +107,31 @@ def nerfstudio_dataset(folder: Path, count=4, **content) -> Dataset:
     return dataset
 
 
-def llff_rows(dataset: Dataset, size=SIZE, focal=40.0) -> np.ndarray:
-    """[N, 17] rows of a poses_bounds.npy, by the definition of the format."""
+def llff_dataset(folder: Path, count=4) -> Dataset:
+    """Write a dataset of LLFF, by the definition of the format, with photographs."""
+    dataset = dataset_of_views(count)
     rows = []
     for view in dataset.views:
         right, down, forward = view.viewmat[:3, :3]
-        intrinsics = np.asarray([size[1], size[0], focal])
+        intrinsics = (SIZE[1], SIZE[0], 40.0)
         matrix = np.stack([down, right, -forward, view.centre, intrinsics], -1)
         rows.append([*matrix.ravel(), 1.5, 20.0])
-    return np.asarray(rows)
-
-
-def llff_dataset(folder: Path, count=4, **more) -> Dataset:
-    """Write a dataset of LLFF with photographs."""
-    dataset = dataset_of_views(count)
-    np.save(folder / "poses_bounds.npy", llff_rows(dataset, **more))
+    np.save(folder / "poses_bounds.npy", rows)
     for index in range(count):
         save_photo(folder / "images" / f"IMG_{9 - index}.JPG")
     return dataset
 
 
-def synthetic_model(folder: Path) -> Path:
-    """A model by pycolmap in ``bin`` and ``txt``, with tracks and 2D points."""
-    # After cv2: loaded before, its zlib breaks the PNG encoder of OpenCV.
-    pycolmap = pytest.importorskip("pycolmap")
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig = 2, 2
-    options.num_frames_per_rig, options.num_points3D = 3, 15
-    options.num_points2D_without_point3D = 3
-    pycolmap.set_random_seed(1)
-    model = pycolmap.synthesize_dataset(options)
-    for form in ("bin", "txt"):
-        (folder / form).mkdir()
-    model.write_binary(folder / "bin")
-    model.write_text(folder / "txt")
-    return folder
+def png_chunk(kind: bytes, body: bytes) -> bytes:
+    """Return a chunk of a PNG."""
+    crc = struct.pack(">I", zlib.crc32(kind + body))
+    return struct.pack(">I", len(body)) + kind + body + crc
+
+
+def exif_turn(orientation: int) -> bytes:
+    """Return EXIF data of nothing but an orientation."""
+    entry = struct.pack("<IHHHII", 8, 1, 0x112, 3, 1, orientation)
+    return b"II*\0" + entry + bytes(4)
 
 
 def ply_file(
@@ -153,7 +145,7 @@ def ply_file(
 ) -> bytes:
     """A PLY file; ``before`` and ``after`` are header lines and body of elements."""
     count = len(next(iter(table.values())))
-    codes = {"float": "f4", "double": "f8", "uchar": "u1", "int": "i4"}
+    codes = {"float": "f4", "double": "f8", "uchar": "u1", "ushort": "u2", "int": "i4"}
     types = dict.fromkeys(table, "float") | (types or {})
     lines = ["ply", f"format {kind} 1.0", "comment made by a test"]
     lines += before[0].splitlines() + [f"element vertex {count}"]

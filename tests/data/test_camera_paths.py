@@ -1,5 +1,6 @@
 """Camera paths: rigid, closed, at their documented positions, and never NaN."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +77,7 @@ MAKERS = {
     "orbit": orbit,
     "spiral": spiral,
     "interpolate": interpolate,
-    "closed": lambda v, f: interpolate(v, f, closed=True),
+    "closed": partial(interpolate, closed=True),
 }
 
 
@@ -197,10 +198,8 @@ def test_interpolation_of_an_arc_has_constant_speed():
 
 def test_interpolation_of_two_rotations_is_the_shortest():
     """Evenly, whatever the signs of the quaternions are; equal cameras stand still."""
-    ahead = interpolate(
-        looking((AXES[0] * 0, AXES[0]), (AXES[0] * 0, (-0.9, 0.5, 0))), 31
-    )
-    ahead = ahead[:, 2, :3]
+    two = looking(((0, 0, 0), (1, 0, 0)), ((0, 0, 0), (-0.9, 0.5, 0)))
+    ahead = interpolate(two, 31)[:, 2, :3]
     angles = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
     np.testing.assert_allclose(ahead[:, 2], 0, atol=1e-12)
     total = np.arctan2(0.5, -0.9)
@@ -209,30 +208,26 @@ def test_interpolation_of_two_rotations_is_the_shortest():
     np.testing.assert_allclose(path, np.tile(ring(1), (5, 1, 1)), atol=1e-12)
 
 
-def view_of(width, height, focal):
-    K = np.array([[focal, 0, width / 2], [0, focal * 1.1, height / 3], [0, 0, 1.0]])
-    return View("a.png", Path("a.png"), np.eye(4), K, width, height)
-
-
 def test_median_intrinsics():
-    views = [view_of(80, 60, f) for f in (90, 100, 140)] + [view_of(160, 120, 190)] * 2
+    views = []
+    for size, focal in ((1, 90), (1, 100), (1, 140), (2, 190), (2, 190)):
+        width, height = 80 * size, 60 * size
+        K = np.array([[focal, 0, width / 2], [0, focal * 1.1, height / 3], [0, 0, 1.0]])
+        views.append(View("a.png", Path("a.png"), np.eye(4), K, width, height))
     found = median_intrinsics(views)
     assert (found.width, found.height) == (80, 60)
     np.testing.assert_allclose(found.K, [[95, 0, 40], [0, 104.5, 20], [0, 0, 1]])
 
 
 @pytest.mark.parametrize(
-    ("make", "given", "expected"),
+    ("make", "views", "expected"),
     [
         (median_intrinsics, [], "views: expected at least one"),
         (focus_point, np.zeros((0, 4, 4)), "at least one camera"),
         (focus_point, np.eye(4), r"got \(4, 4\)"),
         (focus_point, np.full((1, 4, 4), np.nan), "expected finite"),
-        *(
-            (lambda v, make=m: make(v, 0), ring(3), "at least 1")
-            for m in MAKERS.values()
-        ),
+        *((partial(m, frames=0), ring(3), "at least 1") for m in MAKERS.values()),
     ],
 )
-def test_bad_input(make, given, expected):
-    rejects(expected, make, given)
+def test_bad_input(make, views, expected):
+    rejects(expected, make, views)

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from captures import rejects, save_photo, warned
+from captures import exif_turn, png_chunk, rejects, save_photo, warned
 
 from gsjax.cameras.distortion import Distortion, distort
 from gsjax.data.decode import warn_of_damage
@@ -49,35 +49,27 @@ def test_rgb_as_stored(tmp_path, suffix):
 def test_grey_and_16_bits(tmp_path):
     np.testing.assert_array_equal(load(tmp_path, NOISE[..., 0]).pixels, GREY)
     deep = np.linspace(0, 65535, 24 * 32 * 3).reshape(24, 32, 3).astype(np.uint16)
-    photo = load(tmp_path, deep)
-    expected = np.rint(deep / 65535 * 255).astype(np.uint8)
-    np.testing.assert_array_equal(photo.pixels, expected)
-    assert photo.pixels.dtype == np.uint8
+    pixels = load(tmp_path, deep).pixels
+    np.testing.assert_array_equal(pixels, np.rint(deep / 65535 * 255))
+    assert pixels.dtype == np.uint8
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])
-@pytest.mark.parametrize("one", [1, 257])
-def test_alpha_is_kept_unless_opaque(tmp_path, suffix, one):
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_alpha_is_kept_unless_opaque(tmp_path, suffix, dtype):
     """One step of 8 bits less in one pixel is not opaque."""
-    dtype = np.uint8 if one == 1 else np.uint16
-    rgba = (np.dstack([NOISE, np.full((24, 32), 255)]) * one).astype(dtype)
-    photo = load(tmp_path, rgba, f"a{suffix}")
-    assert photo.alpha is None
-    np.testing.assert_array_equal(photo.pixels, NOISE)
-    rgba[3, 5, 3] -= one
-    photo = load(tmp_path, rgba, f"a{suffix}")
-    np.testing.assert_array_equal(photo.pixels, NOISE)
-    np.testing.assert_array_equal(photo.alpha, rgba[..., 3] // one)
+    alpha = np.full((24, 32), 255)
+    for step in (0, 1):
+        alpha[3, 5] -= step
+        rgba = np.dstack([NOISE, alpha]) * (np.iinfo(dtype).max // 255)
+        photo = load(tmp_path, rgba.astype(dtype), f"a{suffix}")
+        np.testing.assert_array_equal(photo.pixels, NOISE)
+        np.testing.assert_array_equal(photo.alpha, alpha if step else None)
 
 
 @pytest.mark.parametrize("depth", [2, 8, 16])
 def test_a_transparent_grey_of_a_png(tmp_path, depth):
     """The tRNS chunk instead of an alpha channel, which OpenCV ignores."""
-
-    def chunk(kind, body):
-        crc = struct.pack(">I", zlib.crc32(kind + body))
-        return struct.pack(">I", len(body)) + kind + body + crc
-
     grey, one = NOISE[..., 0] % 4, {2: 1, 8: 1, 16: 257}[depth]
     if depth == 2:
         rows = np.packbits((grey[..., None] >> [1, 0] & 1).reshape(24, -1), axis=1)
@@ -88,7 +80,8 @@ def test_a_transparent_grey_of_a_png(tmp_path, depth):
     chunks = [(b"IHDR", head), (b"tRNS", struct.pack(">H", 2 * one))]
     chunks += [(b"IDAT", lines), (b"IEND", b"")]
     path = tmp_path / "a.png"
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*each) for each in chunks))
+    data = b"".join(png_chunk(*each) for each in chunks)
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + data)
     photo = load_photo(view_of(path))
     np.testing.assert_array_equal(photo.alpha, np.where(grey == 2, 0, 255))
     shown = grey * (85 if depth == 2 else 1)
@@ -123,8 +116,7 @@ def test_orientation_and_thumbnail_of_exif_are_ignored(tmp_path):
         head = b"\xff\xe1" + struct.pack(">H", len(exif) + 2)
         path.write_bytes(data[:2] + head + exif + data[2:end])
 
-    tiff = b"II*\0" + struct.pack("<IHHHII", 8, 1, 0x112, 3, 1, 6)
-    with_exif(b"Exif\0\0" + tiff + bytes(4))
+    with_exif(b"Exif\0\0" + exif_turn(6))
     assert cv2.imread(str(path)).shape == (32, 24, 3)  # rotated
     np.testing.assert_array_equal(load_photo(view_of(path)).pixels, plain)
     assert image_size(path) == (32, 24)
@@ -346,24 +338,22 @@ def test_many_photographs_keep_their_order(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "pixels", "more", "expected"),
+    ("more", "expected"),
     [
-        ("a.png", NOISE, {"size": (24, 32)}, "its camera, 24 × 32, .*was rotated"),
-        ("a.png", NOISE, {"size": (64, 24)}, "its camera, 64 × 24, got 32 × 24 px"),
-        ("a.tiff", NOISE.astype(np.float32), {}, "expected samples .* got float32"),
-        ("a.png", NOISE, {"max_size": 0}, "max_size: expected at least 1 px, got 0"),
-        ("a.png", NOISE, {"lens": Distortion("fisheye", (0.1,))}, "'fisheye' with 1"),
-        ("a.png", NOISE, {"lens": Distortion("mirror", (0.0,))}, "'mirror' with 1"),
+        ({"size": (24, 32)}, "its camera, 24 × 32, .*was rotated"),
+        ({"size": (64, 24)}, "its camera, 64 × 24, got 32 × 24 px"),
+        ({"pixels": np.float32(NOISE), "name": "a.tiff"}, "samples .* got float32"),
+        ({"max_size": 0}, "max_size: expected at least 1 px, got 0"),
+        ({"lens": Distortion("fisheye", (0.1,))}, "'fisheye' with 1"),
+        ({"lens": Distortion("mirror", (0.0,))}, "'mirror' with 1"),
         (
-            "a.png",
-            NOISE,
             {"lens": Distortion("opencv", (1e20, 0.0, 0.0, 0.0))},
             r"a\.png: 0 of 768 pixels are left .* \(opencv, 1e\+20, 0",
         ),
     ],
 )
-def test_rejected_photographs(tmp_path, name, pixels, more, expected):
-    rejects(expected, load, tmp_path, pixels, name, **more)
+def test_rejected_photographs(tmp_path, more, expected):
+    rejects(expected, load, tmp_path, **({"pixels": NOISE} | more))
 
 
 def test_damaged_bytes_raise_nothing_else(tmp_path):
@@ -395,8 +385,7 @@ def test_repaired_photographs_give_a_warning(tmp_path, capfd, name, damage):
     good = [save_photo(tmp_path / f"{index}.png") for index in range(40)]
     expected = rf"damaged .*: \S*{name}: {damage}[^;]*; copy or export them again"
     view = view_of(path, (64, 48))
-    with pytest.warns(UserWarning, match=expected):
-        assert load_photo(view).pixels.shape == (48, 64, 3)
+    assert warned(expected, load_photo, view).pixels.shape == (48, 64, 3)
     warned(expected, read_upright, path)
     with pytest.warns(UserWarning, match=expected) as caught:
         photos = load_photos([view_of(p) for p in good] + [view])

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from captures import rejects
 
 import gsjax
 from gsjax.data.types import Dataset, Photo, View
-from gsjax.errors import InputError
 from gsjax.init import dense
 from gsjax.init.dense import (
     DensePoints,
@@ -23,7 +23,6 @@ from gsjax.init.plane_sweep import (
     make_sweep_image,
     project,
     scaled_pinhole,
-    sweep,
     unproject,
 )
 from gsjax.synthetic.raycaster import cast, demo_cameras, surface_points
@@ -75,17 +74,6 @@ def off_surface(points: np.ndarray) -> np.ndarray:
         off = np.abs(z / np.where(there > 0, there, 1) - 1)
         least = np.where(good, np.minimum(least, off), least)
     return least
-
-
-def test_a_sweep_finds_the_depth():
-    _, photos, depths = still_life()
-    images = [make_sweep_image(c, p.pixels) for c, p in zip(cameras(), photos)]
-    found = sweep(images[0], images[1:4], 2.5, 12.0)
-    there = (found.score > 0.6) & (depths[0] > 0)
-    assert np.mean(there[depths[0] > 0]) > 0.5
-    off = np.abs(found.inverse[there] * depths[0][there] - 1)
-    assert np.mean(off < 0.05) > 0.8
-    assert np.median(off) < 0.016  # a step is 3 %
 
 
 def test_points_behind_a_neighbour_are_not_seen_by_it():
@@ -143,13 +131,6 @@ def test_points_lie_on_surfaces():
     assert usual().points.shape == usual().colors.shape
 
 
-def test_a_dataset_without_points_is_searched_where_the_cameras_look():
-    dataset, photos, _ = still_life()
-    found = find_points(replace(dataset, points=np.zeros((0, 3))), photos, ALL)
-    assert len(found.points) > 2500
-    assert np.mean(off_surface(found.points) < 0.05) > 0.88
-
-
 def test_a_subset_depends_on_the_seed_and_not_on_threads(monkeypatch):
     dataset, photos, _ = still_life()
     found = []
@@ -178,15 +159,39 @@ def test_the_unit_of_length_does_not_matter():
     np.testing.assert_array_equal(1024 * usual().points, found)
 
 
-def test_exposure_does_not_matter():
+def test_points_of_other_photographs():
     dataset, photos, _ = still_life()
-    darker = [
-        photo._replace(pixels=np.uint8(photo.pixels * (1 - 0.1 * index) + 4 * index))
-        for index, photo in enumerate(photos)
-    ]
-    found = find_points(dataset, darker, ALL)
-    assert len(found.points) > 0.9 * len(usual().points)
-    assert np.mean(off_surface(found.points) < 0.05) > 0.91
+    usually = len(usual().points)
+    bare = replace(dataset, points=np.zeros((0, 3)))
+    two = replace(dataset, views=dataset.views[:2])
+    darker = [np.uint8(p.pixels * (1 - 0.1 * i) + 4 * i) for i, p in enumerate(photos)]
+    darker = [photo._replace(pixels=x) for photo, x in zip(photos, darker)]
+    K = photos[2].K / [[2], [2], [1]]
+    rgb, _ = cast(dataset.views[2].viewmat, K, WIDTH // 2, HEIGHT // 2)
+    half = photos[2]._replace(pixels=np.uint8(255 * rgb + 0.5), K=K)
+    half = [*photos[:2], half, *photos[3:]]
+    small = SweepSettings(longest_side=64)
+    some = SweepSettings(max_views=3, seed_views=1)
+    for data, seen, settings, least, most, near, median in (
+        (bare, photos, None, 2500, np.inf, 0.88, 1),
+        (two, photos[:2], None, 2000, np.inf, 0.83, 1),
+        (dataset, darker, None, 0.9 * usually, np.inf, 0.91, 1),
+        (dataset, half, None, 0, np.inf, 0.9, 1),
+        (dataset, photos, small, 2000, 0.6 * usually, 0.85, 0.012),
+        (dataset, photos, some, 2000, 0.9 * usually, 0.88, 1),
+    ):
+        found = find_points(data, seen, ALL, settings=settings).points
+        assert least < len(found) < most
+        off = off_surface(found)
+        assert np.mean(off < 0.05) > near
+        assert np.median(off) < median
+
+
+def test_few_views_are_far_apart():
+    line = np.asarray([0, 1, 2.2, 3, 4, 5])[:, None] * [1, 0, 0]
+    assert farthest_point_sample(line, 6) == [0, 1, 2, 3, 4, 5]
+    assert farthest_point_sample(line, 3) == [0, 2, 5]
+    assert farthest_point_sample(np.zeros((5, 3)), 3) == [0]
 
 
 @pytest.mark.parametrize("how", ["masked", "transparent", "masked and scaled"])
@@ -206,29 +211,8 @@ def test_excluded_pixels_give_no_points(how):
     assert (np.sum([x >= WIDTH // 2 for x in seen], 0) >= 3).all()
 
 
-def test_photographs_are_scaled_down():
-    dataset, photos, _ = still_life()
-    found = find_points(dataset, photos, ALL, settings=SweepSettings(longest_side=64))
-    assert 2000 < len(found.points) < 0.6 * len(usual().points)
-    off = off_surface(found.points)
-    assert np.mean(off < 0.05) > 0.85
-    assert np.median(off) < 0.012
-
-
-def test_of_many_views_some_are_swept():
-    dataset, photos, _ = still_life()
-    line = np.asarray([0, 1, 2.2, 3, 4, 5])[:, None] * [1, 0, 0]
-    assert farthest_point_sample(line, 6) == [0, 1, 2, 3, 4, 5]
-    assert farthest_point_sample(line, 3) == [0, 2, 5]
-    assert farthest_point_sample(np.zeros((5, 3)), 3) == [0]
-    settings = SweepSettings(max_views=3, seed_views=1)
-    found = find_points(dataset, photos, ALL, settings=settings)
-    assert 2000 < len(found.points) < 0.9 * len(usual().points)
-    assert np.mean(off_surface(found.points) < 0.05) > 0.88
-
-
-def test_rotated_cameras_and_photographs_of_other_sizes():
-    """Views rolled by 90° and one of half the size change no point by half a pixel."""
+def test_rotated_cameras():
+    """Views rolled by 90° change no point by half a pixel."""
     dataset, photos, _ = still_life()
     views, others = list(dataset.views), list(photos)
     for index in range(1, VIEWS, 2):
@@ -246,26 +230,15 @@ def test_rotated_cameras_and_photographs_of_other_sizes():
     assert len(turned.points) == pytest.approx(len(usual().points), rel=0.05)
     medians = [np.median(off_surface(f.points)) for f in (usual(), turned)]
     assert medians[1] < 1.1 * medians[0]
-    half = photos[2].K / [[2], [2], [1]]
-    rgb, _ = cast(dataset.views[2].viewmat, half, WIDTH // 2, HEIGHT // 2)
-    smaller = [*photos]
-    smaller[2] = photos[2]._replace(pixels=np.uint8(255 * rgb + 0.5), K=half)
-    found = find_points(dataset, smaller, ALL)
-    assert np.mean(off_surface(found.points) < 0.05) > 0.9
 
 
-def test_two_views_are_enough():
-    dataset, photos, _ = still_life()
-    found = find_points(replace(dataset, views=dataset.views[:2]), photos[:2], ALL)
-    assert len(found.points) > 2000
-    assert np.mean(off_surface(found.points) < 0.05) > 0.83
+@pytest.mark.parametrize("extents", [8, 25])
+def test_distant_walls_have_no_false_matches_in_front(extents):
+    """1 / z is uncertain by a pixel of shift, which is 0.017 of the depth.
 
-
-def wall_at(depth: float) -> np.ndarray:
-    """Return the depths of points found on a wall in front of five parallel cameras.
-
-    They span 2 units, an extent of 1.1; the dataset has no points.
+    Five parallel cameras span 2 units, an extent of 1.1; the dataset has no points.
     """
+    depth = 1.1 * extents
     tiles = np.random.default_rng(0).integers(0, 256, (60, 60, 3)).astype(np.uint8)
     K = np.asarray([[120.0, 0, 48], [0, 120, 36], [0, 0, 1]])
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
@@ -281,58 +254,38 @@ def wall_at(depth: float) -> np.ndarray:
         views.append(View(name, Path(name), viewmat, K, WIDTH, HEIGHT))
         photos.append(Photo(pixels, None, None, K))
     dataset = Dataset(Path("wall"), "made up", tuple(views))
-    return find_points(dataset, photos, ALL).points[:, 2]
-
-
-@pytest.mark.parametrize("extents", [8, 25])
-def test_distant_walls_have_no_false_matches_in_front(extents):
-    """1 / z is uncertain by a pixel of shift, which is 0.017 of the depth."""
-    depth = 1.1 * extents
-    found = wall_at(depth)
+    found = find_points(dataset, photos, ALL).points[:, 2]
     assert len(found) > 3000
     assert np.mean(np.abs(depth / found - 1) < 0.017 * depth) > 0.95
 
 
-def no_overlap(dataset, photos):
-    turned = []
-    for index, view in enumerate(dataset.views):
+def test_nothing_is_found_where_there_is_nothing():
+    dataset, photos, _ = still_life()
+    views, turned = dataset.views, []
+    for index, view in enumerate(views):
         flip = np.diag([-1.0, 1, -1, 1]) if index % 2 else np.eye(4)
         aside = np.eye(4)
         aside[0, 3] = 1e3 * index
         turned.append(replace(view, viewmat=flip @ view.viewmat @ aside))
-    return replace(dataset, views=tuple(turned)), photos
-
-
-def one_view(dataset, photos):
-    return replace(dataset, views=dataset.views[:1]), photos[:1]
-
-
-def one_position(dataset, photos):
-    return replace(dataset, views=(dataset.views[0],) * len(photos)), photos
-
-
-def no_texture(dataset, photos):
-    return dataset, [p._replace(pixels=np.full_like(p.pixels, 127)) for p in photos]
-
-
-def all_masked(dataset, photos):
-    none = np.zeros((HEIGHT, WIDTH), bool)
-    return dataset, [p._replace(valid=none) for p in photos]
-
-
-def noise(dataset, photos):
     rng, shape = np.random.default_rng(0), photos[0].pixels.shape
-    drawn = [rng.integers(0, 256, shape, np.uint8) for _ in photos]
-    return dataset, [p._replace(pixels=x) for p, x in zip(photos, drawn)]
-
-
-@pytest.mark.parametrize(
-    "case", [no_overlap, one_view, one_position, no_texture, all_masked, noise]
-)
-def test_nothing_is_found_where_there_is_nothing(case):
-    found = find_points(*case(*still_life()[:2]), ALL)
-    most = 0.001 * VIEWS * HEIGHT * WIDTH if case is noise else 0
-    assert len(found.points) == len(found.colors) <= most
+    grey = [p._replace(pixels=np.full_like(p.pixels, 127)) for p in photos]
+    masked = [p._replace(valid=np.zeros((HEIGHT, WIDTH), bool)) for p in photos]
+    noise = [p._replace(pixels=rng.integers(0, 256, shape, np.uint8)) for p in photos]
+    for of, seen, most in (
+        (turned, photos, 0),  # without overlap
+        (views[:1], photos[:1], 0),
+        (views[:1] * VIEWS, photos, 0),
+        (views, grey, 0),
+        (views, masked, 0),
+        (views, noise, 0.001 * VIEWS * HEIGHT * WIDTH),
+    ):
+        found = find_points(replace(dataset, views=tuple(of)), seen, ALL)
+        assert len(found.points) == len(found.colors) <= most
+    # A run then starts as without dense points.
+    none = np.zeros((0, 3))
+    bare = replace(dataset, points=none, colors=none.astype(np.uint8))
+    config = gsjax.TrainConfig(initial="dense")
+    assert len(add_dense_points(bare, grey, config).points) == 0
 
 
 @pytest.mark.parametrize("size", [(1, 1), (9, 5), (400, 3)])
@@ -360,13 +313,4 @@ def test_a_run_adds_them_to_the_points_of_the_dataset():
     others = [config.replace(initial=x) for x in ("points", "random", "auto")]
     for other in (*others, config.replace(dense_count=0)):
         assert add_dense_points(dataset, photos, other) is dataset
-    with pytest.raises(InputError, match=f"{VIEWS - 1}"):
-        find_points(dataset, photos[1:], ALL)
-
-
-def test_a_run_without_dense_points_starts_as_usual():
-    dataset, photos = no_texture(*still_life()[:2])
-    config = gsjax.TrainConfig(initial="dense")
-    none = np.zeros((0, 3))
-    bare = replace(dataset, points=none, colors=none.astype(np.uint8))
-    assert len(add_dense_points(bare, photos, config).points) == 0
+    rejects(f"{VIEWS - 1}", find_points, dataset, photos[1:], ALL)

@@ -1,22 +1,12 @@
 """Photographs for structure from motion: orientation, EXIF, transparency, names."""
 
 import os
-import struct
-import zlib
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from captures import save_photo
-from corner_room import (
-    HEIGHT,
-    WIDTH,
-    corner_view,
-    read,
-    write_blank,
-    write_photo,
-)
+from captures import exif_turn, png_chunk, save_photo
+from corner_room import HEIGHT, WIDTH, corner_view, read, write_blank, write_photo
 
 from gsjax import InputError
 from gsjax.sfm.engine import count_rows
@@ -99,21 +89,12 @@ def transparent(pixels: np.ndarray, left: int, top=0, size=HEIGHT, hidden=RED):
     return rgba
 
 
-def set_png_orientation(path: Path, orientation: int) -> None:
-    """Add an EXIF orientation to a PNG."""
-    body = b"eXIf" + b"II*\0" + struct.pack("<IHHHII", 8, 1, 0x112, 3, 1, orientation)
-    body += bytes(4)
-    chunk = struct.pack(">I", len(body) - 4) + body
-    chunk += struct.pack(">I", zlib.crc32(body))
-    data = path.read_bytes()
-    path.write_bytes(data[:33] + chunk + data[33:])
-
-
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_transparency_is_oriented_as_the_colours(work, tmp_path, orientation):
     path = tmp_path / "a.png"
-    save_photo(path, transparent(corner_view(), 20, 30, 90))
-    set_png_orientation(path, orientation)
+    data = save_photo(path, transparent(corner_view(), 20, 30, 90)).read_bytes()
+    turn = png_chunk(b"eXIf", exif_turn(orientation))
+    path.write_bytes(data[:33] + turn + data[33:])
     (made,) = prepare_photos([path], None, work, 0)
     pixels = read(work.photos / made.record.file)
     if int(cv2.__version__.split(".")[0]) >= 5:  # older versions rotate no PNG
