@@ -22,29 +22,27 @@ from conftest import (
 import gsjax
 from gsjax import InputError, RasterConfig
 
+COUNTS = ("tile_size", "chunk_size", "tiles_per_step", "pair_capacity")
+COUNTS += ("visible_capacity", "num_size_buckets", "devices")
+
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("name", "values"),
     [
-        *(("alpha_min", v) for v in (0.0, 1.0, np.nan)),
-        *(("alpha_max", v) for v in (1e-6, 1.1, np.nan)),
-        *(("transmittance_min", v) for v in (-1e-4, 1.0, np.nan)),
-        ("stop_rule", "never"),
-        *(("dilation", v) for v in (-0.1, np.inf, np.nan)),
-        *(("outputs", v) for v in ((), ("rgb", "normal"), "rgb")),
-        ("tile_size", 0),
-        ("chunk_size", 0),
-        ("tiles_per_step", 0),
-        *(("pair_capacity", v) for v in (0, -5, 2**30)),
-        ("visible_capacity", 0),
-        ("num_size_buckets", 0),
-        ("devices", 0),
+        ("alpha_min", (0.0, 1.0, np.nan)),
+        ("alpha_max", (1e-6, 1.1, np.nan)),
+        ("transmittance_min", (-1e-4, 1.0, np.nan)),
+        ("stop_rule", ("never",)),
+        ("dilation", (-0.1, np.inf, np.nan)),
+        ("outputs", ((), ("rgb", "normal"), "rgb")),
+        *((name, (0, -5)) for name in COUNTS),
+        ("pair_capacity", (2**30,)),
     ],
-    ids=str,
 )
-def test_settings_are_checked(name, value):
-    with pytest.raises(InputError, match=rf"RasterConfig\.{name}"):
-        RasterConfig(**{name: value})
+def test_settings_are_checked(name, values):
+    for value in values:
+        with pytest.raises(InputError, match=rf"RasterConfig\.{name}"):
+            RasterConfig(**{name: value})
 
 
 def arguments():
@@ -245,29 +243,21 @@ def test_gaussians_at_the_camera_far_from_the_origin_stay_finite():
         assert np.isfinite(leaf).all()
 
 
-def test_an_impossible_camera_draws_nothing_under_jit():
+def test_nothing_to_draw_is_exactly_the_background():
+    """No Gaussian that can be seen, or under jit a camera that cannot see."""
     gaussians, camera, background = cast((*scene_of("random"), BACKGROUND), jnp.float32)
-    for bad in (
-        camera.replace(K=camera.K.at[0, 0].multiply(-1)),
-        camera.replace(K=camera.K.at[1, 1].multiply(-1)),
-        camera.replace(viewmat=camera.viewmat * np.nan),
-        camera.replace(near=camera.near * np.nan),
-    ):
-        out = render(gaussians, bad, WHOLE, background)
-        assert (out.rgb == background).all()
-        assert out.demand.visible == 0
-
-
-def test_an_empty_scene_is_exactly_the_background():
-    gaussians, camera, background = cast((*scene_of("random"), BACKGROUND), jnp.float32)
-    params = gaussians.params
+    params, K = gaussians.params, camera.K
     none = {name: array[:0] for name, array in vars(params).items()}
     faint = params.replace(logit_opacities=params.logit_opacities * 0 - 30)
     for kind, scene in {
         "no Gaussians": (gsjax.make_gaussians(**none, capacity=COUNT), camera),
         "none active": (gsjax.select(gaussians, jnp.zeros(COUNT, bool)), camera),
-        "all culled": (gaussians, camera.replace(near=camera.far / 2)),
         "all transparent": (gaussians.replace(params=faint), camera),
+        "all culled": (gaussians, camera.replace(near=camera.far / 2)),
+        "mirrored in x": (gaussians, camera.replace(K=K.at[0, 0].multiply(-1))),
+        "mirrored in y": (gaussians, camera.replace(K=K.at[1, 1].multiply(-1))),
+        "no place": (gaussians, camera.replace(viewmat=camera.viewmat * np.nan)),
+        "no near plane": (gaussians, camera.replace(near=camera.near * np.nan)),
     }.items():
         out = render(*scene, WHOLE, background)
         assert (out.rgb == background).all(), kind

@@ -42,16 +42,13 @@ def tiles_of(dtype) -> Tiles:
     splat = Splat(u, v, (inv_sx, slope, inv_sy, opacity))
     channels = Channels(rng.uniform(-1, 2, (COLORS, RANKS)), depth)
     values = jax.tree.map(lambda a: jnp.asarray(a, dtype), (splat, channels))
-    return Tiles(*values, jax.tree.map(jnp.asarray, lists()), jnp.int32(DEVICE))
-
-
-def lists() -> Lists:
-    rng, lengths = np.random.default_rng(1), np.int32(LENGTHS)
+    lengths = np.int32(LENGTHS)
     ranks = [np.sort(rng.choice(RANKS, n, replace=False)) for n in LENGTHS]
     ranks = np.concatenate([*ranks, np.full(20, 7)]).astype(np.int32)
     start = (np.cumsum(lengths) - lengths).astype(np.int32)
     known = {"ranks": ranks, "start": start, "length": lengths, "fit": np.bool_(True)}
-    return Lists(**{name: known.get(name, np.int32(0)) for name in Lists._fields})
+    lists = Lists(**{name: known.get(name, np.int32(0)) for name in Lists._fields})
+    return Tiles(*values, jax.tree.map(jnp.asarray, lists), jnp.int32(DEVICE))
 
 
 def plain(tiles: Tiles, grid, config) -> dict[str, np.ndarray]:
@@ -216,16 +213,6 @@ def test_one_kernel_wherever_it_suits(reverse, dtype):
         program = jax.jit(run).lower(tiles, kept, cotangent).compile().as_text()
         assert "xla_cpu_small_call" in program
         assert not loops.has_interpreted_loop(program)
-
-
-def test_tasks_that_do_not_suit():
-    config = RasterConfig()
-    assert not fused.suits(task_of(config, "float32", make_grid(24, 24, 4, 1)))
-    assert not fused.suits(task_of(config, "float32", colors=200))
-    assert not fused.suits(task_of(config, "float64", make_grid(64, 64, 32, 1)))
-    assert fused_vjp.suits(task_of(config, "float32"))
-    for changes in ({"absgrad": True}, {"outputs": ALL}):
-        assert not fused_vjp.suits(task_of(config.replace(**changes), "float32"))
 
 
 CHOICE = """

@@ -12,27 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import (
-    COMPAT,
-    camera_of,
-    cast,
-    gaussians_at,
-    reference,
-)
+from conftest import COMPAT, camera_of, cast, gaussians_at, reference
 from pictures import assert_close
 
 import gsjax
-from gsjax.raster.compositing.alpha import (
-    _gaussian,
-    _limited,
-    alphas,
-    pixel_centres,
-)
-from gsjax.raster.compositing.blending import (
-    channel_sums,
-    running_product,
-    transmittance,
-)
 from gsjax.raster.reference import reference_colors, reference_project
 
 COUNT, WIDTH, HEIGHT, DIRECTIONS = 24, 19, 13, 12
@@ -117,28 +100,25 @@ def dense_gradient(point, config):
     return jax.grad(dense_loss)(point)
 
 
-@partial(jax.jit, static_argnames="config")
-def central_slopes(point, directions, step, config):
-    """Return (L(x + h d) − L(x − h d)) / 2h for a leading axis of directions."""
+@jax.jit
+def slopes_along(point, directions, step):
+    """Return slopes of "compat" in forward mode, and by central differences.
+
+    Directions have a leading axis. All is mapped: the renderer is compiled twice only.
+    """
+    function = partial(loss, config=COMPAT)
+
+    def slope(direction):
+        return jax.jvp(function, (point,), (direction,))[1]
 
     def difference(direction):
         def value(h):
-            moved = jax.tree.map(lambda x, d: x + h * d, point, direction)
-            return loss(moved, config)
+            return function(jax.tree.map(lambda x, d: x + h * d, point, direction))
 
-        # Mapped, so that the renderer is compiled once.
         ahead, behind = jax.lax.map(value, step * jnp.asarray([1.0, -1.0]))
         return (ahead - behind) / (2 * step)
 
-    return jax.lax.map(difference, directions)
-
-
-@partial(jax.jit, static_argnames="config")
-def forward_slopes(point, directions, config):
-    """Return directional derivatives in forward mode."""
-    return jax.lax.map(
-        lambda d: jax.jvp(partial(loss, config=config), (point,), (d,))[1], directions
-    )
+    return jax.lax.map(slope, directions), jax.lax.map(difference, directions)
 
 
 def random_directions(point, names, seed=0, count=DIRECTIONS):
@@ -153,15 +133,7 @@ def random_directions(point, names, seed=0, count=DIRECTIONS):
     return directions
 
 
-def slopes_of(grads, directions):
-    return sum(
-        d.reshape(len(d), -1) @ np.asarray(grads[name]).ravel()
-        for name, d in directions.items()
-    )
-
-
 def test_reverse_mode_forward_mode_and_differences_agree(report):
-    """Forward mode of "smooth" is tested by second derivatives."""
     point = base_point()
     images = reference(*scene_at(point), COMPAT, point["background"])
     assert images["margin"].min() > 1e-5  # steps of 1e-8 cross no threshold
@@ -169,10 +141,9 @@ def test_reverse_mode_forward_mode_and_differences_agree(report):
     grads = gradient(point, COMPAT)
     for name in LEAVES:
         directions = random_directions(point, {name})
-        reverse = slopes_of(grads, directions)
-        forward = forward_slopes(point, directions, COMPAT)
+        reverse = directions[name].reshape(DIRECTIONS, -1) @ np.ravel(grads[name])
+        forward, wanted = map(np.asarray, slopes_along(point, directions, 1e-8))
         assert_close(report, f"jvp and vjp, {name}", forward, reverse, 1e-10)
-        wanted = np.asarray(central_slopes(point, directions, 1e-8, COMPAT))
         size = np.sqrt(np.mean(wanted**2))
         assert size > 1e-3
         error = np.max(np.abs(reverse - wanted)) / size
@@ -180,16 +151,57 @@ def test_reverse_mode_forward_mode_and_differences_agree(report):
         assert error <= 1e-5, name
 
 
-@pytest.mark.parametrize("config", [SMOOTH, COMPAT], ids=["smooth", "compat"])
-def test_gradient_is_that_of_the_reference(config, report):
-    point = base_point()
-    wanted = dense_gradient(point, config)
-    assert_same_leaves("reference", gradient(point, config), wanted, report)
-
-
 def assert_same_leaves(name, found, wanted, report, limit=1e-10, but=("probe",)):
     for leaf in set(LEAVES) - set(but):
         assert_close(report, f"{name}, {leaf}", found[leaf], wanted[leaf], limit)
+
+
+def needle_point():
+    point = base_point()
+    return point | {"log_scales": point["log_scales"] + np.array([1.5, -2, -2])}
+
+
+def isotropic_point():
+    point = base_point()
+    log_scales = jnp.broadcast_to(point["log_scales"][:, :1], (COUNT, 3))
+    return point | {"log_scales": log_scales}
+
+
+def opaque_point():
+    """Return two Gaussians of opacity 1 on one pixel, among others."""
+    point, rng = base_point(), np.random.default_rng(0)
+    point["viewmat"] = jnp.eye(4)
+    point["K"] = jnp.asarray([[20.0, 0, 9.5], [0, 21.0, 6.5], [0, 0, 1]])
+    z = jnp.linspace(2, 6, COUNT)
+    xy = rng.uniform(-0.4, 0.4, (COUNT, 2)) * z[:, None]
+    means = jnp.concatenate([xy, z[:, None]], -1)
+    opaque = np.array([4, 9])
+    point["means"] = means.at[opaque, :2].set(0)
+    point["logit_opacities"] = point["logit_opacities"].at[opaque].set(60.0)
+    return point
+
+
+@pytest.mark.parametrize(
+    ("make", "config", "dtype", "bar"),
+    [
+        (base_point, SMOOTH, jnp.float64, 1e-10),
+        (base_point, COMPAT, jnp.float64, 1e-10),
+        (needle_point, COMPAT, jnp.float64, 1e-10),
+        (isotropic_point, SMOOTH, jnp.float64, 1e-10),
+        (opaque_point, SMOOTH.replace(alpha_max=1.0), jnp.float64, 1e-10),
+        (opaque_point, SMOOTH, jnp.float32, 1e-5),  # in which 1 − 1e-9 is 1
+    ],
+)
+def test_gradient_is_that_of_the_reference(make, config, dtype, bar, report):
+    point = make()
+    found, wanted = gradient(cast(point, dtype), config), dense_gradient(point, config)
+    assert {found[name].dtype for name in LEAVES} == {np.dtype(dtype)}
+    name, but = f"{make.__name__}, {dtype.__name__}", ("probe",)
+    if make is isotropic_point:  # turning a ball changes nothing
+        turns, stretches = np.abs(found["quats"]), np.abs(found["log_scales"])
+        assert turns.max() <= 1e-10 * stretches.max()
+        but += ("quats",)
+    assert_same_leaves(name, found, wanted, report, bar, but)
 
 
 def test_hessian_vector_product(report):
@@ -210,6 +222,35 @@ def test_hessian_vector_product(report):
         wanted = {name: (ahead[name] - behind[name]) / (2 * step) for name in LEAVES}
         found, but = product(point, direction), ("background",)
         assert_same_leaves(f"Hessian, {names[0]}", found, wanted, report, 1e-4, but)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("platform", ["cpu", "gpu"])
+def test_second_derivatives_in_all_modes(platform, monkeypatch, report):
+    """With α at both limits, against plain differentiation of the reference."""
+    monkeypatch.setattr(jax, "default_backend", lambda: platform)
+    point = base_point()
+    directions = random_directions(point, LEAVES[:-1], count=1)
+    direction = {name: jnp.asarray(d[0]) for name, d in directions.items()}
+    function = partial(loss, config=COMPAT)
+
+    def along(function):
+        return lambda point: jax.jvp(function, (point,), (direction,))[1]
+
+    def dot(slopes):
+        return sum(jnp.sum(slopes[name] * direction[name]) for name in LEAVES)
+
+    def slope(point):
+        return dot(jax.grad(function)(point))
+
+    wanted = along(partial(dense_gradient, config=COMPAT))(point)
+    for name, product in {
+        "forward over reverse": along(jax.grad(function)),
+        "reverse over reverse": jax.grad(slope),
+    }.items():
+        assert_same_leaves(name, jax.jit(product)(point), wanted, report, 1e-10)
+    twice = jax.jit(along(along(function)))(point)
+    assert_close(report, "forward over forward", twice, dot(wanted), 1e-10)
 
 
 def test_every_product_is_in_full_precision():
@@ -263,80 +304,6 @@ def test_gradients_of_a_batch_are_the_sum(report):
         assert_same_leaves(name, found, wanted, report, 1e-12, ("K", "viewmat"))
 
 
-def slopes_both_ways(function, point, direction):
-    """Return first and second derivatives along a direction, forward and reverse."""
-
-    def along(function):
-        return lambda point: jax.jvp(function, (point,), (direction,))[1]
-
-    def dot(tree):
-        products = jax.tree.map(lambda a, b: jnp.sum(a * b), tree, direction)
-        return sum(jax.tree.leaves(products))
-
-    def slope(point):
-        return dot(jax.grad(function)(point))
-
-    forward = along(function)(point), along(along(function))(point)
-    return forward, jax.grad(function)(point), jax.grad(slope)(point)
-
-
-def transmittance_case(rng):
-    alpha = rng.uniform(0, 0.99, (3, 9, 5)) * (rng.uniform(size=(3, 9, 5)) > 0.3)
-    alpha[0, :4, 0] = 0.99
-    return transmittance, running_product, (alpha,)
-
-
-def sums_case(rng):
-    point = rng.normal(size=(3, 9, 7)), rng.normal(size=(3, 9, 4))
-    return channel_sums, lambda w, c: jnp.einsum("gkp,gkc->gcp", w, c), point
-
-
-def alpha_case(rng):
-    """Round splats and needles, near and far, with α at both limits."""
-    tile, shape = 8, (2, 300)
-    inv_sx, inv_sy = 10 ** rng.uniform(-3, 0.2, (2, *shape))
-    slope, opacity = rng.normal(size=shape), rng.uniform(0.1, 1, shape)
-    along = rng.normal(size=shape) / inv_sx
-    u, v = rng.uniform(0, tile, (2, *shape)) + (along, slope * along)
-    point = inv_sx, slope, inv_sy, opacity, u, v
-    pixels = pixel_centres(tile, np.float64)
-    config = COMPAT.replace(tile_size=tile, alpha_max=0.8)
-
-    def ours(*splats):
-        return alphas(splats, pixels, config)
-
-    def plain(*splats):
-        return _limited(_gaussian(splats, pixels), config, None)
-
-    alpha = np.asarray(ours(*map(jnp.asarray, point)))
-    assert 0.05 < np.mean(alpha == 0) < 0.95
-    assert np.sum(alpha == config.alpha_max) > 5
-    return ours, plain, point
-
-
-@pytest.mark.parametrize(
-    ("case", "limit"),
-    [(transmittance_case, 1e-12), (sums_case, 1e-12), (alpha_case, 1e-11)],
-)
-def test_custom_rules_are_plain_differentiation(case, limit, report):
-    ours, plain, point = case(np.random.default_rng(1))
-    rng = np.random.default_rng(2)
-    point = tuple(map(jnp.asarray, point))
-    direction = tuple(v * rng.normal(size=v.shape) for v in point)
-    outputs = jax.tree.leaves(ours(*point))
-    weights = [rng.normal(size=a.shape) for a in outputs]
-
-    def slopes(function):
-        def total(point):
-            found = jax.tree.leaves(function(*point))
-            return sum(jnp.sum(w * a**2) for w, a in zip(weights, found, strict=True))
-
-        return jax.jit(lambda p: slopes_both_ways(total, p, direction))(point)
-
-    found, wanted = slopes(ours), slopes(plain)
-    assert_close(report, case.__name__, found, wanted, limit)
-
-
 def dense_pixels(point, probe, config):
     """Return the loss of each pixel [H W] with ``probe`` added to the means."""
     gaussians, camera = scene_at(point)
@@ -380,36 +347,3 @@ def test_absolute_gradients_by_brute_force(report):
     assert_close(report, "absolute", absolute, np.abs(per_pixel).sum(0), 1e-10)
     assert (absolute >= np.abs(signed) - 1e-12).all()
     assert (absolute > 1.5 * np.abs(signed)).any()
-
-
-def test_isotropic_covariances(report):
-    point = base_point()
-    point["log_scales"] = jnp.broadcast_to(point["log_scales"][:, :1], (COUNT, 3))
-    found, wanted = gradient(point, SMOOTH), dense_gradient(point, SMOOTH)
-    assert_same_leaves("isotropic", found, wanted, report, but=("probe", "quats"))
-    # Turning a ball changes nothing.
-    assert np.abs(found["quats"]).max() <= 1e-10 * np.abs(found["log_scales"]).max()
-
-
-@pytest.mark.parametrize(
-    ("dtype", "config"),
-    [(jnp.float64, SMOOTH.replace(alpha_max=1.0)), (jnp.float32, SMOOTH)],
-    ids=["float64", "float32"],
-)
-def test_alpha_of_exactly_one(dtype, config, report):
-    """Two Gaussians of opacity 1 on one pixel; 1 − 1e-9 is 1 in float32."""
-    point = base_point()
-    point["viewmat"] = jnp.eye(4)
-    point["K"] = jnp.asarray([[20.0, 0, 9.5], [0, 21.0, 6.5], [0, 0, 1]])
-    rng = np.random.default_rng(0)
-    z = jnp.linspace(2, 6, COUNT)
-    xy = rng.uniform(-0.4, 0.4, (COUNT, 2)) * z[:, None]
-    means = jnp.concatenate([xy, z[:, None]], -1)
-    opaque = np.array([4, 9])
-    point["means"] = means.at[opaque, :2].set(0)
-    point["logit_opacities"] = point["logit_opacities"].at[opaque].set(60.0)
-    wanted = dense_gradient(point, config)
-    found = gradient(cast(point, dtype), config)
-    bar = 1e-10 if dtype == jnp.float64 else 1e-5
-    assert {found[name].dtype for name in LEAVES} == {np.dtype(dtype)}
-    assert_same_leaves(f"alpha 1, {dtype.__name__}", found, wanted, report, bar)

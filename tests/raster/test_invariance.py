@@ -16,6 +16,7 @@ from conftest import (
     WHOLE,
     camera_of,
     cast,
+    gaussians_at,
     loss_and_gradients,
     needs_two_devices,
     on_cpu,
@@ -26,7 +27,7 @@ from conftest import (
 from pictures import KINDS, assert_same, images
 
 import gsjax
-from gsjax.math.numerics import in_float64
+from gsjax.raster.lists.blocks import BLOCK
 
 pytestmark = [on_cpu, pytest.mark.as_users]
 
@@ -69,20 +70,26 @@ def test_order_of_slots_and_repetition_are_bit_equal(kind):
 
 
 def with_garbage(gaussians: gsjax.Gaussians, value: float):
-    """Add two dead slots for each live one, holding ``value`` everywhere."""
-    dead = np.ones(3 * COUNT, bool)
-    live = np.sort(np.random.default_rng(0).permutation(3 * COUNT)[:COUNT])
-    dead[live] = False
+    """Spread Gaussians over the outer of three blocks; dead slots hold ``value``."""
+    size = 3 * BLOCK + 9
+    outer = np.r_[0:BLOCK, 2 * BLOCK : size]
+    live = np.sort(np.random.default_rng(0).permutation(outer)[:COUNT])
     params = jax.tree.map(
-        lambda a: jnp.full((3 * COUNT, *a.shape[1:]), value, a.dtype).at[live].set(a),
+        lambda a: jnp.full((size, *a.shape[1:]), value, a.dtype).at[live].set(a),
         gaussians.params,
     )
-    return gsjax.Gaussians(params=params, active=jnp.asarray(~dead)), live
+    active = jnp.zeros(size, bool).at[live].set(True)
+    return gsjax.Gaussians(params=params, active=active), live
 
 
-def test_contents_of_dead_slots_are_bit_equal():
+def test_dead_slots_and_x64_are_bit_equal():
+    """float32 is the default of users, who leave `jax_enable_x64` alone."""
     gaussians, camera = cast(scene_of("random"), jnp.float32)
     wanted, first = images(gaussians, camera), None
+    with jax.enable_x64(False):
+        out = render(gaussians, camera, WHOLE, jnp.float32(BACKGROUND))
+        assert_same(out, wanted, (*ALL, "radii"))
+    assert out.demand == wanted.demand
     for value in (0.0, np.nan, -np.inf, 1e30):
         scene, live = with_garbage(gaussians, value)
         plain = images(scene, camera)
@@ -99,47 +106,26 @@ def test_contents_of_dead_slots_are_bit_equal():
         chex.assert_trees_all_equal((out, grads), first)
 
 
-def test_the_same_without_x64():
-    """float32 is the default of users, who leave `jax_enable_x64` alone."""
-    gaussians, camera = cast(scene_of("random"), jnp.float32)
-    wanted = images(gaussians, camera)
-    with jax.enable_x64(False):
-        out = render(gaussians, camera, WHOLE, jnp.float32(BACKGROUND))
-        assert_same(out, wanted, (*ALL, "radii"))
-    assert out.demand == wanted.demand
-
-
 def test_depths_that_differ_by_less_than_a_step_of_float32(report):
     """Slots are ordered by the depths of the stored numbers, not by float32 depths.
 
-    The Gaussians are opaque, far from the origin, and in any order of slots.
+    The Gaussians are far from the origin, and in any order of slots.
     """
-    rng, count = np.random.default_rng(0), 64
     shift = np.eye(4)
     shift[:3, 3] = 9, -7, 5
     camera = camera_of(viewmat=pose() @ shift)
-    to_world = np.linalg.inv(np.asarray(camera.viewmat, np.float64))
-    seen = np.c_[np.zeros((count, 2)), 3 + 2e-8 * np.arange(count), np.ones(count)]
-    fields = {
-        "means": (seen @ to_world.T)[:, :3],
-        "quats": np.tile([1.0, 0, 0, 0], (count, 1)),
-        "log_scales": np.full((count, 3), -2.0),
-        "logit_opacities": np.full(count, 1.0),
-        "sh": rng.uniform(-1, 2, (count, 1, 3)),
-    }
-    mixed = rng.permutation(count)
+    depths = 3 + 2e-8 * np.random.default_rng(0).permutation(64)
+    points, at = np.c_[np.zeros((64, 2)), depths], {"viewmat": camera.viewmat}
+    scene = gaussians_at(points, np.exp(-2), 0.7, degree=0, **at)
+    means, row = np.asarray(scene.params.means), np.asarray(camera.viewmat)[2]
+    narrow = cast((scene, camera), jnp.float32)
     config = WHOLE.replace(occlusion=False, outputs=("rgb",))
     with jax.enable_x64(False):
-        fields = {name: np.asarray(v[mixed], np.float32) for name, v in fields.items()}
-        scene = gsjax.make_gaussians(**fields)
-        narrow = jax.tree.map(jnp.float32, camera)
-        found = render(scene, narrow, config).rgb
-        row, means = np.asarray(narrow.viewmat)[2], fields["means"]
-        as_computed = sum(row[i] * means[:, i] for i in range(3)) + row[3]
-    wide, camera = in_float64((scene, narrow))
-    z = np.asarray(wide.params.means) @ np.asarray(camera.viewmat)[2, :3]
-    assert (np.argsort(z) != np.argsort(as_computed, kind="stable")).any()
-    wanted = render(wide, camera, config).rgb
-    error = float(jnp.abs(found - wanted).max())
+        found = render(*narrow, config).rgb
+    parts = (np.float32(row) * np.float32(np.c_[means, np.ones(64)])).T
+    as_computed = parts[0] + parts[1] + parts[2] + parts[3]
+    true = np.argsort(means @ row[:3])
+    assert (true != np.argsort(as_computed, kind="stable")).any()
+    error = float(jnp.abs(found - render(scene, camera, config).rgb).max())
     report("order within a step of float32", error, 1e-5)
     assert error <= 1e-5

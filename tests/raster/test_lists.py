@@ -1,6 +1,5 @@
 """The lists hold every pair that matters, hardly any other, in the right order."""
 
-import dataclasses
 from functools import partial
 from unittest import mock
 
@@ -9,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import COUNT, HEIGHT, SCENES, WIDTH, scene_of
-from stages import visible_projection
 
 from gsjax import RasterConfig
-from gsjax.raster.compositing import schedules
 from gsjax.raster.lists import binning, blocks
+from gsjax.raster.primitives.ellipsoid import ELLIPSOID
+from gsjax.raster.render_camera import visible_order
+from gsjax.raster.types import Inputs
 
 CAPACITY = 16384
 CONFIG = RasterConfig(num_size_buckets=1, devices=1)
@@ -21,7 +21,10 @@ CONFIG = RasterConfig(num_size_buckets=1, devices=1)
 
 @jax.jit
 def projected_of(gaussians, camera):
-    return visible_projection(gaussians, camera, CONFIG)
+    """Return the projection of the visible slots, front to back."""
+    inputs = Inputs(gaussians, camera)
+    order = visible_order(ELLIPSOID, inputs, CONFIG)
+    return ELLIPSOID.project(inputs, CONFIG, *order)
 
 
 @jax.jit
@@ -30,19 +33,17 @@ def radii_of(footprint):
 
 
 @partial(jax.jit, static_argnames=("grid", "capacity", "block", "platform"))
-def make_lists(
-    projected, device, grid, capacity=CAPACITY, block=blocks.BLOCK, platform=None
-):
+def make_lists(footprint, grid, capacity=CAPACITY, block=blocks.BLOCK, platform=None):
     with mock.patch.object(blocks, "BLOCK", block):
         return binning.make_lists(
-            projected.footprint, grid, device, capacity, platform=platform
+            footprint, grid, jnp.int32(0), capacity, platform=platform
         )
 
 
-def lists_of(kind, tile, stride=1, device=0, **options):
-    grid = binning.make_grid(WIDTH, HEIGHT, tile, stride)
+def lists_of(kind, tile=8, **options):
+    grid = binning.make_grid(WIDTH, HEIGHT, tile, 1)
     projected = projected_of(*scene_of(kind))
-    lists = make_lists(projected, jnp.int32(device), grid, **options)
+    lists = make_lists(projected.footprint, grid, **options)
     return grid, jax.tree.map(np.asarray, projected), jax.tree.map(np.asarray, lists)
 
 
@@ -57,7 +58,7 @@ def listed_pairs(grid, lists) -> np.ndarray:
     return out
 
 
-def touched_pairs(grid, projected, device: int = 0) -> np.ndarray:
+def touched_pairs(grid, projected) -> np.ndarray:
     """Return [T, R] bool by evaluating Q at every pixel."""
     ys, xs = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     splat, reach = projected.splat, projected.footprint.reach
@@ -69,7 +70,7 @@ def touched_pairs(grid, projected, device: int = 0) -> np.ndarray:
     inside &= reach > 0
     out = np.zeros((grid.tiles, COUNT), bool)
     for tile in range(grid.tiles):
-        x, y = (int(o) for o in binning.tile_origins(grid, np.int32(tile), device))
+        x, y = (int(o) for o in binning.tile_origins(grid, np.int32(tile), 0))
         box = inside[:, max(y, 0) : y + grid.tile, x : x + grid.tile]
         out[tile] = box.any(axis=(1, 2))
     return out
@@ -93,9 +94,8 @@ def test_nothing_is_dropped_and_little_is_superfluous(kind, tile):
     # A radius is positive where the box around Q ≤ reach holds the centre of a pixel.
     seen = projected.footprint
     radii = np.asarray(radii_of(seen))
-    extent = np.sqrt(
-        seen.reach[:, None] * np.stack([seen.inv_sx**-2.0, seen.var_y], -1)
-    )
+    variances = np.stack([seen.inv_sx**-2.0, seen.var_y], -1)
+    extent = np.sqrt(seen.reach[:, None] * variances)
     centre = np.stack([seen.u, seen.v], -1)
     size = np.array([WIDTH, HEIGHT])
     first = np.clip(np.ceil(centre - extent - 0.5), 0, size)
@@ -111,11 +111,10 @@ def test_nothing_is_dropped_and_little_is_superfluous(kind, tile):
 def test_a_view_that_scales_loses_nothing():
     """[s R | s t] shows the same as [R | t]; an optimised view may pass through it."""
     gaussians, camera = scene_of("random")
-    far = dataclasses.replace(camera, near=camera.near * 0, far=camera.far * 1e9)
+    far = camera.replace(near=camera.near * 0, far=camera.far * 1e9)
 
     def count(scale):
-        viewmat = camera.viewmat.at[:3].multiply(scale)
-        seen = dataclasses.replace(far, viewmat=viewmat)
+        seen = far.replace(viewmat=camera.viewmat.at[:3].multiply(scale))
         return int((radii_of(projected_of(gaussians, seen).footprint) > 0).sum())
 
     assert 10 < count(1.0) < COUNT
@@ -126,55 +125,23 @@ def test_a_view_that_scales_loses_nothing():
 @pytest.mark.parametrize(
     ("block", "platform"), [(7, "cpu"), (32, None), (32, "gpu"), (8192, "gpu")]
 )
-def test_blocks_and_platforms_make_the_same_lists(block, platform):
-    """CPUs scatter pairs in blocks; accelerators sort them."""
+def test_blocks_platforms_and_capacities_make_the_same_lists(block, platform):
+    """CPUs scatter pairs in blocks; accelerators sort them.
+
+    The need is reported at any capacity; lists are right if it is enough.
+    """
+    options = {"block": block, "platform": platform}
     for kind in ("random", "huge", "tiny"):
-        _, _, whole = lists_of(kind, 8)
-        _, _, lists = lists_of(kind, 8, block=block, platform=platform)
+        _, _, whole = lists_of(kind)
         count = int(whole.pairs)
-        assert lists.pairs == count > 100
-        np.testing.assert_array_equal(lists.start, whole.start)
-        np.testing.assert_array_equal(lists.length, whole.length)
-        np.testing.assert_array_equal(lists.ranks[:count], whole.ranks[:count])
-
-
-@pytest.mark.parametrize(("block", "platform"), [(7, "cpu"), (8192, "gpu")])
-def test_capacity_changes_no_count(block, platform):
-    """The need is reported at any capacity; lists are right if it is enough."""
-    _, _, whole = lists_of("random", 8)
-    count = int(whole.pairs)
-    for capacity in (1, count - 1, count):
-        _, _, lists = lists_of(
-            "random", 8, capacity=capacity, block=block, platform=platform
-        )
-        assert lists.pairs == count
-        np.testing.assert_array_equal(lists.length, whole.length)
-        assert lists.fit == (capacity >= count)
-        assert lists.ranks.shape == (capacity,)
-        if lists.fit:
-            np.testing.assert_array_equal(lists.ranks, whole.ranks[:count])
-
-
-def test_devices_share_the_rows():
-    """The lists of two devices are those of one, split by rows of tiles."""
-    whole, _, all_lists = lists_of("random", 8)
-    listed = listed_pairs(whole, all_lists).reshape(whole.rows, whole.cols, COUNT)
-    for device in range(2):
-        grid, _, lists = lists_of("random", 8, stride=2, device=device)
-        part = listed_pairs(grid, lists).reshape(grid.rows, grid.cols, COUNT)
-        wanted = listed[device::2]
-        np.testing.assert_array_equal(part[: len(wanted)], wanted)
-        assert not part[len(wanted) :].any()
-
-
-@pytest.mark.parametrize(("group", "chunk"), [(1, 1), (8, 16), (2048, 32)])
-def test_pairs_and_steps_have_matching_capacities(group, chunk):
-    """The pair capacity for so many steps holds them, and a smaller one does not."""
-    grid = binning.make_grid(800, 600, 8, 1)
-    for wanted in np.unique(np.geomspace(1, 5000, 20).astype(int)):
-        count = jnp.int32(wanted)
-        pairs = int(schedules.pairs_for_steps(count, grid, group, chunk))
-        assert schedules.step_capacity(pairs, grid, group, chunk) >= wanted
-        if pairs > 0:
-            fewer = int(pairs * (1 - 2e-6)) - 1
-            assert schedules.step_capacity(fewer, grid, group, chunk) < wanted
+        assert count > 100
+        few = (1, count - 1, count) if kind == "random" else ()
+        for capacity in (*few, CAPACITY):
+            _, _, lists = lists_of(kind, capacity=capacity, **options)
+            assert lists.pairs == count
+            np.testing.assert_array_equal(lists.length, whole.length)
+            assert lists.fit == (capacity >= count)
+            assert lists.ranks.shape == (capacity,)
+            if lists.fit:
+                np.testing.assert_array_equal(lists.start, whole.start)
+                np.testing.assert_array_equal(lists.ranks[:count], whole.ranks[:count])

@@ -19,6 +19,7 @@ from conftest import (
     assert_not_empty,
     camera_of,
     cast,
+    gaussians_at,
     loss_and_gradients,
     reference,
     scene_of,
@@ -139,20 +140,12 @@ def test_one_half_is_crossed_once(platform, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: platform)
     rng, count = np.random.default_rng(0), 1000
     depth = np.sort(rng.uniform(1, 2, count))
-    scene = gsjax.make_gaussians(
-        means=np.stack([0 * depth, 0 * depth, depth], -1),
-        quats=np.tile([1.0, 0, 0, 0], (count, 1)),
-        log_scales=np.full((count, 3), -1.0),
-        logit_opacities=rng.normal(1 - np.log(count), 0.1, count),
-        sh=np.zeros((count, 1, 3)),
-    )
+    points = np.stack([0 * depth, 0 * depth, depth], -1)
+    opacities = np.exp(rng.normal(1, 0.1, count)) / count
+    scene = gaussians_at(points, np.exp(-1), opacities, viewmat=np.eye(4), degree=0)
     camera = camera_of(viewmat=np.eye(4))
-    config = gsjax.RasterConfig(
-        **{**LIGHT, "pair_capacity": 32_768},
-        chunk_size=1,
-        alpha_min=1e-6,
-        outputs=("alpha", "median_depth"),
-    )
+    config = gsjax.RasterConfig(**LIGHT, outputs=("alpha", "median_depth"))
+    config = config.replace(pair_capacity=32_768, chunk_size=1, alpha_min=1e-6)
     drawn = jax.jit(lambda *scene: gsjax.render(*scene, config))
     found = drawn(*cast((scene, camera), jnp.float32))
     assert not found.overflowed
@@ -165,54 +158,25 @@ def test_one_half_is_crossed_once(platform, monkeypatch):
     assert ((median == 0) | (median < 2.001)).all()
 
 
-@pytest.mark.long
-def test_second_derivatives_are_symmetric():
-    """u H v = v H u for the Hessian H of a squared image by the means."""
-    gaussians, camera = scene_of("random")
-    config = COMPAT.replace(outputs=("rgb",))
-    rng = np.random.default_rng(1)
-    first, second = rng.normal(size=(2, *gaussians.params.means.shape))
-
-    def loss(means):
-        params = gaussians.params.replace(means=means)
-        rgb = gsjax.render(gaussians.replace(params=params), camera, config).rgb
-        return jnp.sum(jnp.square(rgb))
-
-    @jax.jit
-    def product(means, direction):
-        return jax.jvp(jax.grad(loss), (means,), (direction,))[1]
-
-    one = jnp.sum(second * product(gaussians.params.means, first))
-    other = jnp.sum(first * product(gaussians.params.means, second))
-    assert abs(one) > 1e-3
-    np.testing.assert_allclose(one, other, rtol=1e-8)
-
-
-def test_too_little_capacity_is_reported_and_changes_no_count():
-    scene = scene_of("random")
-    enough = renders(*scene, BACKGROUND, COMPAT)
-    little = renders(*scene, BACKGROUND, COMPAT.replace(pair_capacity=300))
+def test_capacities_batches_and_devices_make_the_same_images():
+    """A mapped scene, a batch of cameras, two devices; too little is reported."""
+    (one, camera), (other, _) = scene_of("random"), scene_of("wall")
+    first, second = (renders(g, camera, BACKGROUND, COMPAT) for g in (one, other))
+    little = renders(one, camera, BACKGROUND, COMPAT.replace(pair_capacity=300))
     assert little.overflowed
-    assert little.demand == enough.demand
+    assert little.demand == first.demand
     assert little.demand.capacity == little.demand.pairs > 300
     fits = COMPAT.replace(pair_capacity=int(little.demand.capacity))
-    again = renders(*scene, BACKGROUND, fits)
+    again = renders(one, camera, BACKGROUND, fits)
     assert not again.overflowed
-    np.testing.assert_array_equal(again.rgb, enough.rgb)
-
-
-def test_batches_and_devices_make_the_same_images():
-    """A mapped scene, a batch of cameras, two devices."""
-    (one, camera), (other, _) = scene_of("random"), scene_of("wall")
+    np.testing.assert_array_equal(again.rgb, first.rgb)
     both = jax.tree.map(lambda *a: jnp.stack(a), one, other)
-    found = jax.jit(
-        jax.vmap(lambda g: gsjax.render(g, camera, COMPAT, BACKGROUND).rgb)
-    )(both)
-    alone = [renders(scene, camera, BACKGROUND, COMPAT).rgb for scene in (one, other)]
-    np.testing.assert_allclose(found, alone, atol=1e-12)
+    mapped = jax.vmap(lambda g: renders(g, camera, BACKGROUND, COMPAT).rgb)
+    found = jax.jit(mapped)(both)
+    np.testing.assert_allclose(found, [first.rgb, second.rgb], atol=1e-12)
     several = gsjax.stack_cameras([camera, camera])
     batch = renders(one, several, BACKGROUND, COMPAT).rgb
-    np.testing.assert_allclose(batch, [alone[0]] * 2, atol=1e-12)
+    np.testing.assert_allclose(batch, [first.rgb] * 2, atol=1e-12)
     if jax.local_device_count() > 1:
         shared = renders(one, camera, BACKGROUND, COMPAT.replace(devices=2))
-        np.testing.assert_allclose(shared.rgb, alone[0], atol=1e-12)
+        np.testing.assert_allclose(shared.rgb, first.rgb, atol=1e-12)

@@ -6,20 +6,19 @@ whether a Gaussian is blended. `reference_render` gives the distance to the near
 threshold ("margin"); the number of pixels in the band is bounded too.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import (
-    ALL,
     BACKGROUND,
     COMPAT,
     COUNT,
-    HEIGHT,
     PRESETS,
     SCENES,
     WHOLE,
-    WIDTH,
     assert_not_empty,
     camera_of,
     cast,
@@ -103,33 +102,24 @@ def test_settings(changes, dtype, report):
 
 
 @pytest.mark.parametrize(
-    ("size", "degree", "lens"),
-    [((1, 1), 4, "pinhole"), ((33, 50), 0, "orthographic")],
+    ("size", "degree", "lens", "channels"),
+    [
+        ((1, 1), 4, "pinhole", None),
+        ((33, 50), 0, "orthographic", None),
+        ((45, 29), 1, "pinhole", 5),
+    ],
 )
-def test_sizes_degrees_and_lenses(size, degree, lens, report):
-    gaussians, _ = scene_of("random")
+def test_sizes_degrees_lenses_and_features(size, degree, lens, channels, report):
+    gaussians, rng = scene_of("random")[0], np.random.default_rng(0)
     focal = (8.0, 7.0) if lens == "orthographic" else (40.0, 43.0)
-    camera = camera_of(*size, lens=lens, focal=focal)
+    camera, more = camera_of(*size, lens=lens, focal=focal), {}
+    if channels:
+        more["features"] = rng.normal(size=(COUNT, channels))
+        more["background"] = rng.uniform(size=channels)
     gaussians = gsjax.with_sh_degree(gaussians, degree)
-    errors, _ = compare(gaussians, camera, COMPAT, jnp.float64)
-    check(errors, BAR[jnp.float64], report, f"size {size}, degree {degree}, {lens}")
-
-
-def test_features_and_backgrounds_of_a_batch(report):
-    gaussians, first = scene_of("random")
-    cameras = [first, camera_of(centre=(30, 8))]
-    rng = np.random.default_rng(0)
-    features, backgrounds = rng.normal(size=(COUNT, 5)), rng.uniform(size=(2, 5))
-    out = render(
-        gaussians, gsjax.stack_cameras(cameras), COMPAT, backgrounds, features=features
-    )
-    assert out.rgb.shape == (2, HEIGHT, WIDTH, 5)
-    for i, camera in enumerate(cameras):
-        wanted = reference(gaussians, camera, COMPAT, backgrounds[i], features)
-        one = out._replace(**{name: getattr(out, name)[i] for name in ALL})
-        errors, _ = errors_of(one, wanted, BAND[jnp.float64])
-        check(errors, BAR[jnp.float64], report, "batch with features and backgrounds")
-        assert_not_empty(one.alpha)
+    errors, _ = compare(gaussians, camera, COMPAT, jnp.float64, **more)
+    name = f"size {size}, degree {degree}, {lens}, {channels} features"
+    check(errors, BAR[jnp.float64], report, name)
 
 
 def test_the_reference_ignores_gaussians_that_are_not_drawn():
@@ -139,13 +129,11 @@ def test_the_reference_ignores_gaussians_that_are_not_drawn():
     gaussians, camera = gaussians_at(points, np.full((6, 1), 0.3), 0.5), camera_of(8, 7)
 
     @jax.jit
+    @partial(jax.value_and_grad, has_aux=True)
     def picture(means):
-        def total(means):
-            scene = gaussians.replace(params=gaussians.params.replace(means=means))
-            found = reference(scene, camera, WHOLE, BACKGROUND)
-            return jnp.sum(found["rgb"]), found
-
-        return jax.value_and_grad(total, has_aux=True)(means)
+        scene = gaussians.replace(params=gaussians.params.replace(means=means))
+        found = reference(scene, camera, WHOLE, BACKGROUND)
+        return jnp.sum(found["rgb"]), found
 
     means, keep = gaussians.params.means, np.arange(6) != 3
     others = jax.tree.map(lambda a: a[keep], gaussians)
@@ -164,25 +152,28 @@ def test_the_reference_ignores_gaussians_that_are_not_drawn():
     assert np.isinf(empty["margin"]).all()
 
 
-def thousands(kind):
-    """Return 4000 Gaussians, mixed as after training, or all faint."""
+def as_trained():
     rng = np.random.default_rng(9)
-    if kind == "4000 faint":
-        points = frustum_points(rng, 4000)
-        return gaussians_at(points, rng.uniform(0.3, 2, (4000, 3)), 0.003)
-    points = frustum_points(rng, 4000, spread=1.0)
+    points, opacities = frustum_points(rng, 4000, spread=1.0), rng.beta(0.5, 0.7, 4000)
     scales = np.exp(rng.normal(-3, 1, (4000, 3)))
-    return gaussians_at(points, scales, rng.beta(0.5, 0.7, 4000))
+    return gaussians_at(points, scales, opacities), camera_of()
 
 
-@pytest.mark.parametrize("kind", ["4000 as trained", "4000 faint", *SCENES])
+def faint():
+    rng = np.random.default_rng(9)
+    points, scales = frustum_points(rng, 4000), rng.uniform(0.3, 2, (4000, 3))
+    return gaussians_at(points, scales, 0.003), camera_of()
+
+
+THOUSANDS = {"4000 as trained": as_trained, "4000 faint": faint}
+
+
+@pytest.mark.parametrize("kind", [*THOUSANDS, *SCENES])
 def test_accurate_against_the_exact_image(kind, report):
     """The preset errs by at most 0.5/255 from the image without limits; 65 dB."""
     config = PRESETS["accurate"]
-    if kind in SCENES:
-        gaussians, camera = scene_of(kind)
-    else:
-        gaussians, camera = thousands(kind), camera_of()
+    gaussians, camera = scene_of(kind) if kind in SCENES else THOUSANDS[kind]()
+    if kind in THOUSANDS:
         config = config.replace(pair_capacity=2**17)
     exact = reference(gaussians, camera, None, BACKGROUND)
     out = render(gaussians, camera, config, BACKGROUND)

@@ -1,4 +1,4 @@
-"""Sorts by one packed key equal NumPy's stable sorts, whatever the widths."""
+"""Sorts by one packed key, and sums of counts, are those of NumPy."""
 
 from functools import partial
 
@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gsjax.raster.lists.counting import compact_indices, cumulative_sum, total_count
 from gsjax.raster.lists.sorting import (
     argsort_descending,
     argsort_float,
-    bits_for,
     pair_keys,
     sort_pairs,
     split_float,
@@ -35,17 +35,14 @@ def numbers(limit):
     return st.lists(st.integers(0, limit), min_size=LENGTH, max_size=LENGTH)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 255, 256, 257, 2**20])
-def test_bits_hold_the_largest(count):
-    assert count - 1 < 2 ** bits_for(count)
-    assert count == 1 or count - 1 >= 2 ** (bits_for(count) - 1)
-
-
-@pytest.mark.parametrize(("high_bits", "low_bits"), [(10, 12), (20, 31)])
+@pytest.mark.parametrize(
+    ("high_count", "low_count"),
+    [(1, 1), (2, 3), (256, 257), (2**10, 2**12), (2**20, 2**31 - 1)],
+)
 @settings(max_examples=50)
 @given(data=st.data())
-def test_pairs_of_narrow_and_wide_keys(high_bits, low_bits, data):
-    counts = 2**high_bits, min(2**low_bits, 2**31 - 1)
+def test_pairs_of_narrow_and_wide_keys(high_count, low_count, data):
+    counts = high_count, low_count
     high, low = (np.int32(data.draw(numbers(count - 1))) for count in counts)
     got = sort_by_both(high, low, *counts)
     assert got.dtype == jnp.int32
@@ -91,3 +88,49 @@ def test_descending(counts):
     counts = np.asarray(counts, np.int32)
     wanted = np.argsort(-counts.astype(np.int64), kind="stable")
     np.testing.assert_array_equal(descending(counts), wanted)
+
+
+@pytest.fixture(params=["cpu", "gpu"])
+def backend(request, monkeypatch):
+    """Trace for this platform; each test jits a function of its own."""
+    monkeypatch.setattr(jax, "default_backend", lambda: request.param)
+
+
+@pytest.mark.usefixtures("backend")
+@pytest.mark.parametrize("size", [1, 4, 65, 10007])
+def test_cumulative_sums(size):
+    counts = np.random.default_rng(size).integers(0, 2**20, size).astype(np.int32)
+
+    @jax.jit
+    def sums(counts, odd):
+        both = jnp.stack([counts, counts // 3])
+        alone = cumulative_sum(counts), cumulative_sum(odd)
+        return *alone, *jax.vmap(cumulative_sum)(both)
+
+    values = counts, counts % 2 == 1, counts, counts // 3
+    for found, value in zip(sums(*values[:2]), values, strict=True):
+        assert found.dtype == jnp.int32
+        np.testing.assert_array_equal(found, np.cumsum(value, dtype=np.int32))
+
+
+@pytest.mark.usefixtures("backend")
+@pytest.mark.parametrize("capacity", [1, 30, 300])
+def test_compact_indices_keeps_the_first(capacity):
+    chosen = np.random.default_rng(0).random(200) < 0.3
+    where = np.flatnonzero(chosen)
+    index, count = jax.jit(lambda c: compact_indices(c, capacity))(chosen)
+    assert int(count) == len(where)
+    wanted = np.append(where, np.full(capacity, 200))[:capacity]
+    np.testing.assert_array_equal(index, wanted)
+
+
+@pytest.mark.usefixtures("backend")
+def test_total_count_saturates():
+    """Just below and above the limit, and where int32 would wrap to any number."""
+    huge, just_below = 2**30, [2**30 - 2**12, 5]
+    wraps = [huge, huge, 1], [huge] * 4, [*[huge] * 4, 100]
+    for counts in ([3, 0, 4], just_below, [huge, 2**10], *wraps, [2**21] * 1024):
+        total, safe = jax.jit(lambda c: total_count(c))(jnp.asarray(counts, jnp.int32))
+        assert total.dtype == jnp.int32
+        assert safe == (sum(counts) < 2**30)
+        assert total == (sum(counts) if safe else 2**31 - 1)

@@ -1,4 +1,6 @@
-"""Pixels outside a mask are skipped; those inside keep every bit."""
+"""What is masked or hidden is skipped: that changes no bit, and it does skip."""
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -8,17 +10,79 @@ from conftest import (
     ALL,
     BACKGROUND,
     COMPAT,
+    COUNT,
     HEIGHT,
+    PRESETS,
     WIDTH,
     assert_not_empty,
+    camera_of,
+    frustum_points,
+    gaussians_at,
     needs_two_devices,
     render,
     scene_of,
 )
+from pictures import assert_same
 
 import gsjax
 
 TILE = COMPAT.tile_size
+
+
+def scene_behind(layers: int, across: float = 1.0):
+    """Return COUNT Gaussians; the nearest ``layers`` are wide and opaque.
+
+    ``across`` is their σ in image widths; they stand in the left half of the view.
+    """
+    rng = np.random.default_rng(0)
+    points = frustum_points(rng, near=3.0)
+    scales = np.exp(rng.normal(-2, 0.5, (COUNT, 3)))
+    opacities = rng.uniform(0.1, 0.9, COUNT)
+    points[:layers] = [-0.25, 0.0, 1.0]
+    points[:layers, 2] += 0.01 * np.arange(layers)
+    scales[:layers] = across * WIDTH / 40
+    opacities[:layers] = 0.9999
+    return gaussians_at(points, scales, opacities)
+
+
+@pytest.mark.parametrize("preset", ["compat", "accurate"])  # both stop rules
+@pytest.mark.parametrize(
+    ("layers", "across"), [(0, 1.0), (8, 1.0), (40, 0.3), ("wall", None)]
+)
+def test_culling_behind_opaque_parts_changes_no_bit(preset, layers, across):
+    config = PRESETS[preset]
+    gaussians, camera = scene_of("wall")
+    if layers != "wall":
+        gaussians, camera = scene_behind(layers, across), camera_of()
+    with_it = render(gaussians, camera, config=config)
+    without = render(gaussians, camera, config=config.replace(occlusion=False))
+    assert not with_it.overflowed
+    assert_not_empty(with_it.alpha)
+    assert_same(with_it, without)
+    seen, whole = np.asarray(with_it.visible), np.asarray(without.visible)
+    assert not (seen & ~whole).any()
+    pairs = int(with_it.demand.pairs) / int(without.demand.pairs)
+    if layers == 0:
+        np.testing.assert_array_equal(seen, whole)
+        assert pairs == 1
+    if layers == 8:
+        assert seen.sum() < 0.9 * whole.sum()
+    assert pairs <= {8: 0.6, "wall": 0.4}.get(layers, 1)
+
+
+@pytest.mark.parametrize("value", [np.nan, 1e33])
+def test_gaussians_that_are_not_drawn_hide_nothing(value):
+    """Opaque, wide and in front, but with a colour that cannot be drawn."""
+    gaussians, camera, features = scene_behind(8), camera_of(), jnp.ones((COUNT, 2))
+    sh = gaussians.params.sh.at[:8, -1, 1].set(value)
+    spoilt = gaussians.replace(params=gaussians.params.replace(sh=sh))
+    config = PRESETS["compat"]
+    for scene, colors in ((spoilt, None), (gaussians, features.at[:8, 1].set(value))):
+        found = render(scene, camera, config, features=colors)
+        whole = render(scene, camera, config.replace(occlusion=False), features=colors)
+        assert_same(found, whole, (*ALL, "radii"))
+    good = render(gaussians, camera, config, features=features)
+    assert good.visible.sum() < 0.9 * whole.visible.sum()
 
 
 def masks() -> dict[str, np.ndarray]:
@@ -88,13 +152,14 @@ def test_no_pair_outside_of_the_mask():
         assert (name == "nothing") == (total == 0)
 
 
-def test_gradients_of_pixels_inside_are_those_of_the_whole(report):
-    scene, camera = scene_of("random")
+def test_gradients_do_not_depend_on_what_is_skipped(report):
+    scene, camera = scene_behind(8), camera_of()
     weights = np.random.default_rng(0).normal(size=(HEIGHT, WIDTH))
-    config = COMPAT.replace(outputs=("rgb", "depth"))
 
-    @jax.jit
-    def gradient(weight, mask):
+    @partial(jax.jit, static_argnames="occlusion")
+    def gradient(weight, mask, occlusion=False):
+        config = COMPAT.replace(outputs=("rgb", "depth"), occlusion=occlusion)
+
         def loss(params, viewmat):
             seen = camera.replace(viewmat=viewmat)
             view = gsjax.render(scene.replace(params=params), seen, config, mask=mask)
@@ -102,37 +167,15 @@ def test_gradients_of_pixels_inside_are_those_of_the_whole(report):
 
         return jax.grad(loss, (0, 1))(scene.params, camera.viewmat)
 
+    every = np.ones_like(weights)
+    culled, whole = (gradient(every, every > 0, occlusion=o) for o in (True, False))
+    for a, b in zip(jax.tree.leaves(culled[0]), jax.tree.leaves(whole[0])):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
     for name in ("disc", "around"):
         mask = masks()[name]
-        whole = gradient(weights * mask, jnp.ones_like(mask))
+        whole = gradient(weights * mask, every > 0)
         some = gradient(weights * mask, mask)
         for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(some), strict=True):
             error = float(jnp.abs(a - b).max() / jnp.abs(a).max())
             report(f"gradient with and without a mask, {name}", error, 1e-11)
             assert error < 1e-11
-
-
-def test_too_little_capacity_is_reported_and_regrown():
-    """With a hole in the mask, whose pairs are counted but not blended."""
-    scene, camera = scene_of("huge")
-    mask = masks()["around"]
-    wanted = render(scene, camera, COMPAT, BACKGROUND, mask=mask)
-    cramped = COMPAT.replace(pair_capacity=int(wanted.demand.capacity) - 1)
-    assert gsjax.render(scene, camera, cramped, BACKGROUND, mask=mask).overflowed
-    found = gsjax.render_exact(scene, camera, cramped, BACKGROUND, mask=mask)
-    assert not found.overflowed
-    np.testing.assert_array_equal(found.rgb[mask], wanted.rgb[mask])
-
-
-def test_a_mask_for_each_camera_of_a_batch():
-    scene, camera = scene_of("random")
-    cameras = jax.tree.map(lambda a: jnp.stack([a, a]), camera)
-    pair = np.stack([masks()["disc"], masks()["rows"]])
-    both = render(scene, cameras, COMPAT, BACKGROUND, mask=pair)
-    mapped = jax.vmap(lambda c, m: gsjax.render(scene, c, COMPAT, BACKGROUND, mask=m))
-    in_vmap = jax.jit(mapped)(cameras, pair)
-    for index, mask in enumerate(pair):
-        alone = render(scene, camera, COMPAT, BACKGROUND, mask=mask)
-        np.testing.assert_array_equal(both.rgb[index], alone.rgb)
-        np.testing.assert_allclose(in_vmap.rgb[index], alone.rgb, atol=1e-12)
-        assert int(in_vmap.demand.pairs[index]) == int(alone.demand.pairs)
