@@ -1,14 +1,14 @@
-"""The registry of file formats, and the arguments of `load` and `save`."""
+"""The registry of file formats, arguments of `load` and `save`, and camera files."""
 
 import os
 from pathlib import Path
 
-import jax
 import numpy as np
-import pytest
 from captures import rejects
+from conftest import camera_of
 
 import gsjax
+from gsjax.data.transforms import CameraEntry, load_transforms, transforms_json
 from gsjax.io.common import Format
 from gsjax.io.formats import FORMATS
 
@@ -38,29 +38,28 @@ MEANS = Format("means", (".npy", ".means"), load_means, save_means)
 WRITE_ONLY = Format("ply", (".ply",), None, save_means)
 
 
-@pytest.mark.parametrize("name", ["a.npy", "a.MEANS"])
-def test_a_format_from_outside(tmp_path, name):
-    formats, path = (*FORMATS, MEANS), tmp_path / name
-    gsjax.save(path, gsjax.grow(scene(), 9), formats=formats)
+def test_formats_from_outside(tmp_path):
+    """The last format of a suffix is used."""
+    formats, path = (*FORMATS, MEANS, WRITE_ONLY), tmp_path / "a.MEANS"
+    gsjax.save(path, scene(5), formats=formats)
+    gsjax.save(path, gsjax.grow(scene(), 9), formats=formats, overwrite=True)
     found = gsjax.load(path, formats=formats)
     np.testing.assert_array_equal(found.params.means, scene().params.means)
-    gsjax.save(path, scene(5), formats=formats, overwrite=True)
-    assert gsjax.load(path, formats=formats).capacity == 5
-    rejects(r"a suffix of \.ply, \.spz, got '\.n|M", gsjax.load, path)
-
-
-def test_the_last_format_of_a_suffix_is_used(tmp_path):
-    formats, path = (*FORMATS, WRITE_ONLY), tmp_path / "a.ply"
-    gsjax.save(path, scene(), formats=formats)
-    assert np.load(path).shape == (2, 3)
-    rejects(r"expected a suffix of \.spz, got", gsjax.load, path, formats=formats)
+    rejects(r"a suffix of \.ply, \.spz, got '\.M", gsjax.load, path)
+    ply = tmp_path / "a.ply"
+    gsjax.save(ply, scene(), formats=formats)
+    assert np.load(ply).shape == (2, 3)
+    expected = r"expected a suffix of \.means, \.npy, \.spz, got"
+    rejects(expected, gsjax.load, ply, formats=formats)
 
 
 def refusals(folder: Path):
     """(call, message) of what is refused before anything is read or written."""
     (folder / "folder.ply").mkdir()
     os.mkfifo(folder / "pipe.ply")
-    one = scene()
+    one, there = scene(), [folder / f"there{s}" for s in (".ply", ".spz", ".splat")]
+    for path in there:
+        path.touch()
     return [
         (lambda: gsjax.load(folder / "a.obj"), r"a\.obj: .*\.ply, \.spz, got '\.obj'"),
         (lambda: gsjax.load(folder / "a.splat"), r"a\.splat: .* of \.ply, \.spz, got"),
@@ -72,6 +71,9 @@ def refusals(folder: Path):
         (lambda: gsjax.save(folder / "a.ply", [one]), r"got list; .*gsjax.concatenate"),
         (lambda: gsjax.save(folder / "a.obj", one), r"of \.ply, \.splat, \.spz, got"),
         (lambda: gsjax.save(folder / "none/a.ply", one), r"none.* is missing; create"),
+        (lambda: gsjax.save(there[0], one), r"there\.ply: exists.*overwrite=True"),
+        (lambda: gsjax.save(there[1], one), r"there\.spz: exists.*overwrite=True"),
+        (lambda: gsjax.save(there[2], one), r"there\.splat: exists.*overwrite=True"),
         (
             lambda: gsjax.save(folder / "folder.ply", one, overwrite=True),
             r"folder\.ply: expected a file, got a folder",
@@ -80,14 +82,23 @@ def refusals(folder: Path):
 
 
 def test_refusals(tmp_path):
-    for call, message in refusals(tmp_path):
+    rows = refusals(tmp_path)
+    before = {path: path.stat() for path in tmp_path.iterdir()}
+    for call, message in rows:
         rejects(message, call)
-    names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == ["folder.ply", "pipe.ply"]
+    assert {path: path.stat() for path in tmp_path.iterdir()} == before
 
 
-def test_loaded_scenes_are_on_all_devices(tmp_path):
-    for suffix in (".ply", ".spz"):
-        gsjax.save(tmp_path / f"a{suffix}", scene())
-        for leaf in jax.tree.leaves(gsjax.load(tmp_path / f"a{suffix}")):
-            assert len(leaf.devices()) == jax.local_device_count()
+def test_camera_files_round_trip(tmp_path):
+    cameras = [camera_of(20, lens="pinhole"), camera_of(21, lens="orthographic")]
+    path = tmp_path / "cameras.json"
+    entries = [CameraEntry(f"c{i}", camera) for i, camera in enumerate(cameras)]
+    path.write_text(transforms_json(entries))
+    back = load_transforms(path)
+    assert [entry.name for entry in back] == ["c0", "c1"]
+    for entry, camera in zip(back, cameras):
+        assert (entry.camera.width, entry.camera.lens) == (camera.width, camera.lens)
+        np.testing.assert_array_equal(entry.camera.K, camera.K)
+        np.testing.assert_allclose(entry.camera.viewmat, camera.viewmat, atol=1e-6)
+    both = [CameraEntry("b", gsjax.stack_cameras([cameras[0]] * 2))]
+    rejects("expected a single camera", transforms_json, both)

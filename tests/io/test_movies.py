@@ -1,8 +1,7 @@
-"""Movies decode to the same frames at the same speed, and appear complete or not."""
+"""Movies decode to their frames and appear complete or not at all; depth pictures."""
 
-from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 from captures import rejects
 
 import gsjax
+from gsjax.io.images import depth_picture
 from gsjax.io.movies import encode_animation, played_rate, write_movie
 
 
@@ -23,9 +23,7 @@ def pictures(count=6, width=64, height=48):
 
 
 def animation_of(path):
-    done, found = cv2.imdecodeanimation(
-        np.frombuffer(path.read_bytes(), np.uint8)[None]
-    )
+    done, found = cv2.imreadanimation(str(path))
     assert done
     return [frame[..., 2::-1] for frame in found.frames], list(found.durations)
 
@@ -145,12 +143,17 @@ def test_a_truncated_video_is_refused(tmp_path, monkeypatch):
     """The encoder does not report a full disk."""
 
     def writer(path, *_):
-        release = partial(Path(path).write_bytes, b"\x1aE\xdf\xa3")
-        nothing = dict.fromkeys(["isOpened", "write"], lambda *_: True)
-        return SimpleNamespace(release=release, **nothing)
+        Path(path).write_bytes(b"\x1aE\xdf\xa3")
+        return Mock()
 
-    writer.fourcc = lambda *_: 0
-    monkeypatch.setattr(cv2, "VideoWriter", writer)
+    monkeypatch.setattr(cv2, "VideoWriter", Mock(side_effect=writer))
     with pytest.raises(gsjax.InputError, match="of 6 frames could be written"):
         write_movie(tmp_path / "a.webm", pictures())
     assert not list(tmp_path.iterdir())
+
+
+def test_depth_pictures_of_no_depth_and_of_a_plane():
+    assert not depth_picture(np.zeros((2, 3))).pixels.any()
+    flat = depth_picture(np.full((2, 3), 2.0))
+    assert (flat.pixels == 1).all()
+    assert (flat.near, flat.far) == (2, 2)

@@ -1,7 +1,7 @@
-"""Lines on a terminal, and Ctrl-C during a step."""
+"""Lines on a terminal, and handlers of Ctrl-C that are not replaced."""
 
 import signal
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -15,7 +15,7 @@ def _restore_handler():
     signal.signal(signal.SIGINT, before)
 
 
-def test_control_characters_are_escaped(capsys):
+def test_lines_have_no_control_characters_and_are_shortened_in_the_middle(capsys):
     codes = [*range(32), *range(127, 160), *range(0x202A, 0x202F)]
     text = "".join(map(chr, codes))
     escaped = escape_controls(f"a{text}é∞\u200d\tb\n")
@@ -25,9 +25,6 @@ def test_control_characters_are_escaped(capsys):
     assert one_line("a\x1b[31m\n b\r\x9b2J") == r"a\x1b[31m b \x9b2J"
     note("\x1b[2J")
     assert capsys.readouterr().err == "gsjax: \\x1b[2J\n"
-
-
-def test_long_lines_keep_both_ends():
     line = one_line(f"start {'x' * 10**6} end", 100)
     assert len(line) == 105
     assert line.startswith("start x")
@@ -35,40 +32,23 @@ def test_long_lines_keep_both_ends():
     assert one_line("x" * 100, 100) == "x" * 100
 
 
-def test_the_first_ctrl_c_sets_a_flag_and_the_second_interrupts(capsys):
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+def within() -> tuple:
+    """Return the flag and the handler of Ctrl-C while it is deferred."""
     with deferred_interrupt() as stopped:
-        assert not stopped()
-        signal.raise_signal(signal.SIGINT)
-        assert stopped()
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    assert "stopping after this step" in capsys.readouterr().err
+        return stopped(), signal.getsignal(signal.SIGINT)
 
 
-def test_ignored_and_foreign_handlers_stay(monkeypatch):
-    """A shell starts background processes with Ctrl-C ignored."""
+def test_handlers_of_others_stay(monkeypatch):
+    """Ctrl-C may be ignored, as shells do for background processes, or not Python's."""
+    ours = signal.default_int_handler
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with deferred_interrupt() as stopped:
-        signal.raise_signal(signal.SIGINT)
-        assert not stopped()
-    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    assert within() == (False, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, ours)
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(within).result() == (False, ours)
     with monkeypatch.context() as patched:
-        patched.setattr(signal, "getsignal", lambda _: None)  # not Python's
-        with deferred_interrupt() as stopped:
-            assert not stopped()
-    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-
-
-def test_other_threads_leave_the_handler_alone():
-    before, found = signal.getsignal(signal.SIGINT), []
-
-    def work():
-        with deferred_interrupt() as stopped:
-            found.append((stopped(), signal.getsignal(signal.SIGINT)))
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert found == [(False, before)]
+        patched.setattr(signal, "getsignal", lambda _: None)
+        assert within() == (False, None)
+    assert signal.getsignal(signal.SIGINT) is ours
+    assert within()[1] is not ours
+    assert signal.getsignal(signal.SIGINT) is ours

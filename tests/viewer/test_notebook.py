@@ -4,20 +4,20 @@ import base64
 import json
 import re
 from pathlib import Path
-from types import SimpleNamespace
+from unittest.mock import ANY, Mock
 
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import WIDTH, camera_of, scene_of
+from conftest import camera_of, scene_of
 
 import gsjax
 from gsjax.io.images import to_8_bit
 from gsjax.raster.types import Demand, Render
 from gsjax.viewer import notebook
-from gsjax.viewer.notebook import Picture, live, movie, picture, show
+from gsjax.viewer.notebook import live, movie, picture, show
 
 MAGENTA = (255, 0, 255)
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.py"))
@@ -45,8 +45,14 @@ def render_of(batch=(), overflowed=False, **images) -> Render:
 
 
 def test_one_picture_keeps_its_pixels(tmp_path):
+    """Those that are not finite are magenta."""
     image = random_picture()
     eight = to_8_bit(image)
+    spoilt = image.copy()
+    spoilt[3, 4, 1] = np.nan
+    wanted = eight.copy()
+    wanted[3, 4] = MAGENTA
+    np.testing.assert_array_equal(shown(picture(spoilt)), wanted)
     for value in (image, eight, picture(image), render_of(rgb=jnp.asarray(image))):
         np.testing.assert_array_equal(shown(picture(value)), eight)
     grey = shown(picture(image[..., 0]))
@@ -60,14 +66,6 @@ def test_one_picture_keeps_its_pixels(tmp_path):
     png, size = picture(image)._repr_png_()
     assert size == {"width": 240, "height": 180}, "displayed enlarged"
     assert pixels_of(png).shape == (12, 16, 3)
-
-
-def test_pixels_that_are_not_finite_are_magenta():
-    image = random_picture()
-    image[3, 4, 1] = np.nan
-    found = shown(picture(image))
-    assert tuple(found[3, 4]) == MAGENTA
-    assert (found != MAGENTA).any(axis=-1).sum() == 12 * 16 - 1
 
 
 @pytest.mark.parametrize("columns", [1, 2, None])
@@ -103,39 +101,32 @@ def test_refused_pictures(tmp_path):
             call()
 
 
-def test_all_images_of_a_render_are_displayed():
+def test_renders_and_gaussians_are_displayed():
+    """All images of a render, and a sketch of the colours of Gaussians."""
     image = random_picture()
     alone = shown(render_of(rgb=image))
     full = shown(render_of(rgb=image, alpha=image[..., 0], depth=1 + image[..., 0]))
     assert full.size >= 3 * alone.size
-    incomplete = shown(render_of(rgb=image, overflowed=True))
-    assert incomplete.shape != alone.shape, "an overflow is captioned"
     for channels in (1, 2, 5):
         features = np.full((6, 7, channels), 0.5)
         assert shown(render_of(rgb=features))[0, 0, 0] == 128
-
-
-def test_gaussians_are_displayed_as_a_sketch_of_their_colours():
     scene, _ = scene_of("random")
     found = shown(scene)
     assert len(np.unique(found.reshape(-1, 3), axis=0)) > 50
     assert len(scene._repr_png_()[0]) < 200_000
     empty = shown(gsjax.select(scene, jnp.zeros(scene.capacity, bool)))
-    bad = jax.tree.map(lambda a: a.at[::3].set(jnp.nan), scene.params)
     assert not np.array_equal(empty, found)
-    assert shown(scene.replace(params=bad)).size > 0
+    bad = jax.tree.map(lambda a: a.at[::3].set(jnp.nan), scene.params)
     batch = jax.tree.map(lambda a: jnp.stack([a, a]), scene)
-    assert shown(batch).size > 0
+    for other in (scene.replace(params=bad), batch):
+        assert shown(other).size > 0
 
 
 def test_a_camera_describes_its_pose():
-    viewmat = gsjax.look_at((1.0, -5.0, 2.0), (1.0, 0.0, 2.0))
-    text = camera_of(viewmat=viewmat)._repr_html_()
-    assert "at (1, -5, 2)" in text
-    assert "looking along (0.00, 1.00, 0.00)" in text
-    assert f"{WIDTH} × " in text
-    batch = gsjax.stack_cameras([camera_of(), camera_of(), camera_of()])
-    assert "3 cameras" in batch._repr_html_()
+    camera = camera_of(viewmat=gsjax.look_at((1.0, -5.0, 2.0), (1.0, 0.0, 2.0)))
+    text = camera._repr_html_()
+    assert "at (1, -5, 2); looking along (0.00, 1.00, 0.00)" in text
+    assert "3 cameras" in gsjax.stack_cameras([camera] * 3)._repr_html_()
 
 
 def test_nothing_is_drawn_without_values():
@@ -161,68 +152,54 @@ def test_nothing_is_drawn_without_values():
 
 
 @pytest.mark.parametrize("kind", ["webp", "gif", "webm"])
-def test_a_movie_decodes_to_its_frames(kind, tmp_path):
+def test_a_movie_is_embedded(kind, tmp_path):
     frames = np.stack([random_picture(24, 32, seed) for seed in range(5)])
     made = movie(frames, fps=10, kind=kind)
     found = re.search(rf'src="data:(\w+)/{kind};base64,([^"]+)"', made._repr_html_())
-    data = base64.b64decode(found[2])
     assert found[1] == ("video" if kind == "webm" else "image")
-    assert data == made.data
-    assert made.frames == 5
-    assert made.size == (224, 168)
-    if kind == "webm":
-        (tmp_path / "a.webm").write_bytes(data)
-        capture, count = cv2.VideoCapture(str(tmp_path / "a.webm")), 0
-        while capture.read()[0]:
-            count += 1
-    else:
-        _, animation = cv2.imdecodeanimation(np.frombuffer(data, np.uint8))
-        count = len(animation.frames)
-    assert count == 5
+    assert base64.b64decode(found[2]) == made.data
+    assert (made.frames, made.size) == (5, (224, 168))
+    path = tmp_path / f"a.{kind}"
+    path.write_bytes(made.data)
+    capture = cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)
+    assert (capture if kind == "webm" else cv2.imcount(str(path))) == 5
 
 
 def test_live_updates_one_display(monkeypatch):
-    first, updates, calls = [], [], []
-
-    def display(value, **options):
-        first.append((value, options))
-        return SimpleNamespace(update=updates.append)
-
-    def render_exact(gaussians, _, config, background):
-        assert background.shape == (3,)
-        calls.append((gaussians.name, config.visible_capacity, config.outputs))
-        return render_of(rgb=jnp.asarray(image), depth=jnp.ones((24, 32)))
-
     image = random_picture(24, 32)
-    monkeypatch.setattr(notebook, "_display", display)
-    monkeypatch.setattr(notebook, "render_exact", render_exact)
+    view = render_of(rgb=jnp.asarray(image), depth=jnp.ones((24, 32)))
     for photo in (None, to_8_bit(image)):
-        first.clear(), updates.clear(), calls.clear()
+        display, render_exact = Mock(), Mock(return_value=view)
+        monkeypatch.setattr(notebook, "_display", display)
+        monkeypatch.setattr(notebook, "render_exact", render_exact)
         hook = live("camera", photo, every=3, background=[0, 0, 1])
         for step in range(1, 8):
-            metrics = SimpleNamespace(step=step, psnr=20.0 + step, gaussians=7)
-            scene = SimpleNamespace(name=step, capacity=99)
-            hook(SimpleNamespace(gaussians=scene), SimpleNamespace(metrics=metrics))
-        assert calls == [(step, 99, ("rgb", "depth")) for step in (1, 3, 6)]
-        assert [options for _, options in first] == [{"display_id": True}]
-        assert len(updates) == 2
-        assert all(isinstance(one, Picture) for one in updates)
-        assert not np.array_equal(updates[0].pixels, updates[1].pixels)
+            metrics = Mock(step=step, psnr=20.0 + step, gaussians=7)
+            hook(Mock(**{"gaussians.capacity": 100 + step}), Mock(metrics=metrics))
+        drawn = [call.args for call in render_exact.call_args_list]
+        assert [scene.capacity for scene, *_ in drawn] == [101, 103, 106]
+        for scene, _, config, background in drawn:
+            assert config.visible_capacity == scene.capacity
+            assert config.outputs == ("rgb", "depth")
+            assert background.tolist() == [0, 0, 1]
+        display.assert_called_once_with(ANY, display_id=True)
+        updates = display.return_value.update.call_args_list
+        first, second = (call.args[0].pixels for call in updates)
+        assert not np.array_equal(first, second)
     assert show(image) is None
-    np.testing.assert_array_equal(first[-1][0].pixels, to_8_bit(image))
+    np.testing.assert_array_equal(display.call_args.args[0].pixels, to_8_bit(image))
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_both_files_of_a_notebook_agree(path):
+def test_both_files_of_a_notebook_agree():
+    """Their pictures were displayed without errors and are small."""
     jupytext = pytest.importorskip("jupytext")
-    written = [(c.cell_type, c.source) for c in jupytext.read(path).cells]
-    kept = json.loads(path.with_suffix(".ipynb").read_text(encoding="utf-8"))["cells"]
-    assert [(c["cell_type"], "".join(c["source"])) for c in kept] == written
-    outputs = [out for cell in kept for out in cell.get("outputs", ())]
-    assert any("image/png" in out.get("data", ()) for out in outputs)
-    assert all(out["output_type"] != "error" for out in outputs)
-
-
-def test_the_notebooks_are_small():
     assert len(NOTEBOOKS) >= 6
-    assert sum(p.with_suffix(".ipynb").stat().st_size for p in NOTEBOOKS) < 6e6
+    sizes = [path.with_suffix(".ipynb").stat().st_size for path in NOTEBOOKS]
+    assert sum(sizes) < 6e6
+    for path in NOTEBOOKS:
+        written = [(c.cell_type, c.source) for c in jupytext.read(path).cells]
+        kept = json.loads(path.with_suffix(".ipynb").read_bytes())["cells"]
+        assert [(c["cell_type"], "".join(c["source"])) for c in kept] == written
+        outputs = [out for cell in kept for out in cell.get("outputs", ())]
+        assert any("image/png" in out.get("data", ()) for out in outputs)
+        assert all(out["output_type"] != "error" for out in outputs)
