@@ -5,7 +5,6 @@ Gaussians and one image size, tests share jitted functions, and XLA optimises li
 """
 
 import gc
-import json
 import os
 import signal
 import subprocess
@@ -23,8 +22,6 @@ QUICK_FLAGS = (
     "--xla_cpu_use_fusion_emitters=false",
     "--xla_cpu_parallel_codegen_split_count=1",  # the other tests use the other cores
 )
-
-
 # Undo these flags for one program: `jax.jit(…, compiler_options=AS_USERS)`. Tests
 # marked as_users run in a process without them, for what rests on how kernels round.
 AS_USERS = {
@@ -33,28 +30,19 @@ AS_USERS = {
     "xla_llvm_disable_expensive_passes": False,
 }
 
-
-def _set_up_environment():
-    """Configure JAX for this process, the workers of xdist, and processes of tests."""
-    if "GSJAX_TESTS_CACHE" in os.environ:  # a worker
-        return None
-    folder = tempfile.TemporaryDirectory(prefix="gsjax-tests-")
-    flags = [
-        "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=131072"
-    ]
+# For this process, the workers of xdist, and processes of tests.
+if "GSJAX_TESTS_CACHE" not in os.environ:
+    _FOLDER = tempfile.TemporaryDirectory(prefix="gsjax-tests-")
+    flags = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=131072"
     if version("jaxlib").startswith("0.10."):  # XLA aborts at flags it does not know
-        flags += QUICK_FLAGS
+        flags = " ".join([flags, *QUICK_FLAGS])
     os.environ |= {
         "GSJAX_AUTO_SETUP": "0",
-        "GSJAX_TESTS_CACHE": folder.name,
-        "XDG_CACHE_HOME": folder.name,
-        "XLA_FLAGS": " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip(),
+        "GSJAX_TESTS_CACHE": _FOLDER.name,
+        "XDG_CACHE_HOME": _FOLDER.name,
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip(),
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
     }
-    return folder
-
-
-_FOLDER = _set_up_environment()
 
 import jax
 import jax.numpy as jnp
@@ -72,8 +60,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 import gsjax
 import gsjax.runtime.setup
-from gsjax import Gaussians, RasterConfig
-from gsjax.cameras.camera import Camera
+from gsjax import Camera, Gaussians, RasterConfig
 from gsjax.stress.scenes import gaussian_fields
 
 gc.set_threshold(200_000, 20, 50)  # tracing makes millions of objects, few in cycles
@@ -88,107 +75,72 @@ LIGHT = {"num_size_buckets": 1, "devices": 1, "pair_capacity": 8192, "occlusion"
 ALL = ("rgb", "alpha", "depth", "median_depth")
 COMPAT = RasterConfig.compat(**LIGHT, outputs=ALL)
 WHOLE = COMPAT.replace(occlusion=True)
-ACCURATE = RasterConfig.accurate(**LIGHT, outputs=ALL)
-FAST = RasterConfig.fast(**LIGHT, outputs=ALL)
 PRESETS = {
-    name: preset.replace(occlusion=True)
-    for name, preset in (("compat", COMPAT), ("accurate", ACCURATE), ("fast", FAST))
+    name: getattr(RasterConfig, name)(**{**LIGHT, "outputs": ALL, "occlusion": True})
+    for name in ("compat", "accurate", "fast")
 }
 
 COUNT, WIDTH, HEIGHT = 192, 45, 29
 BACKGROUND = np.array([0.2, 0.5, 0.9])
 
-# Linux gives a process 65 530 memory mappings, and every program takes a handful. XLA
-# crashes or hangs when they run out.
-_MAX_MAPPINGS = 30_000
-_MAX_MEMORY = 2e9  # bytes
+
+def run_python(*words: str, cwd=None, **changes: str):
+    """Run Python in a process of its own, with a changed environment."""
+    command = [sys.executable, *words]
+    env = os.environ | changes
+    return subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True)
 
 
+class _AsUsers(pytest.Item):
+    """The tests of a module that are marked as_users, in a process of their own."""
+
+    tests: list[str]
+
+    def runtest(self):
+        flags = [f for f in os.environ["XLA_FLAGS"].split() if f not in QUICK_FLAGS]
+        done = run_python(
+            *("-m", "pytest", "-n0", "-q", *self.tests),
+            cwd=self.config.rootpath,
+            GSJAX_TESTS_AS_USERS="1",
+            JAX_DISABLE_MOST_OPTIMIZATIONS="0",
+            PYTEST_XDIST_WORKER="",
+            PYTEST_XDIST_WORKER_COUNT="",
+            XLA_FLAGS=" ".join(flags),
+        )
+        if done.returncode:
+            pytest.fail(f"{done.stdout}\n{done.stderr[-3000:]}", pytrace=False)
+
+
+@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items):
     """Run the slowest modules first, lest one process waits for another at the end."""
-    slow = {x.path for x in items if x.get_closest_marker("long") or _marked(x)}
+    marked: dict[Path, list] = {}
+    for item in items:
+        if item.get_closest_marker("as_users"):
+            marked.setdefault(item.path, []).append(item)
+    slow = {x.path for x in items if x.get_closest_marker("long")} | set(marked)
+    if "GSJAX_TESTS_AS_USERS" not in os.environ:
+        for tests in marked.values():
+            whole = _AsUsers.from_parent(tests[0].parent, name="as_users")
+            whole.tests = [test.nodeid for test in tests]
+            items[items.index(tests[0])] = whole
+            items[:] = [item for item in items if item not in tests]
     paths = list(dict.fromkeys(item.path for item in items))
     items.sort(key=lambda item: (item.path not in slow, paths.index(item.path)))
 
 
-_OUTCOMES: dict[Path, dict] = {}  # of marked tests: by module, then by test
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_protocol(item):
-    """Run the tests of a module that are marked as_users in a process of their own."""
-    if not _marked(item) or "GSJAX_TESTS_OUTCOMES" in os.environ:
-        return None
-    if item.path not in _OUTCOMES:
-        tests = [x for x in item.session.items if x.path == item.path and _marked(x)]
-        names = [test.nodeid for test in tests]
-        _OUTCOMES[item.path] = _run_as_users(item.config.rootpath, names)
-    outcomes = _OUTCOMES[item.path]
-    failed = ("call", "failed", 0.0, outcomes[""])
-    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-    for when, outcome, duration, text in outcomes.get(item.nodeid, [failed]):
-        if outcome == "skipped":
-            text = (str(item.path), item.location[1], text)
-        report = pytest.TestReport(
-            item.nodeid, item.location, {}, outcome, text, when, (), duration
-        )
-        item.ihook.pytest_runtest_logreport(report=report)
-    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
-    return True
-
-
-def _marked(item) -> bool:
-    return item.get_closest_marker("as_users") is not None
-
-
-def _run_as_users(root: Path, tests: list[str]) -> dict:
-    """Run tests in a process; return their phases by name, and the output by ""."""
-    flags = os.environ["XLA_FLAGS"]
-    for flag in QUICK_FLAGS:
-        flags = flags.replace(flag, "")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "outcomes"
-        path.touch()
-        changes = {
-            "GSJAX_TESTS_OUTCOMES": str(path),
-            "JAX_DISABLE_MOST_OPTIMIZATIONS": "0",
-            "PYTEST_XDIST_WORKER": "",
-            "PYTEST_XDIST_WORKER_COUNT": "",
-            "XLA_FLAGS": flags,
-        }
-        done = subprocess.run(
-            [sys.executable, "-m", "pytest", "-n0", "-q", *tests],
-            cwd=root,
-            env=os.environ | changes,
-            capture_output=True,
-            text=True,
-        )
-        outcomes: dict = {"": f"{done.stdout[-3000:]}\n{done.stderr[-3000:]}"}
-        for line in path.read_text(encoding="utf-8").splitlines():
-            name, *phase = json.loads(line)
-            outcomes.setdefault(name, []).append(phase)
-    return outcomes
-
-
-def pytest_runtest_logreport(report):
-    """In the process of marked tests: write what its parent reports."""
-    if "GSJAX_TESTS_OUTCOMES" in os.environ:
-        text = report.longreprtext or None
-        if report.outcome == "skipped":
-            text = report.longrepr[-1]
-        phase = (report.nodeid, report.when, report.outcome, report.duration, text)
-        with open(os.environ["GSJAX_TESTS_OUTCOMES"], "a", encoding="utf-8") as file:
-            file.write(json.dumps(phase) + "\n")
-
-
 @pytest.fixture(autouse=True, scope="module")
 def _clear_programs():
+    """Free compiled programs beyond 2 GB or 30 000 memory mappings.
+
+    Linux gives a process 65 530 of these. XLA crashes or hangs when they run out.
+    """
     yield
-    mappings, sizes = Path("/proc/self/maps"), Path("/proc/self/statm")
-    if mappings.exists() and (
-        mappings.read_bytes().count(b"\n") > _MAX_MAPPINGS
-        or int(sizes.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > _MAX_MEMORY
-    ):
+    if not os.path.exists("/proc/self/maps"):
+        return
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    mappings = Path("/proc/self/maps").read_bytes().count(b"\n")
+    if mappings > 30_000 or pages * os.sysconf("SC_PAGE_SIZE") > 2e9:
         jax.clear_caches()
         gc.collect()
 
@@ -203,11 +155,10 @@ def float32():
 
 def as_compiled(config):
     """A `TrainConfig` without what no program of a step depends on."""
-    host = ("seed", "max_size", "levels", "prune_invisible", "every_eval")
-    begun = ("initial", "initial_count", "dense_count", "max_initial")
-    names = (*host, *begun, "every_checkpoint")
-    same = type(config)()
-    return config.replace(**{name: getattr(same, name) for name in names})
+    host = ("seed", "max_size", "levels", "prune_invisible")
+    host += ("initial", "initial_count", "dense_count", "max_initial")
+    host += ("every_eval", "every_checkpoint")
+    return config.replace(**{name: getattr(type(config)(), name) for name in host})
 
 
 @pytest.fixture(scope="module")
@@ -248,12 +199,7 @@ def in_a_process():
         path = os.pathsep.join(map(str, (folder, folder.parent)))
         changes = {"XLA_FLAGS": "" if option else default, "PYTHONPATH": path}
         changes |= {"GSJAX_TESTS_CACHE": "", "JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            env=os.environ | changes,
-            capture_output=True,
-            text=True,
-        )
+        done = run_python("-c", code, **changes)
         assert done.returncode == 0, done.stderr[-2000:]
         return done.stdout
 
@@ -278,23 +224,11 @@ def _reference(gaussians, camera, config, background, features):
     )
 
 
-def reference(
-    gaussians: Gaussians,
-    camera: Camera,
-    config: RasterConfig | None,
-    background=None,
-    features=None,
-) -> dict[str, jax.Array]:
+def reference(gaussians, camera, config, background=None, features=None) -> dict:
     """`gsjax.reference_render`, jitted, of scenes without inactive slots."""
     if config is not None:  # only these matter; the rest would compile it again
-        names = (
-            "alpha_min",
-            "alpha_max",
-            "transmittance_min",
-            "stop_rule",
-            "dilation",
-            "antialias",
-        )
+        names = ("alpha_min", "alpha_max", "transmittance_min", "stop_rule")
+        names += ("dilation", "antialias")
         config = RasterConfig(**{name: getattr(config, name) for name in names})
     return _reference(gaussians, camera, config, background, features)
 
@@ -304,14 +238,15 @@ def loss_and_gradients(gaussians: Gaussians, camera: Camera):
     """Of a loss over three outputs: (images, gradients of params and camera)."""
     rng = np.random.default_rng(2)
     weights = {n: rng.normal(size=(HEIGHT, WIDTH)) for n in ("rgb", "alpha", "depth")}
+    weights["rgb"] = weights["rgb"][..., None]
 
     def loss(params, camera):
         out = gsjax.render(gaussians.replace(params=params), camera, WHOLE)
-        weigh = cast(weights, out.rgb.dtype)
-        total = jnp.sum(out.rgb * weigh["rgb"][..., None])
-        for name in ("alpha", "depth"):
-            total += jnp.sum(getattr(out, name) * weigh[name])
-        return total, out
+        weighted = [
+            jnp.sum(getattr(out, name) * weight)
+            for name, weight in cast(weights, out.rgb.dtype).items()
+        ]
+        return sum(weighted), out
 
     grads, out = jax.grad(loss, (0, 1), has_aux=True)(gaussians.params, camera)
     return out, grads
@@ -409,18 +344,16 @@ def assert_not_empty(alpha, share=0.05):
     assert np.mean(np.asarray(alpha) > 0.02) > share
 
 
-# The catalogue: name → (Gaussians, camera). All have COUNT Gaussians and one size.
+# The catalogue: name → (seed, Gaussians, camera), of COUNT Gaussians and one size.
 
 
-def _random():
-    rng = np.random.default_rng(1)
+def _random(rng):
     scales = np.exp(rng.normal(-2.3, 0.9, (COUNT, 3)))
     return gaussians_at(frustum_points(rng), scales, rng.beta(0.6, 0.8, COUNT))
 
 
-def _needles(length):
+def _needles(rng, length):
     """Needles ``length`` px long, a hundredth of a pixel wide, half of them far out."""
-    rng = np.random.default_rng(2)
     points = frustum_points(rng)
     points[::2, :2] *= max(1, length / 200)
     long = length * points[:, 2] / 40 * rng.uniform(0.5, 1, COUNT)
@@ -428,26 +361,22 @@ def _needles(length):
     return gaussians_at(points, np.column_stack([thin, long, thin]), 0.3)
 
 
-def _huge():
-    rng = np.random.default_rng(3)
+def _huge(rng):
     return gaussians_at(frustum_points(rng), rng.uniform(20, 500, (COUNT, 1)), 0.05)
 
 
-def _tiny():
-    rng = np.random.default_rng(4)
+def _tiny(rng):
     scales = np.exp(rng.uniform(-40, -6, (COUNT, 3)))
     return gaussians_at(frustum_points(rng), scales, rng.uniform(0.1, 0.99, COUNT))
 
 
-def _fog():
-    rng = np.random.default_rng(5)
+def _fog(rng):
     scales = rng.uniform(0.5, 2, (COUNT, 3))
     return gaussians_at(frustum_points(rng), scales, rng.uniform(0.002, 0.03, COUNT))
 
 
-def _wall():
+def _wall(rng):
     """A wall between what stands in front of it and what it hides altogether."""
-    rng = np.random.default_rng(6)
     points = frustum_points(rng)
     order = np.argsort(points[:, 2])
     front, wall = order[:80], order[80:120]
@@ -461,47 +390,45 @@ def _wall():
     return gaussians_at(points, scales, opacities)
 
 
-def _equal_depths():
-    rng = np.random.default_rng(7)
+def _equal_depths(rng):
     points = frustum_points(rng)
     points[:, 2] = rng.choice([2.0, 3.0, 4.0], COUNT)
     scales = np.exp(rng.normal(-2, 0.5, (COUNT, 3)))
     return gaussians_at(points, scales, 0.4, viewmat=np.eye(4))
 
 
-def _around():
+def _around(rng):
     """All around the camera: behind it, beside it, and on either side of near."""
-    rng = np.random.default_rng(8)
     points = rng.normal(0, 2, (COUNT, 3))
     points[: COUNT // 4, 2] = rng.normal(0.01, 0.01, COUNT // 4)
     scales = np.exp(rng.normal(-2, 0.7, (COUNT, 3)))
     return gaussians_at(points, scales, rng.uniform(0.05, 0.9, COUNT))
 
 
-def _saturated():
-    scene = _random()
+def _saturated(rng):
+    scene = _random(rng)
     logits = np.resize(np.float32([9, 17, 40, 88, 120, 500]), COUNT)
     params = scene.params.replace(logit_opacities=jnp.asarray(logits, float))
     return scene.replace(params=params)
 
 
 SCENES = {
-    "random": (_random, {}),
-    "needles_10": (partial(_needles, 10.0), {}),
-    "needles_1000": (partial(_needles, 1e3), {}),
-    "needles_10000": (partial(_needles, 1e4), {}),
-    "huge": (_huge, {}),
-    "tiny": (_tiny, {}),
-    "fog": (_fog, {}),
-    "wall": (_wall, {}),
-    "equal_depths": (_equal_depths, {"viewmat": np.eye(4)}),
-    "around": (_around, {}),
-    "off_centre": (_random, {"centre": (-6.0, 33.0)}),
-    "saturated": (_saturated, {}),
+    "random": (1, _random, {}),
+    "needles_10": (2, partial(_needles, length=10.0), {}),
+    "needles_1000": (2, partial(_needles, length=1e3), {}),
+    "needles_10000": (2, partial(_needles, length=1e4), {}),
+    "huge": (3, _huge, {}),
+    "tiny": (4, _tiny, {}),
+    "fog": (5, _fog, {}),
+    "wall": (6, _wall, {}),
+    "equal_depths": (7, _equal_depths, {"viewmat": np.eye(4)}),
+    "around": (8, _around, {}),
+    "off_centre": (1, _random, {"centre": (-6.0, 33.0)}),
+    "saturated": (1, _saturated, {}),
 }
 
 
 def scene_of(kind: str) -> tuple[Gaussians, Camera]:
     """A scene of the catalogue with its camera, in float64."""
-    make, changes = SCENES[kind]
-    return make(), camera_of(**changes)
+    seed, make, changes = SCENES[kind]
+    return make(np.random.default_rng(seed)), camera_of(**changes)

@@ -19,14 +19,11 @@ from gsjax.data.nerf import load_nerf
 from gsjax.data.photos import load_photo
 from gsjax.data.transforms import load_transforms
 from gsjax.data.types import View
-from gsjax.init.gaussians import init_gaussians
 from gsjax.io.point_cloud import read_point_cloud
 from gsjax.runs.checkpoint import load_checkpoint, save_checkpoint
 from gsjax.runs.folder import RunSettings, load_settings, save_settings
 from gsjax.runs.info import describe_run
 from gsjax.runs.refined_cameras import load_cameras, save_cameras
-from gsjax.train.config import TrainConfig
-from gsjax.train.state import init_state
 
 SCENE = dataset_of_views(count=2, points=4)
 MODEL = ("cameras", "images", "points3D")
@@ -67,13 +64,13 @@ TEXT = ("ascii.ply", "cloud.ply", *(f"text/{name}.txt" for name in MODEL))
 def write_good_files(folder: Path) -> None:
     """A small good file of every format."""
     with jax.enable_x64(False):
-        gaussians = init_gaussians(SCENE, sh_degree=0)
+        gaussians = gsjax.init_gaussians(SCENE, sh_degree=0)
     gsjax.save(folder / "scene.ply", gaussians)
     gsjax.save(folder / "scene.spz", gaussians)
     (folder / "ascii.ply").write_bytes(as_ascii((folder / "scene.ply").read_bytes()))
     cloud = "ply\nformat ascii 1.0\nelement vertex 2\n"
-    cloud += "".join(f"property float {axis}\n" for axis in "xyz")
-    cloud += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    names = [*(f"float {axis}" for axis in "xyz"), "uchar red", "uchar green"]
+    cloud += "".join(f"property {name}\n" for name in [*names, "uchar blue"])
     cloud += "end_header\n0 0.5 1 9 8 7\n1 2 3 4 5 6\n"
     (folder / "cloud.ply").write_text(cloud)
     write_colmap(folder / "sparse/0", SCENE)
@@ -88,12 +85,13 @@ def write_good_files(folder: Path) -> None:
     for suffix in (".png", ".jpg", ".webp", ".tiff", ".bmp"):
         save_photo(folder / f"photo{suffix}", pixels)
     save_photo(folder / "mask.png", pixels[..., 0] // 128 * np.uint8(255))
-    state = init_state(gaussians, TrainConfig(sh_degree=0), 1.0, 2)
+    state = gsjax.init_state(gaussians, gsjax.TrainConfig(sh_degree=0), 1.0, 2)
     state = state.replace(step=state.step + 7)
     content = {"pair_capacity": 64, "seconds": 0.0}
     assert save_checkpoint(folder / "checkpoints", state, content) == folder / STEP
     save_settings(folder, RunSettings(dataset=folder))
-    (folder / "eval.json").write_text(json.dumps(EVAL))
+    scores = {"which": "test", "views": 2, "psnr": 30.5, "ssim": 0.9}
+    (folder / "eval.json").write_text(json.dumps(scores))
     save_cameras(folder / "cameras.json", SCENE)
 
 
@@ -152,4 +150,3 @@ TRANSFORMS = {
 }
 # Down, right, back; position; height, width, focal length; near and far.
 POSES = np.asarray([[0, 1, 0, 1, 24, 1, 0, 0, 2, 32, 0, 0, -1, 3, 40, 1, 9]] * 2, float)
-EVAL = {"which": "test", "views": 2, "psnr": 30.5, "ssim": 0.9}

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from captures import save_photo
 
-from gsjax.cameras.camera import look_at
+from gsjax import look_at
 from gsjax.data.colmap_writer import write_colmap
 from gsjax.data.types import Dataset, View
 
@@ -33,15 +33,18 @@ class Hostile:
     masked: tuple[int, ...] = ()
 
 
+def _matrix(focal: float, width=SIZE, height=SIZE) -> np.ndarray:
+    return np.asarray([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+
+
 def harmless() -> Hostile:
     """Return coloured points and photographs of noise, from which others are made."""
     rng = np.random.default_rng(3)
     views, photos = [], []
     for index in range(PHOTOS):
-        eye = (APART * (index - 2), -3, 0.5)
-        K = np.asarray([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]])
-        name = f"{index}.png"
-        views.append(View(name, Path(name), look_at(eye, (0, 0, 0)), K, SIZE, SIZE))
+        pose = look_at((APART * (index - 2), -3, 0.5), (0, 0, 0))
+        name, K = f"{index}.png", _matrix(30.0)
+        views.append(View(name, Path(name), pose, K, SIZE, SIZE))
         photos.append(rng.integers(0, 256, (SIZE, SIZE, 3)).astype(np.uint8))
     points = rng.uniform(-0.8, 0.8, (POINTS, 3))
     colors = rng.integers(0, 256, (POINTS, 3)).astype(np.uint8)
@@ -84,26 +87,17 @@ def _turned() -> Hostile:
     rng = np.random.default_rng(5)
 
     def turn(_, view):
-        rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-        rotation *= np.sign(np.linalg.det(rotation))
-        pose = np.column_stack([rotation, -rotation @ view.centre])
-        return replace(view, viewmat=np.vstack([pose, (0, 0, 0, 1)]))
+        ahead, up = rng.normal(size=(2, 3))
+        return replace(view, viewmat=look_at(view.centre, view.centre + ahead, up))
 
     return _with_views(turn)
 
 
 def _far() -> Hostile:
-    def move(_, view):
-        viewmat = view.viewmat.copy()
-        viewmat[:3, 3] -= viewmat[:3, :3] @ FAR
-        return replace(view, viewmat=viewmat)
-
-    return _with_points(harmless().dataset.points + FAR, _with_views(move))
-
-
-def _behind() -> Hostile:
-    rng = np.random.default_rng(7)
-    return _with_points(rng.uniform(-1, 1, (5000, 3)) - (0, 60, 0))
+    move = np.eye(4)
+    move[:3, 3] = -FAR
+    made = _with_views(lambda _, view: replace(view, viewmat=view.viewmat @ move))
+    return _with_points(harmless().dataset.points + FAR, made)
 
 
 def _inside() -> Hostile:
@@ -116,12 +110,8 @@ def _inside() -> Hostile:
 
 def _lenses() -> Hostile:
     """Return focal lengths from that of a fisheye to that of a telescope."""
-
-    def lens(index, view):
-        focal = (30.0, 0.02, 3e6)[index]
-        return replace(view, K=np.asarray([[focal, 0, 16], [0, focal, 16], [0, 0, 1]]))
-
-    return _with_views(lens)
+    lenses = [_matrix(focal) for focal in (30.0, 0.02, 3e6)]
+    return _with_views(lambda index, view: replace(view, K=lenses[index]))
 
 
 def _slivers() -> Hostile:
@@ -130,8 +120,7 @@ def _slivers() -> Hostile:
 
     def cut(index, view):
         width, height = sizes[index]
-        K = np.asarray([[30.0, 0, width / 2], [0, 30, height / 2], [0, 0, 1]])
-        return replace(view, K=K, width=width, height=height)
+        return replace(view, K=_matrix(30.0, *sizes[index]), width=width, height=height)
 
     made = _with_views(cut)
     photos = zip(made.photos, sizes)
@@ -150,7 +139,7 @@ HOSTILE: dict[str, Callable[[], Hostile]] = {
     "points in one place": lambda: _with_points(np.zeros((POINTS, 3))),
     "points in a line": lambda: _with_points(np.eye(3)[0] * np.c_[-20:20] / 20),
     "ten thousand km away": _far,
-    "all behind the cameras": _behind,
+    "all behind the cameras": lambda: _with_points(np.full((5000, 3), (0, -60, 0.1))),
     "cameras in the cloud": _inside,
     "a photograph masked": lambda: replace(harmless(), masked=(1,)),
     "all masked": lambda: replace(harmless(), masked=(0, 1, 2)),

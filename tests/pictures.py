@@ -24,13 +24,8 @@ def assert_same(first, second, names=ALL):
 
 
 def largest_difference(first, second):
-    return max(
-        np.max(
-            np.abs(getattr(first, name) - getattr(second, name))
-            / np.maximum(1, np.abs(getattr(first, name)))
-        )
-        for name in ("rgb", "alpha", "depth")
-    )
+    pairs = [(getattr(first, n), getattr(second, n)) for n in ("rgb", "alpha", "depth")]
+    return max(np.max(np.abs(a - b) / np.maximum(1, np.abs(a))) for a, b in pairs)
 
 
 def errors_of(out, wanted, band):

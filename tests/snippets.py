@@ -6,6 +6,7 @@ as a program, this file runs the given pages in one process, so that they share 
 compiled.
 """
 
+import contextlib
 import os
 import re
 import shlex
@@ -37,55 +38,36 @@ def program(text: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def typed(text: str) -> list[list[str]]:
-    """Return the words of every command in ```sh blocks."""
-    found = []
-    for _, code in blocks(text, "sh"):
-        for line in code.replace("\\\n", " ").splitlines():
-            parts = re.split(r"&&|\||;", line)
-            found += [shlex.split(part, comments=True) for part in parts]
-    return [words for words in found if words]
-
-
 def commands(text: str) -> list[list[str]]:
     """Return the arguments of every ``gsjax …`` in ```sh blocks."""
-    return [words[1:] for words in typed(text) if words[0] == "gsjax"]
+    found = []
+    for _, code in blocks(text, "sh"):
+        for line in re.split(r"\n|&&|\||;", code.replace("\\\n", " ")):
+            words = shlex.split(line, comments=True)
+            if words[:1] == ["gsjax"]:
+                found.append(words[1:])
+    return found
 
 
-def mentions(text: str) -> list[list[str]]:
-    """Return the arguments of every `gsjax …` in the text; they may be incomplete."""
-    spans = re.findall(r"`(gsjax [^`]*)`", _BLOCK.sub("", text))
-    return [shlex.split(span)[1:] for span in spans]
+def spans(text: str) -> list[str]:
+    """Return the code spans of the text outside of blocks."""
+    return re.findall(r"`([^`]*)`", _BLOCK.sub("", text))
 
 
-def bare_options(text: str) -> list[str]:
-    """Return every ``--option`` in a code span that begins with one."""
-    spans = re.findall(r"`(-[^`]*)`", _BLOCK.sub("", text))
-    return [option for span in spans for option in re.findall(r"--[a-z][\w-]*", span)]
-
-
-def run_pages(paths: list[Path], *, claims: str = "", cwd: Path) -> str:
-    """Run pages in a process of their own; return the error, or "".
-
-    Args:
-      paths: the pages.
-      claims: Python to run after each page.
-      cwd: the working directory.
-    """
+def run_pages(paths: list[Path], cwd: Path) -> str:
+    """Run pages in a process of their own; return the error, or ""."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "JAX_ENABLE_X64": "0"}
     done = subprocess.run(
         [sys.executable, "-W", "error::UserWarning", __file__, *map(str, paths)],
         cwd=cwd,
         env=environment,
-        input=claims,
         capture_output=True,
         text=True,
     )
     return done.stderr if done.returncode else ""
 
 
-def _run(path: Path, claims: str) -> None:
-    """Run a page, then the claims."""
+def _run(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     lines = text.splitlines()
 
@@ -102,7 +84,6 @@ def _run(path: Path, claims: str) -> None:
 
     names = {"print": check, "__name__": "__main__"}
     exec(compile(program(text), str(path), "exec"), names)
-    exec(compile(claims, "claims", "exec"), names)
     for _, code in blocks(text, "python", marked="no-run"):
         compile(code, str(path), "exec")
 
@@ -111,17 +92,13 @@ def main() -> None:
     """Run the pages of the command line, each in a folder of its own."""
     import gsjax
 
-    claims = sys.stdin.read()
     if len(sys.argv) > 2:
         # Several pages queue calls for several devices, for which XLA's collectives
         # may wait too long on a busy machine.
         gsjax.use_all_cores = lambda *_, **__: 1
-    for name in sys.argv[1:]:
-        here = Path.cwd()
-        with tempfile.TemporaryDirectory() as folder:
-            os.chdir(folder)
-            _run(here / name, claims)
-            os.chdir(here)
+    for path in [Path(name).resolve() for name in sys.argv[1:]]:
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            _run(path)
 
 
 if __name__ == "__main__":

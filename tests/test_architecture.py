@@ -3,17 +3,18 @@
 import ast
 import inspect
 import re
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
-from conftest import LIGHT, camera_of, frustum_points, gaussians_at
+from conftest import ALL, LIGHT, camera_of, frustum_points, gaussians_at, run_python
 
 import gsjax
 from gsjax import RasterConfig
@@ -54,6 +55,12 @@ def trees() -> list[tuple[Path, ast.AST]]:
     return [(path, ast.parse(text)) for path, text in sources("gsjax").items()]
 
 
+def nodes(*kinds: type) -> Iterator[tuple[Path, Any]]:
+    """Yield the nodes of these kinds in the package."""
+    for path, tree in trees():
+        yield from ((path, n) for n in ast.walk(tree) if isinstance(n, kinds))
+
+
 def module_name(path: Path) -> str:
     return ".".join(part for part in path.with_suffix("").parts if part != "__init__")
 
@@ -65,17 +72,13 @@ def imports() -> set[tuple[str, str]]:
     The public names in `gsjax` itself are left out: they are imported lazily.
     """
     found = set()
-    for path, tree in trees():
-        importer = module_name(path)
-        for node in ast.walk(tree) if importer != "gsjax" else ():
-            targets = []
-            if isinstance(node, ast.ImportFrom) and node.module:
-                inner = [f"{node.module}.{alias.name}" for alias in node.names]
-                targets = [name if is_module(name) else node.module for name in inner]
-            elif isinstance(node, ast.Import):
-                targets = [alias.name for alias in node.names]
-            found |= {(importer, t) for t in targets if t.startswith("gsjax.")}
-    return found
+    for path, node in nodes(ast.Import, ast.ImportFrom):
+        names = [alias.name for alias in node.names]
+        if isinstance(node, ast.ImportFrom):
+            inner = [f"{node.module}.{name}" for name in names]
+            names = [name if is_module(name) else str(node.module) for name in inner]
+        found |= {(module_name(path), n) for n in names if n.startswith("gsjax.")}
+    return {pair for pair in found if pair[0] != "gsjax"}
 
 
 def is_module(name: str) -> bool:
@@ -83,55 +86,36 @@ def is_module(name: str) -> bool:
     return path.is_dir() or path.with_suffix(".py").exists()
 
 
-def package_of(module: str) -> str:
-    return module.split(".")[1]
-
-
-def test_packages():
+def test_imports_run_downward():
     entries = {path.stem for path in PACKAGE.iterdir() if path.name != "__pycache__"}
     assert entries == set(FLOOR)
     assert len(entries) <= 22
-
-
-def test_imports_run_downward():
-    pairs = {(a, b) for a, b in imports() if package_of(a) != package_of(b)}
+    found = [(a, b, a.split(".")[1], b.split(".")[1]) for a, b in imports()]
+    pairs = [(a, b, FLOOR[of], FLOOR[to]) for a, b, of, to in found if of != to]
     assert len(pairs) > 100
-    upward = [(a, b) for a, b in pairs if FLOOR[package_of(a)] <= FLOOR[package_of(b)]]
-    assert not upward
+    assert not [pair for pair in pairs if pair[2] <= pair[3]]
 
 
 def test_no_circular_imports():
     graph: dict[str, set[str]] = {}
     for importer, imported in imports():
         graph.setdefault(importer, set()).add(imported)
-    done, path = set(), []
-
-    def visit(module):
-        assert module not in path, f"circle: {[*path, module]}"
-        if module not in done:
-            path.append(module)
-            for other in graph.get(module, ()):
-                visit(other)
-            path.pop()
-            done.add(module)
-
-    for module in list(graph):
-        visit(module)
-    assert len(done) > 100
+    order = TopologicalSorter(graph).static_order()  # raises if there is a circle
+    assert len(list(order)) > 100
 
 
-@pytest.mark.parametrize(
-    ("folder", "hidden"),
-    [
-        ("raster.lists", "raster.primitives raster.compositing gaussians cameras"),
-        ("raster.compositing", "raster.primitives gaussians cameras"),
-    ],
-)
-def test_lists_see_footprints_and_compositing_sees_splats(folder, hidden):
-    prefixes = tuple(f"gsjax.{name}" for name in hidden.split())
-    seen = [(a, b) for a, b in imports() if a.startswith(f"gsjax.{folder}")]
-    assert seen
-    assert not [pair for pair in seen if pair[1].startswith(prefixes)]
+def seen_by(package: str) -> set[str]:
+    """Return the modules that those of a package import."""
+    found = {b for a, b in imports() if a.startswith(f"gsjax.{package}")}
+    assert found
+    return found
+
+
+def test_lists_see_footprints_and_compositing_sees_splats():
+    hidden = ("gsjax.raster.primitives", "gsjax.gaussians", "gsjax.cameras")
+    seen = seen_by("raster.lists")
+    assert not [b for b in seen if b.startswith((*hidden, "gsjax.raster.compositing"))]
+    assert not [b for b in seen_by("raster.compositing") if b.startswith(hidden)]
 
 
 def test_one_module_asks_for_the_backend():
@@ -145,18 +129,11 @@ def test_no_private_jax():
     assert not [path for path, text in files.items() if private in text]
 
 
-def docstrings() -> Iterator[tuple[str, str]]:
-    """Yield where each docstring is, and its text."""
-    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    for path, tree in trees():
-        for node in ast.walk(tree):
-            if isinstance(node, kinds) and (text := ast.get_docstring(node)):
-                yield f"{path}:{getattr(node, 'lineno', 1)}", text
-
-
 def test_docstrings_begin_with_a_verb_or_a_noun():
     begins = re.compile(r"(What|Of|Whose|Whether|Where|How)\b")
-    assert not [place for place, text in docstrings() if begins.match(text)]
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    texts = [(path, ast.get_docstring(node) or "") for path, node in nodes(*kinds)]
+    assert not [found for found in texts if begins.match(found[1])]
 
 
 def test_nothing_is_wanted():
@@ -171,13 +148,6 @@ def test_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 170
 
 
-def functions() -> Iterator[tuple[str, ast.FunctionDef]]:
-    for path, tree in trees():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.FunctionDef):
-                yield f"{module_name(path)}.{node.name}", node
-
-
 # Each extension point of `fit` is an argument, passed by keyword.
 MANY_PARAMETERS = {"gsjax.train.loop.fit"}
 # The nested loops of one kernel share their values.
@@ -187,45 +157,34 @@ LONG = {
 }
 
 
-def test_functions_take_few_parameters():
-    def count(node):
-        arguments = node.args
-        return len(arguments.posonlyargs + arguments.args + arguments.kwonlyargs)
-
-    many = {name for name, node in functions() if count(node) > 8}
-    assert many <= MANY_PARAMETERS
-
-
-def test_functions_are_short():
+def test_functions_are_short_and_take_few_parameters():
     """At most 65 lines of code; docstrings and decorators do not count."""
-
-    def lines(node):
+    many, long = set(), set()
+    for path, node in nodes(ast.FunctionDef):
+        name, given = f"{module_name(path)}.{node.name}", node.args
+        if len(given.posonlyargs + given.args + given.kwonlyargs) > 8:
+            many.add(name)
         body = node.body[ast.get_docstring(node) is not None :] or node.body
-        return (node.end_lineno or 0) - body[0].lineno + 1
-
-    assert {name for name, node in functions() if lines(node) > 65} <= LONG
+        if (node.end_lineno or 0) - body[0].lineno + 1 > 65:
+            long.add(name)
+    assert many <= MANY_PARAMETERS
+    assert long <= LONG
 
 
 def test_the_rasteriser_has_few_doors():
     doors = {"render", "exact", "types", "reference", "memory_estimate"}
     doors |= {"argument_checks", "tile_render"}  # messages; `device_count`
     inside = ("gsjax.raster", "gsjax.stress")  # the latter examines every stage
-    outside = {
-        b
-        for a, b in imports()
-        if b.startswith("gsjax.raster.") and not a.startswith(inside)
-    }
-    assert outside
-    assert outside <= {f"gsjax.raster.{name}" for name in doors}
+    used = {b for a, b in imports() if not a.startswith(inside)}
+    used = {name for name in used if name.startswith("gsjax.raster.")}
+    assert used
+    assert used <= {f"gsjax.raster.{name}" for name in doors}
 
 
 def test_importing_is_light():
     heavy = ("jax", "numpy", "cv2", "pycolmap", "tyro", "scipy", "matplotlib", "viser")
     code = f"import gsjax, sys; print([m for m in {heavy} if m in sys.modules])"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == "[]"
+    assert run_python("-c", code).stdout.strip() == "[]"
 
 
 def test_imports_are_declared():
@@ -237,13 +196,9 @@ def test_imports_are_declared():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     lines = [*project["dependencies"], *project["optional-dependencies"]["viewer"]]
     declared = {re.split("[^A-Za-z0-9_-]", line)[0] for line in lines}
-    found = set()
-    for _, tree in trees():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Import):
-                found |= {alias.name.split(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                found.add(node.module.split(".")[0])
+    found = {str(node.module).split(".")[0] for _, node in nodes(ast.ImportFrom)}
+    for _, node in nodes(ast.Import):
+        found |= {alias.name.split(".")[0] for alias in node.names}
     found -= {*sys.stdlib_module_names, "gsjax", *brought}
     assert {packages.get(name, name) for name in found} == declared
 
@@ -269,31 +224,31 @@ def test_public_names_are_loaded_on_use():
         _ = gsjax.rend
 
 
+def sixteen(degree=3):
+    points = frustum_points(np.random.default_rng(0), 16)
+    return gaussians_at(points, 0.1, 0.5, degree=degree)
+
+
 def traced(degree: int, outputs) -> str:
-    scene = gaussians_at(
-        frustum_points(np.random.default_rng(0), 16), 0.1, 0.5, degree=degree
-    )
     config = RasterConfig(**LIGHT, outputs=outputs)
     render = jax.make_jaxpr(lambda g, c: gsjax.render(g, c, config))
-    return str(render(scene, camera_of()))
+    return str(render(sixteen(degree), camera_of()))
 
 
 def test_static_choices_cost_nothing_when_not_taken():
     """Neither higher harmonics nor unused outputs are part of a program."""
     basis = "0.4886025"  # the constant of degree 1
-    everything = ("rgb", "alpha", "depth", "median_depth")
-    whole = traced(0, everything)
+    whole = traced(0, ALL)
     assert basis in traced(1, ("rgb",))
     assert basis not in whole
     for left_out in ("rgb", "depth", "median_depth"):
-        fewer = tuple(name for name in everything if name != left_out)
+        fewer = tuple(name for name in ALL if name != left_out)
         assert len(traced(0, fewer)) < len(whole)
 
 
 def test_another_camera_does_not_recompile():
-    scene = gaussians_at(frustum_points(np.random.default_rng(0), 16), 0.1, 0.5)
     config = RasterConfig(**LIGHT, outputs=("alpha",))
     render = jax.jit(lambda scene, camera: gsjax.render(scene, camera, config))
     for eye in ((0, 0, -3), (1, 2, 3), (5, 0, 0)):
-        render(scene, camera_of(viewmat=gsjax.look_at(eye, (0, 0, 0))))
+        render(sixteen(), camera_of(viewmat=gsjax.look_at(eye, (0, 0, 0))))
     assert render._cache_size() == 1

@@ -1,4 +1,4 @@
-"""Laws of the containers: Gaussians in slots, and cameras."""
+"""Gaussians in slots, and cameras, as values: laws, and which arguments are refused."""
 
 import jax
 import jax.numpy as jnp
@@ -9,13 +9,24 @@ from conftest import camera_of, gaussians_at
 import gsjax
 from gsjax import InputError
 from gsjax.cameras.camera import camera_centre
-from gsjax.cameras.lenses import PINHOLE
 
 
 def some(count=5, degree=1, seed=0):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(count, 3)) + [0, 0, 4]
     return gaussians_at(points, 0.1, 0.5, seed=seed, degree=degree)
+
+
+def three(**changes) -> gsjax.Gaussians:
+    """Return three Gaussians in five slots."""
+    fields = {
+        "means": np.arange(9.0).reshape(3, 3),
+        "quats": np.tile([1.0, 0, 0, 0], (3, 1)),
+        "log_scales": np.full((3, 3), -1.0),
+        "logit_opacities": np.zeros(3),
+        "sh": np.zeros((3, 4, 3)),
+    }
+    return gsjax.make_gaussians(**{**fields, "capacity": 5, **changes})
 
 
 def active_rows(gaussians):
@@ -28,31 +39,22 @@ def assert_same_rows(one, other):
         np.testing.assert_array_equal(a, b)
 
 
-def test_fifty_nine_numbers():
-    params = some(1, degree=3).params
-    assert sum(leaf.size for leaf in jax.tree.leaves(params)) == 59
-
-
-def test_growing_keeps_and_adds_inactive_finite_slots():
-    grown = gsjax.grow(some(5), 9)
-    assert grown.capacity == 9
-    assert int(gsjax.num_active(grown)) == 5
-    assert_same_rows(grown, some(5))
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grown.params))
-    assert gsjax.make_gaussians(**vars(some(5).params), capacity=9).capacity == 9
-
-
-def test_compact_reverses_select_and_grow():
+def test_growing_selecting_and_compacting_keep_the_active_rows():
     scene = gsjax.grow(some(6), 11)
+    assert scene.capacity == 11
+    assert int(gsjax.num_active(scene)) == 6
+    assert_same_rows(scene, some(6))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(scene.params))
+    assert gsjax.make_gaussians(**vars(some(5).params), capacity=9).capacity == 9
     keep = np.array([1, 0, 1, 1, 0, 1] + [1] * 5, bool)
     picked = gsjax.select(scene, jnp.asarray(keep))  # activates no empty slot
     packed = gsjax.compact(picked, 4)
     assert packed.capacity == 4
     assert bool(packed.active.all())
-    assert_same_rows(packed, picked)
-    assert gsjax.compact(picked, 20).capacity == 20
     jitted = jax.jit(gsjax.compact, static_argnums=1)(picked, 7)
-    assert_same_rows(jitted, picked)
+    for one in (picked, packed, jitted, gsjax.compact(picked, 20)):
+        for found, wanted in zip(active_rows(one), active_rows(some(6)), strict=True):
+            np.testing.assert_array_equal(found, wanted[keep[:6]])
     with pytest.raises(InputError, match="expected at least 4"):
         gsjax.compact(picked, 3)
 
@@ -68,11 +70,10 @@ def test_concatenate_keeps_both():
 
 
 def test_degree_up_and_down_is_the_identity():
-    scene = some(degree=1)
-    raised = gsjax.with_sh_degree(scene, 3)
+    raised = gsjax.with_sh_degree(some(degree=1), 3)
     assert raised.sh_degree == 3
-    assert float(jnp.abs(raised.params.sh[:, 4:]).max()) == 0
-    assert_same_rows(gsjax.with_sh_degree(raised, 1), scene)
+    assert not raised.params.sh[:, 4:].any()
+    assert_same_rows(gsjax.with_sh_degree(raised, 1), some(degree=1))
 
 
 def test_capacity_buckets():
@@ -89,23 +90,117 @@ def test_capacity_buckets():
             gsjax.capacity_bucket(100, minimum)
 
 
-def project_directions(camera, directions):
-    """Return image coordinates in units of the image of directions [N, 3]."""
-    u, v = camera.project(tuple(directions.T))
-    return np.stack([u / camera.width, v / camera.height], -1)
+def test_opacities_may_be_a_column_and_scenes_empty():
+    column = three(logit_opacities=np.arange(3.0)[:, None], capacity=None)
+    np.testing.assert_array_equal(column.params.logit_opacities, np.arange(3.0))
+    empty = {name: array[:0] for name, array in vars(column.params).items()}
+    none = gsjax.make_gaussians(**empty)
+    assert none.capacity == 1
+    assert gsjax.num_active(none) == 0
+
+
+def test_a_repr_is_short_and_computes_nothing_under_tracing():
+    one = three()
+    dtype = one.params.means.dtype
+    assert repr(one) == f"Gaussians(active=3/5, sh_degree=1, {dtype})"
+    batch = jax.tree.map(lambda a: jnp.stack([a, a]), one)
+    assert repr(batch) == f"Gaussians(batch=(2,), active=6/10, sh_degree=1, {dtype})"
+    seen = [repr(jax.eval_shape(lambda x: x, one))]
+
+    def look(gaussians):
+        seen.append(repr(gaussians))
+        return gaussians.params.means
+
+    assert len(jax.make_jaxpr(look)(one).eqns) == 0
+    jax.vmap(look)(jax.tree.map(lambda a: a[None], one))
+    for leaf in (None, 0, "x", object()):  # not arrays
+        odd = jax.tree.map(lambda _, leaf=leaf: leaf, one)
+        assert repr(odd).startswith("Gaussians(params=")
+    jax.tree.map(lambda a: a.delete(), one)
+    assert {*seen, repr(one)} == {f"Gaussians(capacity=5, sh_degree=1, {dtype})"}
+
+
+def test_arrays_are_placed_where_results_are():
+    """On all devices, or on the one that is chosen."""
+    count, first = jax.local_device_count(), jax.local_devices()[0]
+    assert all(len(a.devices()) == count for a in jax.tree.leaves(three()))
+    with jax.default_device(first):
+        assert all(a.devices() == {first} for a in jax.tree.leaves(three()))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda g: [g, g], "list; merge them with gsjax.concatenate"),
+        (lambda g: vars(g.params), r"dict; call gsjax.make_gaussians\(\*\*fields\)"),
+        (lambda g: g.params, r"GaussianParams; call gsjax.Gaussians\("),
+        (lambda _: "a.ply", r"str; call gsjax.load\(path\)"),
+        (lambda _: 3, "int; make them with gsjax.make_gaussians"),
+    ],
+)
+def test_other_types_are_named(make, message):
+    wrong = make(three())
+    for call in (
+        gsjax.num_active,
+        gsjax.compact,
+        lambda g: gsjax.grow(g, 9),
+        lambda g: gsjax.select(g, np.ones(5, bool)),
+        lambda g: gsjax.with_sh_degree(g, 2),
+        lambda g: gsjax.concatenate(three(), g),
+    ):
+        with pytest.raises(InputError, match=f"expected Gaussians, got {message}"):
+            call(wrong)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "named"),
+    [
+        ("means", np.zeros((3, 2)), "means"),
+        ("means", np.zeros(3), "means"),
+        ("means", np.zeros((4, 3)), "quats"),  # the others are one short
+        ("means", np.zeros((3, 3), complex), "means"),
+        ("quats", np.zeros((3, 3)), "quats"),
+        ("log_scales", np.zeros((3, 1)), "log_scales"),
+        ("logit_opacities", np.zeros((3, 2)), "logit_opacities"),
+        ("sh", np.zeros((3, 3)), "sh"),
+        ("sh", np.zeros((2, 1, 3)), "sh"),
+        ("sh", np.zeros((3, 5, 3)), "5"),
+        *(("capacity", v, "capacity") for v in (2, 100.5, "100", True)),
+    ],
+    ids=str,
+)
+def test_gaussians_are_checked(name, value, named):
+    with pytest.raises(InputError, match=named):
+        three(**{name: value})
+
+
+def test_slots_are_checked():
+    gaussians = three()
+    unseen = gsjax.select(gaussians, np.zeros(5, bool))
+    wrong = [
+        *(("keep", gsjax.select, k) for k in (np.ones((5, 1), bool), np.ones(1, bool))),
+        ("keep", gsjax.select, np.ones(5, int)),
+        *(("0 to 4", gsjax.with_sh_degree, degree) for degree in (-1, 5)),
+        *(("capacity", gsjax.compact, size) for size in (0, -1, 100.5)),
+        *(("capacity", gsjax.grow, size) for size in (0, -1, 100.5)),
+    ]
+    for named, change, value in wrong:
+        with pytest.raises(InputError, match=named):
+            change(unseen, value)
+    assert gsjax.compact(unseen, 1).capacity == 1
+    assert gsjax.grow(gaussians, np.int64(6)).capacity == 6
 
 
 def test_resizing_keeps_directions():
-    rng = np.random.default_rng(0)
-    directions = rng.normal(size=(20, 3)) * 0.2 + [0, 0, 1]
+    directions = np.random.default_rng(0).normal(size=(20, 3)) * 0.2 + [0, 0, 1]
     camera = camera_of()
     smaller = gsjax.resize_camera(camera, 20, 33)
     assert (smaller.width, smaller.height) == (20, 33)
-    np.testing.assert_allclose(
-        project_directions(smaller, directions),
-        project_directions(camera, directions),
-        rtol=1e-12,
+    found, wanted = (
+        np.divide(one.project(tuple(directions.T)), [[one.width], [one.height]])
+        for one in (smaller, camera)
     )
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (1, 2, 3)])
@@ -124,12 +219,8 @@ def test_look_at(up):
 def test_stacked_cameras_have_a_leading_axis():
     cameras = [camera_of(viewmat=gsjax.look_at((i, 1, 2), (0, 0, 0))) for i in range(3)]
     batch = gsjax.stack_cameras(cameras)
-    assert batch.batched
-    assert batch.viewmat.shape == (3, 4, 4)
-    np.testing.assert_array_equal(batch.viewmat[1], cameras[1].viewmat)
-    assert batch.lens is PINHOLE
-    with pytest.raises(InputError, match="one size and lens"):
-        gsjax.stack_cameras([cameras[0], camera_of(width=9)])
+    np.testing.assert_array_equal(batch.viewmat, [one.viewmat for one in cameras])
+    assert (batch.batched, batch.lens) == (True, cameras[0].lens)
 
 
 @pytest.mark.parametrize("capacity", [None, 99])
@@ -157,8 +248,7 @@ def test_no_memory_is_shared_with_the_caller(dtype, capacity):
         np.testing.assert_array_equal(a, b)
 
 
-def test_lists_may_contain_tracers():
-
+def test_fields_may_be_lists_of_tracers():
     def focal(f):
         K = [[f, 0, 4], [0, f, 3], [0, 0, 1]]
         camera = gsjax.make_camera(viewmat=np.eye(4), K=K, width=8, height=6)

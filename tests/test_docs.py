@@ -2,26 +2,15 @@
 
 import importlib.util
 import io
-import os
 import re
-import subprocess
-import sys
 from contextlib import redirect_stdout
-from inspect import isclass, isfunction, ismodule
+from inspect import ismodule
 from pathlib import Path
 from types import ModuleType
 
 import pytest
-import yaml
-from snippets import (
-    ROOT,
-    bare_options,
-    blocks,
-    commands,
-    mentions,
-    program,
-    run_pages,
-)
+from conftest import run_python
+from snippets import ROOT, blocks, commands, program, run_pages, spans
 from viewing import CHROMIUM, page_requests
 
 import gsjax
@@ -32,14 +21,19 @@ DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
 ROOT_PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
 TEXTS = {path: path.read_text(encoding="utf-8") for path in [*ROOT_PAGES, *PAGES]}
-CLI_PAGE = TEXTS[DOCS / "reference" / "cli.md"]
+CLI_PAGE, README = TEXTS[DOCS / "reference" / "cli.md"], TEXTS[ROOT / "README.md"]
+CLAIMS = """
+```python
+gradient = jax.tree.leaves((by_params, by_camera.viewmat, by_camera.K))
+assert jnp.isfinite(value) and all(jnp.isfinite(g).all() for g in gradient)
+assert all(jnp.abs(g).max() > 0 for g in gradient)
+```
+"""
 
 
 def hook(name: str) -> ModuleType:
     """Import a module of docs/, which is not a package."""
     spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -50,37 +44,29 @@ options, numbers, examples = map(hook, ("options", "numbers", "examples"))
 
 @pytest.mark.long
 def test_python_blocks_run(tmp_path):
+    assert blocks(README, "python")
     with_python = [path for path in PAGES if program(TEXTS[path]).strip()]
     assert len(with_python) >= 10
-    assert run_pages(with_python, cwd=tmp_path) == ""
+    (tmp_path / "README.md").write_text(README + CLAIMS, encoding="utf-8")
+    for pages in ([tmp_path / "README.md"], with_python):
+        assert run_pages(pages, tmp_path) == ""
 
 
 def test_a_wrong_comment_is_found(tmp_path):
     page = tmp_path / "page.md"
-    page.write_text(
-        "```python\nprint(1 + 1)  # 2\n```\n\n```python\nprint(3)  # 4\n```\n"
-    )
-    assert "page.md, line 6: '3' is printed, not '4'" in run_pages([page], cwd=tmp_path)
-
-
-def test_blocks_know_their_lines():
-    text = "a\n```python\nx = 1\n```\n<!-- no-run -->\n```python\ny\n```\n"
-    assert blocks(text, "python") == [(2, "x = 1\n")]
-    assert blocks(text, "python", marked="no-run") == [(6, "y\n")]
-    assert program(text).splitlines()[2] == "x = 1"
+    page.write_text("```python\nprint(2)  # 2\n```\n\n```python\nprint(3)  # 4\n```\n")
+    assert "page.md, line 6: '3' is printed, not '4'" in run_pages([page], tmp_path)
 
 
 @pytest.fixture(scope="module")
 def helps() -> dict[str, str]:
-    """The --help of each command."""
-
-    def help_of(*words: str) -> str:
-        out = io.StringIO()
-        with redirect_stdout(out):
-            assert main([*words, "--help"]) == 0
-        return out.getvalue()
-
-    return {name: help_of(name) for name in options.command_classes()}
+    """Return the --help of each command."""
+    found = {}
+    for name in options.command_classes():
+        with redirect_stdout(io.StringIO()) as out:
+            assert main([name, "--help"]) == 0
+        found[name] = out.getvalue()
+    return found
 
 
 def options_in(text: str) -> set[str]:
@@ -93,14 +79,14 @@ def test_commands_exist(path, helps):
     for words in commands(TEXTS[path]):
         if words[-1] not in ("--help", "--version"):
             parse(words)
-    for words in mentions(TEXTS[path]):
-        if words[0] in ("--help", "--version", "…"):
-            continue
-        assert words[0] in helps, words
-        given = options_in(" ".join(words)) - {"--help"}
-        assert given <= options_in(helps[words[0]]), words
     known = {"--help", "--version"}.union(*map(options_in, helps.values()))
-    assert [x for x in bare_options(TEXTS[path]) if x not in known] == []
+    for span in spans(TEXTS[path]):
+        first, *words = span.split() or [""]
+        if first == "gsjax" and words and words[0] not in ("--help", "--version", "…"):
+            assert words[0] in helps, span
+            assert options_in(span) - {"--help"} <= options_in(helps[words[0]]), span
+        elif first[:1] == "-":
+            assert options_in(span) <= known, span
 
 
 def test_every_command_has_its_section_and_table(helps):
@@ -120,15 +106,37 @@ def test_generated_tables_are_current():
     assert len(numbers.headline(ROOT / "README.md")) == 5
 
 
+def test_every_benchmark_and_result_is_linked():
+    folder = ROOT / "benchmarks"
+    claims = {
+        path
+        for path in folder.glob("*.py")
+        if path.read_text(encoding="utf-8").startswith('"""Claim: ')
+    }
+    assert len(claims) > 15
+    text = (folder / "README.md").read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)\s#]+)", text)
+    found = {folder / link for link in links if "://" not in link}
+    assert claims.union((folder / "results").iterdir()) <= found
+    assert [path for path in found if not path.exists()] == []
+
+
+def test_presets_are_as_in_the_table():
+    presets = (gsjax.RasterConfig.compat(), gsjax.RasterConfig.accurate())
+    presets += (gsjax.RasterConfig.fast(),)
+    table = TEXTS[DOCS / "concepts" / "rasteriser.md"].split("### Presets")[1]
+    for name in ("alpha_min", "alpha_max", "transmittance_min", "stop_rule"):
+        (row,) = re.findall(rf"^\| `{name}` \|(.*)\|$", table, re.M)
+        cells = [cell.strip().replace("−", "-") for cell in row.split("|")]
+        if name != "stop_rule":
+            cells = [eval(cell, {}) for cell in cells]
+        assert cells == [getattr(preset, name) for preset in presets]
+
+
 def test_every_extension_has_its_example():
     wanted = re.findall(r"<!-- snippet: (\w+) -->", TEXTS[DOCS / "extending.md"])
     assert len(wanted) == 7
     assert [name for name in wanted if name not in examples.snippets()] == []
-
-
-def documented() -> list[str]:
-    text = "\n".join(TEXTS[path] for path in (DOCS / "reference").glob("*.md"))
-    return re.findall(r"^::: (\S+)$", text, re.M)
 
 
 def public_names() -> list[str]:
@@ -136,21 +144,18 @@ def public_names() -> list[str]:
     found = []
     for name in gsjax.__all__:
         value = getattr(gsjax, name)
-        if not ismodule(value):
-            found.append(f"gsjax.{name}")
-            continue
+        inner = vars(value).items() if ismodule(value) else ()
         found += [
-            f"gsjax.{name}.{inner}"
-            for inner, member in vars(value).items()
-            if not inner.startswith("_")
-            and (isfunction(member) or isclass(member))
-            and member.__module__ == value.__name__
-        ]
+            f"gsjax.{name}.{n}"
+            for n, member in inner
+            if n[0] != "_" and getattr(member, "__module__", "") == value.__name__
+        ] or [f"gsjax.{name}"]
     return found
 
 
 def test_every_public_name_is_in_the_reference():
-    names = documented()
+    text = "\n".join(TEXTS[path] for path in (DOCS / "reference").glob("*.md"))
+    names = re.findall(r"^::: (\S+)$", text, re.M)
     # `gsjax.save_png` is that of the module `notebook`.
     aliases = {"gsjax.notebook.save_png"}
     assert len(public_names()) > 35
@@ -159,15 +164,8 @@ def test_every_public_name_is_in_the_reference():
 
 
 def test_every_page_is_in_the_menu():
-    config = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
-
-    def leaves(entry):
-        if isinstance(entry, str):
-            return [entry]
-        inner = entry.values() if isinstance(entry, dict) else entry
-        return [leaf for part in inner for leaf in leaves(part)]
-
-    found = leaves(config["nav"])
+    menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("\nnav:\n")[1]
+    found = re.findall(r"([\w./-]+\.md)$", menu, re.M)
     assert sorted(found) == sorted(p.relative_to(DOCS).as_posix() for p in PAGES)
 
 
@@ -196,19 +194,13 @@ def site(tmp_path_factory) -> Path:
     pytest.importorskip("mkdocstrings", reason="needs gsjax[docs]")
     pytest.importorskip("material", reason="needs gsjax[docs]")
     out = tmp_path_factory.mktemp("site")
-    usual = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(out)],
-        cwd=ROOT,
-        env=usual,
-        capture_output=True,
-        text=True,
-    )
+    command = ("-m", "mkdocs", "build", "--strict", "--site-dir", str(out))
+    done = run_python(*command, cwd=ROOT, PYTHONDONTWRITEBYTECODE="")
     assert done.returncode == 0, done.stderr
     return out
 
 
-def test_the_site_fetches_nothing_from_elsewhere(site):
+def test_the_site_is_complete_and_fetches_nothing_from_elsewhere(site):
     pages = list(site.rglob("*.html"))
     assert len(pages) > len(PAGES)  # and 404.html
     fetched = (
@@ -223,6 +215,12 @@ def test_the_site_fetches_nothing_from_elsewhere(site):
         text = sheet.read_text(encoding="utf-8")
         assert not re.search(r"(?:@import|url\()\s*[\"']?(?:https?:)?//", text), sheet
     assert list(site.rglob("*.py*")) == [], "sources are not published"
+    names = ("rendering", "cli")
+    page, table = ((site / f"reference/{n}.html").read_text("utf-8") for n in names)
+    for shown in ('id="gsjax.render_exact"', "CapacityError", "transmittance_min"):
+        assert shown in page, "docstrings and attributes"
+    assert "--refine-poses" in table
+    assert "options: train" not in table
 
 
 @pytest.mark.long
@@ -234,13 +232,3 @@ def test_the_search_works_from_a_disk(site, tmp_path):
     assert re.search(r'search-result__meta">\d+ matching documents', html)
     assert re.search(r'href="[^"]*/cli.html\?h=refine[^"]*#train"', html)
     assert asked == []
-
-
-def test_the_reference_shows_docstrings_and_options(site):
-    page = (site / "reference" / "rendering.html").read_text(encoding="utf-8")
-    assert 'id="gsjax.render_exact"' in page
-    assert "CapacityError" in page
-    assert "transmittance_min" in page, "attributes are listed"
-    table = (site / "reference" / "cli.html").read_text(encoding="utf-8")
-    assert "--refine-poses" in table
-    assert "options: train" not in table

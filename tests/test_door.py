@@ -65,14 +65,11 @@ def test_a_training_step_of_ones_own_compiles_once():
     assert step._cache_size() == 1
 
 
-def large_splats():
-    points = frustum_points(np.random.default_rng(0), 60)
-    return gaussians_at(points, np.full((60, 3), 20.0), 0.05)
-
-
 def test_the_default_capacity_holds_large_splats():
+    points = frustum_points(np.random.default_rng(0), 60)
     camera = camera_of(160, 120, focal=(150.0, 150.0))
-    view = gsjax.render(large_splats(), camera, gsjax.RasterConfig(outputs=("alpha",)))
+    config = gsjax.RasterConfig(outputs=("alpha",))
+    view = gsjax.render(gaussians_at(points, 20.0, 0.05), camera, config)
     assert not view.overflowed
     assert view.check() is view
 
@@ -85,8 +82,7 @@ def test_an_overflow_can_be_chosen_to_be_seen():
     with pytest.raises(CapacityError, match=r"pair_capacity to at least \d+"):
         view.check()
     marked = gsjax.render(gaussians, camera, small.replace(on_overflow="nan"))
-    assert np.isnan(marked.rgb).all()
-    assert np.isnan(marked.alpha).all()
+    assert all(np.isnan(image).all() for image in (marked.rgb, marked.alpha))
     fits = gsjax.render(gaussians, camera, CONFIG.replace(on_overflow="nan"))
     assert np.isfinite(fits.rgb).all()
     checked = checkify.checkify(

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import training
-from conftest import assert_not_empty, camera_of, gaussians_at
+from conftest import assert_not_empty, camera_of, frustum_points, gaussians_at
 
 import gsjax
 
@@ -208,18 +208,14 @@ NPZ = Format("npz", (".npz",), _load_npz, _save_npz)
 # gsjax.load(path, formats=(*FORMATS, NPZ))
 # --8<-- [end:format]
 
-CONFIG = gsjax.RasterConfig(
-    alpha_min=1e-14, alpha_max=1 - 1e-9, transmittance_min=0.0, stop_rule="after",
-    devices=1, pair_capacity=4096,
-)  # fmt: skip
+WEIGHT = np.random.default_rng(3).normal(size=(13, 19, 3))
 
 
 def scene():
     rng = np.random.default_rng(0)
-    z = rng.permutation(np.linspace(2, 6, 12))
-    xy = rng.uniform(-0.4, 0.4, (12, 2)) * z[:, None]
+    points = frustum_points(rng, 12, far=6.0, spread=0.4)
     scales = np.exp(rng.normal(-1, 0.3, (12, 3)))
-    return gaussians_at(np.column_stack([xy, z]), scales, rng.uniform(0.2, 0.9, 12))
+    return gaussians_at(points, scales, rng.uniform(0.2, 0.9, 12))
 
 
 def assert_gradient(loss, point):
@@ -242,61 +238,50 @@ def assert_gradient(loss, point):
 
 def test_lens():
     gaussians = scene()
-    pinhole = camera_of(19, 13, focal=(12.0, 13.0))
-    camera = gsjax.make_camera(
-        viewmat=pinhole.viewmat, K=pinhole.K, width=19, height=13,
-        lens=STEREOGRAPHIC, coefficients=[0.05],
-    )  # fmt: skip
+    lens = {"lens": STEREOGRAPHIC, "coefficients": [0.05]}
+    camera = camera_of(19, 13, focal=(12.0, 13.0), **lens)
     pixels = np.random.default_rng(2).uniform(0, 13, (2, 40))
-    again = camera.project(
-        STEREOGRAPHIC.unproject(camera.K, jnp.asarray([0.05]), pixels)
-    )
-    np.testing.assert_allclose(again, pixels, atol=1e-9)
-    weight = np.random.default_rng(3).normal(size=(13, 19, 3))
+    rays = STEREOGRAPHIC.unproject(camera.K, camera.coefficients, pixels)
+    np.testing.assert_allclose(camera.project(rays), pixels, atol=1e-9)
 
     def loss(point):
-        coefficients, K, means = point
+        coefficients, (fx, fy, cx, cy), means = point
+        K = jnp.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         seen = camera.replace(coefficients=coefficients, K=K)
         moved = gaussians.replace(params=gaussians.params.replace(means=means))
-        return jnp.sum(gsjax.render(moved, seen, CONFIG).rgb * weight)
+        return jnp.sum(gsjax.render(moved, seen, training.SMOOTH).rgb * WEIGHT)
 
-    assert_not_empty(gsjax.render(gaussians, camera, CONFIG).alpha)
-    focal = jnp.asarray([[1.0, 0, 1], [0, 1, 1], [0, 0, 0]])
-    point = camera.coefficients, camera.K, gaussians.params.means
-
-    def loss_of_used(point):  # skew and the last row of K are not used
-        return loss((point[0], camera.K + (point[1] - camera.K) * focal, point[2]))
-
-    assert_gradient(loss_of_used, point)
+    assert_not_empty(gsjax.render(gaussians, camera, training.SMOOTH).alpha)
+    intrinsics = camera.K[jnp.asarray([0, 1, 0, 1]), jnp.asarray([0, 1, 2, 2])]
+    assert_gradient(loss, (camera.coefficients, intrinsics, gaussians.params.means))
 
 
 def test_primitive():
     gaussians, camera = scene(), camera_of(19, 13, focal=(20.0, 21.0))
-    config = CONFIG.replace(primitive=BUMP)
+    config = training.SMOOTH.replace(primitive=BUMP)
     with pytest.raises(gsjax.InputError, match="absgrad"):
         config.replace(absgrad=True)
     bumps = gsjax.render(gaussians, camera, config)
-    ellipsoids = gsjax.render(gaussians, camera, CONFIG)
+    ellipsoids = gsjax.render(gaussians, camera, training.SMOOTH)
     assert not bumps.overflowed
     assert_not_empty(bumps.alpha)
     assert np.abs(bumps.alpha - ellipsoids.alpha).max() > 0.05
-    weight = np.random.default_rng(3).normal(size=(13, 19, 3))
 
     def loss(params):
         image = gsjax.render(gaussians.replace(params=params), camera, config).rgb
-        return jnp.sum(image * weight)
+        return jnp.sum(image * WEIGHT)
 
     assert_gradient(loss, gaussians.params)
 
 
-STEPS = 30
+TRAIN = gsjax.TrainConfig(
+    steps=30, sh_degree=0, raster=training.RASTER.replace(pair_capacity=None),
+    prune_invisible=False,
+)  # fmt: skip
 
 
-def config_of(**changes):
-    return gsjax.TrainConfig(
-        steps=STEPS, sh_degree=0, raster=training.RASTER.replace(pair_capacity=None),
-        prune_invisible=False, **changes,
-    )  # fmt: skip
+def fit(**seams):
+    return gsjax.fit(training.dataset(), training.photos(), TRAIN, **seams)
 
 
 def test_model():
@@ -310,44 +295,33 @@ def test_model():
         photos.append(training.photo_of(still.replace(params=moved), view))
         views.append(replace(view, time=time))
     dataset = replace(training.dataset(), views=tuple(views))
-    fixed = gsjax.TrainConfig().rates._replace(means=(1e-5, 1e-5))
-    config = config_of(rates=fixed)
+    config = TRAIN.replace(rates=TRAIN.rates._replace(means=(1e-5, 1e-5)))
     with jax.enable_x64(False):
         result = gsjax.fit(dataset, photos, config, model=RIGID)
     found = np.asarray(result.state.model.shared["shift"])
     assert np.linalg.norm(found - shift) < 0.6 * np.linalg.norm(shift)
 
 
+@pytest.mark.usefixtures("float32")
 def test_strategy():
-    with jax.enable_x64(False):
-        start = training.rough_start(0, 64)
-        logits = start.params.logit_opacities.at[:20].set(-9.0)
-        start = start.replace(params=start.params.replace(logit_opacities=logits))
-        config, strategy = config_of(), remove_faint(every=10, limit=0.01)
-        state = gsjax.init_state(
-            start, config, training.EXTENT, training.VIEWS, strategy=strategy
-        )
-        result = gsjax.fit(
-            training.dataset(), training.photos(), config,
-            state=state, strategy=strategy,
-        )  # fmt: skip
+    start = training.rough_start(0, 64)
+    logits = start.params.logit_opacities.at[:20].set(-9.0)
+    start = start.replace(params=start.params.replace(logit_opacities=logits))
+    given = {"strategy": remove_faint(every=10, limit=0.01)}
+    state = gsjax.init_state(start, TRAIN, training.EXTENT, training.VIEWS, **given)
+    result = fit(state=state, **given)
     assert gsjax.num_active(start) == training.POINTS
     assert gsjax.num_active(result.gaussians) == training.POINTS - 20
 
 
+@pytest.mark.usefixtures("float32")
 def test_loss_term():
-    alphas = []
-    for terms in ((), (OPAQUE,)):
-        with jax.enable_x64(False):
-            result = gsjax.fit(
-                training.dataset(), training.photos(), config_of(), loss_terms=terms
-            )
-            view = training.dataset().views[0]
-            camera = gsjax.make_camera(
-                viewmat=view.viewmat, K=view.K, width=view.width, height=view.height
-            )
-            alphas.append(gsjax.render_exact(result.gaussians, camera).alpha.mean())
-    assert alphas[1] > alphas[0] + 0.01
+    camera = training.camera_at(training.dataset().views[0])
+    plain, opaque = (
+        gsjax.render_exact(fit(loss_terms=terms).gaussians, camera).alpha.mean()
+        for terms in ((), (OPAQUE,))
+    )
+    assert opaque > plain + 0.01
 
 
 def test_reader(tmp_path):

@@ -13,7 +13,6 @@ import gsjax
 from gsjax import RasterConfig
 from gsjax.data.extent import extent_of
 from gsjax.data.types import Dataset, Photo, View
-from gsjax.init.gaussians import init_gaussians
 from gsjax.io.images import to_8_bit
 
 VIEWS, POINTS, WIDTH, HEIGHT = 4, 60, 32, 24
@@ -46,7 +45,7 @@ EXTENT = extent_of(dataset())
 
 def true_gaussians() -> gsjax.Gaussians:
     """Return the Gaussians that the photographs show."""
-    return init_gaussians(dataset(), sh_degree=0, opacity=0.8, scale=0.6)
+    return gsjax.init_gaussians(dataset(), sh_degree=0, opacity=0.8, scale=0.6)
 
 
 @cache
@@ -61,12 +60,15 @@ _render = jax.jit(
 )
 
 
+def camera_at(view: View) -> gsjax.Camera:
+    """Return the camera of a view."""
+    sizes = {"width": WIDTH, "height": HEIGHT}
+    return gsjax.make_camera(viewmat=view.viewmat, K=view.K, **sizes)
+
+
 def photo_of(gaussians: gsjax.Gaussians, view: View, background=(0.0, 0.0, 0.0)):
     """Return the photograph of a view."""
-    camera = gsjax.make_camera(
-        viewmat=view.viewmat, K=view.K, width=WIDTH, height=HEIGHT
-    )
-    image = _render(gaussians, camera, jnp.asarray(background))
+    image = _render(gaussians, camera_at(view), jnp.asarray(background))
     return Photo(to_8_bit(np.asarray(image)), None, None, view.K)
 
 
@@ -76,7 +78,7 @@ def rough_start(sh_degree: int, capacity: int, seed: int = 1) -> gsjax.Gaussians
     rng = np.random.default_rng(seed)
     points = start.points + 0.05 * rng.normal(size=start.points.shape)
     colors = rng.integers(0, 256, start.colors.shape).astype(np.uint8)
-    made = init_gaussians(
+    made = gsjax.init_gaussians(
         replace(start, points=points, colors=colors),
         sh_degree=sh_degree,
         opacity=0.5,

@@ -24,9 +24,13 @@ from gsjax.train.config import TrainConfig
 
 COUNT = 64
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-WEBGL = [
-    "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"
-]  # fmt: skip
+
+
+def chromium(profile: Path, *more: str) -> list[str]:
+    """Return the command of a browser with a profile of its own."""
+    webgl = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+    command = [str(CHROMIUM), "--headless", "--no-sandbox", *webgl]
+    return [*command, "--ignore-gpu-blocklist", f"--user-data-dir={profile}", *more]
 
 
 def wait_for(condition, seconds=30.0):
@@ -120,11 +124,8 @@ def page_requests(url: str, folder: Path) -> tuple[str, list[str]]:
     # With virtual time Chromium hangs, once in some thirty times.
     for attempt in range(3):
         log = folder / f"net{attempt}.json"
-        command = [
-            str(CHROMIUM), "--headless", "--no-sandbox", *WEBGL,
-            f"--user-data-dir={folder / f'profile{attempt}'}", f"--log-net-log={log}",
-            "--virtual-time-budget=20000", "--dump-dom", url,
-        ]  # fmt: skip
+        options = (f"--log-net-log={log}", "--virtual-time-budget=20000", "--dump-dom")
+        command = chromium(folder / f"profile{attempt}", *options, url)
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=60)
             break
@@ -151,12 +152,9 @@ def screenshots(url: str, profile: Path, size: str = "500,400") -> Iterator[np.n
     """
     from websockets.sync.client import connect
 
-    browser = subprocess.Popen(
-        [str(CHROMIUM), "--headless", "--no-sandbox", *WEBGL,
-         "--remote-debugging-port=0", f"--user-data-dir={profile}",
-         f"--window-size={size}", url],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+    options = ("--remote-debugging-port=0", f"--window-size={size}", url)
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    browser = subprocess.Popen(chromium(profile, *options), **quiet)
     try:
         port = profile / "DevToolsActivePort"
         wait_for(lambda: port.exists() and port.read_text())

@@ -4,6 +4,8 @@ import shutil
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -31,36 +33,28 @@ def make_scene(count=200):
     return scene
 
 
-def composite(means2d, conics, opacities, colors, depths):
-    """Composite all splats of finite depth, in order of depth, in float64.
+@jax.jit
+def composite(splats):
+    """Composite splats in the order given, in float64.
 
     Returns:
       image [H, W, 3], transmittance [H, W], unclamped α [n, H, W].
     """
-    order = np.argsort(depths, kind="stable")
-    order = order[np.isfinite(depths[order])]
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    image, trans = np.zeros((HEIGHT, WIDTH, 3)), np.ones((HEIGHT, WIDTH))
-    raws = []
-    for i in order:
-        dx, dy = means2d[i, 0] - x, means2d[i, 1] - y
-        a, b, c = conics[i]
+
+    def add(behind, splat):
+        image, trans = behind
+        mean, (a, b, c), opacity, color = splat
+        dx, dy = mean[0] - x, mean[1] - y
         sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-        raw = opacities[i] * np.exp(-sigma)
-        raws.append(raw)
-        alpha = np.where((sigma < 0) | (raw < 1 / 255), 0.0, np.minimum(0.99, raw))
-        image += (alpha * trans)[..., None] * colors[i]
-        trans = trans * (1 - alpha)
-    return image + trans[..., None] * BACKGROUND, trans, np.array(raws)
+        raw = opacity * jnp.exp(-sigma)
+        alpha = jnp.where((sigma < 0) | (raw < 1 / 255), 0, jnp.minimum(0.99, raw))
+        image += (alpha * trans)[..., None] * color
+        return (image, trans * (1 - alpha)), raw
 
-
-def regions(raw):
-    """Return the side of the two thresholds that each α lies on."""
-    return np.digitize(raw, [1 / 255, 0.99])
-
-
-def in_float64(scene):
-    return {name: value.astype(np.float64) for name, value in scene.items()}
+    nothing = jnp.zeros((HEIGHT, WIDTH, 3)), jnp.ones((HEIGHT, WIDTH))
+    (image, trans), raw = jax.lax.scan(add, nothing, splats)
+    return image + trans[..., None] * BACKGROUND, trans, raw
 
 
 def compositor_inputs(scene, tile_size=16):
@@ -73,56 +67,40 @@ def compositor_inputs(scene, tile_size=16):
 
 
 @needs_compiler
-@pytest.mark.parametrize(("tile_size", "threads"), [(8, 1), (16, 2)])
-def test_forward(tile_size, threads):
+@pytest.mark.parametrize(
+    ("tile_size", "threads", "by_pixel"), [(8, 1, True), (16, 2, False)]
+)
+def test_images_and_gradients(tile_size, threads, by_pixel):
     scene = make_scene()
-    expected, trans, raw = composite(**in_float64(scene))
-    # No α crosses the threshold by rounding to float32.
-    assert np.abs(raw * 255 - 1).min() > 1e-5
-    got = yardstick.forward(
-        *compositor_inputs(scene, tile_size), tile_size=tile_size, threads=threads
-    )
-    np.testing.assert_allclose(got[0], expected, rtol=0, atol=2e-5)
-    np.testing.assert_allclose(got[1], trans, rtol=0, atol=2e-5)
+    weights = np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 4))
+    weights = weights.astype(np.float32)
+    order = np.argsort(scene["depths"], kind="stable")
+    order = order[np.isfinite(scene["depths"][order])]
 
+    def loss(splats):
+        image, trans, raw = composite(splats)
+        whole = jnp.concatenate([image, 1 - trans[..., None]], -1)
+        return jnp.sum(weights * whole), (image, trans, raw)
 
-@needs_compiler
-@pytest.mark.parametrize(("tile_size", "by_pixel"), [(8, True), (16, False)])
-def test_backward(tile_size, by_pixel):
-    scene = make_scene()
-    rng = np.random.default_rng(0)
-    v_image = rng.normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
-    v_alpha = rng.normal(size=(HEIGHT, WIDTH)).astype(np.float32)
+    splats = [jnp.asarray(scene[name][order], jnp.float64) for name in NAMES]
+    slopes, (*images, raw) = jax.grad(loss, has_aux=True)(splats)
+    assert raw.max() > 0.99, "some α are clamped"
+    for threshold in (1 / 255, 0.99):  # none is crossed by rounding to float32
+        assert np.abs(raw / threshold - 1).min() > 1e-6
     inputs = compositor_inputs(scene, tile_size)
-    image, trans, grads = yardstick.forward_backward(
-        *inputs, v_image, v_alpha, tile_size=tile_size, by_pixel=by_pixel
-    )
-    alone = yardstick.forward(*inputs, tile_size=tile_size)
-    np.testing.assert_array_equal(image, alone[0])
-    np.testing.assert_array_equal(trans, alone[1])
-
-    def loss(point):
-        image, trans, raw = composite(**point)
-        return (v_image * image).sum() + (v_alpha * (1 - trans)).sum(), regions(raw)
-
-    point, eps = in_float64(scene), 1e-7
-    assert regions(composite(**point)[2]).max() == 2, "some α are clamped"
-    step = {"means2d": 1.0, "conics": 0.1, "opacities": 1.0, "colors": 1.0}
-    for name in NAMES:
-        assert grads[name].shape == scene[name].shape
-        for _ in range(2):
-            direction = step[name] * rng.normal(size=scene[name].shape)
-            # Partly aligned with the gradient, so that the derivative is not near 0.
-            direction *= np.where(rng.random(direction.shape) < 0.7, 1, -1) * np.sign(
-                direction * grads[name]
-            )
-            high, in_high = loss(point | {name: point[name] + eps * direction})
-            low, in_low = loss(point | {name: point[name] - eps * direction})
-            assert (in_high == in_low).all(), "no threshold is crossed"
-            numeric = (high - low) / (2 * eps)
-            np.testing.assert_allclose(
-                (grads[name] * direction).sum(), numeric, rtol=2e-3
-            )
+    *found, grads = yardstick.forward_backward(
+        *inputs, weights[..., :3], weights[..., 3],
+        tile_size=tile_size, threads=threads, by_pixel=by_pixel,
+    )  # fmt: skip
+    alone = yardstick.forward(*inputs, tile_size=tile_size, threads=threads)
+    for one, same, wanted in zip(found, alone, images, strict=True):
+        np.testing.assert_array_equal(one, same)
+        np.testing.assert_allclose(one, wanted, rtol=0, atol=2e-5)
+    for name, slope in zip(NAMES, slopes):
+        wanted = np.zeros(scene[name].shape)
+        wanted[order] = slope
+        error = np.linalg.norm(grads[name] - wanted)
+        assert error < 1e-4 * np.linalg.norm(wanted)
 
 
 @needs_compiler

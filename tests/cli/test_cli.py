@@ -57,10 +57,8 @@ def error_of(capsys) -> str:
 def test_render_writes_the_pixels_of_render_exact(scene, tmp_path, capsys):
     out = tmp_path / "new" / "views"
     assert main(render_args(scene, out, "--npy")) == 0
-    printed = capsys.readouterr()
-    assert printed.out.splitlines() == [str(out / f"view {i}.png") for i in (0, 1)]
-    assert "views 2/2" in printed.err
-    assert re.search(r"memory: about \d+ MB per view", printed.err)
+    printed = capsys.readouterr().out.splitlines()
+    assert printed == [str(out / f"view {i}.png") for i in (0, 1)]
     names = sorted(path.name for path in out.iterdir())
     assert names == ["view 0.npy", "view 0.png", "view 1.npy", "view 1.png"]
     gaussians = gsjax.load(scene / "scene.ply")
@@ -165,6 +163,15 @@ ERRORS = [
     (2, "train a -o b --viewer-port 9000", "--viewer-port goes with --viewer"),
     (2, "train a -o b --test-images", "--test-images: expected the name of at least"),
     (2, "train a -o b --resume --overwrite", "exclude each other"),
+    (2, "train a -o b --test-images 0.png --test-every 0", "exclude each other"),
+    (2, "train a -o b --initial densely", "--initial: expected points, dense, random"),
+    (3, "bench nowhere", "knot"),
+    (2, "bench --repeats 0", "--repeats"),
+    (2, "bench --budget x", "--budget"),
+    (2, "bench --budget 2", "--budget"),
+    (3, "bench --plot TMP/a.png", "a.png: exists"),
+    (2, "bench --plot a.jpg", ".png"),
+    (3, "info SCENE/scene.ply --plot TMP/a.png", "a.png: exists"),
 ]
 
 
@@ -172,6 +179,7 @@ ERRORS = [
 def test_an_error_is_one_line_and_a_code(code, line, message, scene, tmp_path, capsys):
     (tmp_path / "bad.json").write_text("{")
     (tmp_path / "bad.ply").write_bytes(b"ply\n")
+    (tmp_path / "a.png").touch()
     line = line.replace("RENDER", "render SCENE/scene.ply --cameras SCENE/cameras.json")
     line = line.replace("SCENE", str(scene)).replace("TMP", str(tmp_path))
     assert main(line.split()) == code
@@ -202,22 +210,17 @@ def test_exceptions_become_one_line(error, code, scene, capsys, monkeypatch):
     assert lines[-1].startswith("gsjax: error: ")
 
 
-def test_text_of_files_is_escaped_and_shortened(tmp_path, capsys):
+def test_text_of_paths_and_files_is_escaped_and_shortened(tmp_path, capsys):
     assert main(["info", f"{tmp_path}/\x1b[2J.ply"]) == 3
     assert r"\x1b[2J.ply: cannot be read" in error_of(capsys)
-    name = "A" * 10_000 + "\x1b"
-    matrix = np.eye(4).tolist()
-    frame = {"transform_matrix": matrix, "camera_model": name, "file_path": "a.png"}
+    frame = {"transform_matrix": np.eye(4).tolist(), "file_path": "a.png"}
+    frame["camera_model"] = "A" * 10_000 + "\x1b"
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps({"w": 8, "h": 6, "fl_x": 8, "frames": [frame]}))
-    (tmp_path / "a.png").touch()
-    for args in (["train", str(path)], ["render", "a.ply", "--cameras", str(path)]):
-        assert main([*args, "-o", str(tmp_path / "out")]) == 3
-        message = error_of(capsys)
-        assert "AAA" in message
-        assert len(message) < 1000
-    assert main(["info", "a" * 5000 + ".ply"]) == 3
-    assert "File name too long; check the path" in error_of(capsys)
+    render = ["render", "a.ply", "--cameras", str(path), "-o", str(tmp_path / "out")]
+    for args in (render, ["info", "a" * 5000 + ".ply"]):
+        assert main(args) == 3
+        assert 100 < len(error_of(capsys)) < 1000
 
 
 def test_a_missing_opencv_is_named(scene, tmp_path, capsys, monkeypatch):
@@ -312,7 +315,7 @@ def test_info(scene, tmp_path, capsys):
     path = scene / "scene.ply"
     gaussians = gsjax.load(path)
     assert main(["info", str(path)]) == 0
-    assert f"Gaussians         {gaussians.capacity:,}" in capsys.readouterr().out
+    assert f" {gaussians.capacity:,}\n" in capsys.readouterr().out
     assert main(["info", str(path), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     means = np.asarray(gaussians.params.means)

@@ -20,14 +20,10 @@ from corner_room import make_room
 from snippets import ROOT, blocks, commands
 
 import gsjax
-from gsjax.cli import common
 from gsjax.cli.main import main
 from gsjax.gaussians import activate
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.usefixtures("float32", "shared_programs"),
-]
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("float32", "shared_programs")]
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 WIDTH, HEIGHT, PHOTOS, STEPS = 64, 48, 9, 20
@@ -113,10 +109,6 @@ def test_demo_learns_and_its_outputs_exist(printed, demo):
     assert all(path.exists() for path in (splat, preview, curves))
     assert "2 held-out views: PSNR " in result
     quality = json.loads((demo / "run" / "eval.json").read_text())
-    lines = (demo / "run" / "metrics.jsonl").read_text().splitlines()
-    losses = [json.loads(line)["loss"] for line in lines]
-    assert len(losses) == STEPS
-    assert np.mean(losses[-5:]) < 0.85 * np.mean(losses[:5])
     assert quality["psnr"] > 17
     movie = read_movie(turntable)
     assert movie.shape == (48, HEIGHT, WIDTH, 3)
@@ -124,7 +116,7 @@ def test_demo_learns_and_its_outputs_exist(printed, demo):
     assert np.abs(movie[0].astype(int) - movie[24]).mean() > 2, "it turns"
 
 
-def test_commands_that_demo_suggests_work(printed, demo, monkeypatch):
+def test_commands_that_demo_suggests_work(printed, demo):
     lines = [s.split()[2:] for s in printed["demo"].err.splitlines() if "  gsjax " in s]
     expected = ["view", "info", "render", "export", "sfm", "train"]
     assert [line[0] for line in lines] == expected
@@ -136,9 +128,6 @@ def test_commands_that_demo_suggests_work(printed, demo, monkeypatch):
         found = read_image(demo / "views" / f"{name}.png")
         assert found.std() > 20
         assert np.abs(found.astype(int) - wanted).max() <= 1
-    monkeypatch.setattr(common, "find_spec", lambda _: None)
-    needs = "gsjax view 'a b'  # needs pip install 'gsjax[viewer]'"
-    assert common.view_hint(Path("a b")) == needs
 
 
 def test_render_a_path_to_movies(demo, tmp_path):
@@ -153,19 +142,6 @@ def test_render_a_path_to_movies(demo, tmp_path):
     depth = read_movie(path).astype(int)
     seen = (depth.max(-1) - depth.min(-1)) > 100
     assert 0.05 < seen.mean() < 0.95
-
-
-def test_render_a_path_to_images(demo, tmp_path):
-    more = ["--path", "interpolate", "--frames", "2", "--size", "32x24", "--npy"]
-    more += ["--what", "rgb,alpha", "--background", "1,1,1"]
-    run("render", demo / "run", "-o", tmp_path, *more)
-    stems = [f"frame_000{n}{kind}" for n in (1, 2) for kind in ("", ".alpha")]
-    assert names(tmp_path) == sorted(f"{s}{x}" for s in stems for x in (".npy", ".png"))
-    rgb = np.load(tmp_path / "frame_0001.npy")
-    alpha = np.load(tmp_path / "frame_0001.alpha.npy")
-    assert rgb.shape == (24, 32, 3)
-    assert 0.05 < (alpha > 0.5).mean() < 0.95
-    assert (rgb[alpha == 0] == 1).all()
 
 
 def test_a_file_renders_like_its_run(demo, tmp_path):
@@ -210,8 +186,15 @@ def test_render_the_test_views_that_a_dataset_declares(demo, tmp_path):
 
 def test_evaluating_training_views_keeps_other_files(demo, tmp_path):
     folder = shutil.copytree(demo / "run", tmp_path / "run")
+    text = run("eval", folder, "--json")
+    assert json.loads(text.out)["which"] == "test"
+    assert "unfinished" not in text.err
+    config = json.loads((folder / "config.json").read_text())
+    config["train"]["steps"] += 1
+    (folder / "config.json").write_text(json.dumps(config))
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     text = run("eval", folder, "--views", "train")
+    assert f"unfinished: step {STEPS} of {STEPS + 1}" in text.err
     assert text.out.splitlines()[-1] == str(folder / "preview_train.png")
     assert {path: path.read_bytes() for path in before} == before
     report = json.loads((folder / "eval_train.json").read_text())
@@ -250,20 +233,24 @@ def test_info_of_a_run(demo, tmp_path):
     assert Path(report["dataset"]) == (demo / "dataset").resolve()
     assert (report["steps_done"], report["steps"]) == (STEPS, STEPS)
     assert report["evaluation"]["views"] == 2
-    text = run("info", demo / "run", "--plot", tmp_path / "a.png").out
-    assert f"steps             {STEPS} of {STEPS}" in text
-    assert f"PSNR {report['evaluation']['psnr']:.2f} dB" in text
-    assert f"Gaussians         {facts['count']:,}" in text
-    assert read_image(tmp_path / "a.png").std() > 10
+    plot = tmp_path / "new" / "a.png"
+    text = run("info", demo / "run", "--plot", plot).out
+    assert text.splitlines()[-1] == str(plot)
+    assert f" {STEPS} of {STEPS}\n" in text
+    assert read_image(plot).std() > 10
     # A run without Gaussians yet is described, too.
     young = tmp_path / "young"
     young.mkdir()
     shutil.copy(demo / "run" / "config.json", young)
-    assert f"steps             0 of {STEPS}" in run("info", young).out
+    assert f" 0 of {STEPS}\n" in run("info", young).out
 
 
 # Words DEMO and TMP are replaced by folders. TMP is an unfinished run.
 ERRORS = [
+    (3, "train DEMO/dataset -o TMP/o --initial DEMO/dataset", "is a dataset; train on"),
+    (2, "train DEMO/dataset -o DEMO/run --initial DEMO/run", "another folder with -o"),
+    (3, "train DEMO/dataset -o TMP/o --initial TMP/none.ply", "none.ply"),
+    (2, "train DEMO/dataset -o TMP/o --initial DEMO/run --antialias", "--antialias"),
     (3, "info DEMO", "is not a run, but "),
     (3, "train DEMO/dataset -o DEMO/run/splat.ply", "is a file; pass a folder with -o"),
     (3, "train DEMO/dataset -o DEMO/dataset", "is the dataset's own folder"),

@@ -1,6 +1,7 @@
 """Runs and their folders: started, replaced, resumed, initialised, evaluated."""
 
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -10,6 +11,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hostile import HOSTILE, harmless, write_hostile
@@ -21,17 +23,20 @@ from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import InputError
 from gsjax.raster.types import RasterConfig
 from gsjax.runs import folder as run_folder
-from gsjax.runs import initialisation
+from gsjax.runs import initialisation, report
 from gsjax.runs import run as run_module
 from gsjax.runs.config_json import config_from_json
 from gsjax.runs.evaluation import evaluate_run
 from gsjax.runs.folder import RunSettings, load_settings, load_split
 from gsjax.runs.history import read_metrics
+from gsjax.runs.report import Reporter
 from gsjax.runs.run import RunResult, resume_run, start_run
 from gsjax.runs.scene_source import open_scene_source
 from gsjax.runtime.files import locked_folder
-from gsjax.train.config import Level, TrainConfig, continuation_config, preset
+from gsjax.train.config import Level, TrainConfig
 from gsjax.train.initialisation import initial_state
+from gsjax.train.loop import Progress
+from gsjax.train.state import Metrics
 
 pytestmark = pytest.mark.usefixtures("float32", "shared_programs")
 
@@ -86,14 +91,13 @@ def repeat(run: Path) -> None:
 
 @pytest.mark.parametrize("name", ["config.json", "other.json"])
 def test_only_a_run_is_replaced(whole, tmp_path, name):
-    folder = tmp_path / "mine"
-    (folder / "renders" / "precious").mkdir(parents=True)
-    (folder / "renders" / "precious" / "a.blend").write_text("mine")
-    (folder / name).write_text('{"my": "app"}')
-    before = contents(folder)
+    (tmp_path / "renders" / "precious").mkdir(parents=True)
+    (tmp_path / "renders" / "precious" / "a.blend").write_text("mine")
+    (tmp_path / name).write_text('{"my": "app"}')
+    before = contents(tmp_path)
     with pytest.raises(InputError, match=r"config\.json"):
-        start_run(RunSettings(whole / "data", CONFIG), folder, overwrite=True)
-    assert contents(folder) == before
+        start_run(RunSettings(whole / "data", CONFIG), tmp_path, overwrite=True)
+    assert contents(tmp_path) == before
 
 
 def test_a_run_is_replaced_only_when_the_next_can_start(made, tmp_path, monkeypatch):
@@ -132,72 +136,61 @@ def test_a_run_is_replaced_only_when_the_next_can_start(made, tmp_path, monkeypa
     assert contents(tmp_path / "checkpoints") == kept
 
 
+HOLDS_A_LOCK = """
+import pathlib, sys, time
+from gsjax.runtime.files import locked_folder
+with locked_folder(pathlib.Path(sys.argv[1])):
+    print("held", flush=True), time.sleep(600)
+"""
+
+
 def test_one_training_at_a_time_in_a_folder(made):
-    before, settings = contents(made / "run"), RunSettings(made / "data", CONFIG)
-    with locked_folder(made / "run"):
-        with pytest.raises(InputError, match="another"):
-            start_run(settings, made / "run", overwrite=True)
-        with pytest.raises(InputError, match="another"):
-            resume_run(made / "run")
-    assert contents(made / "run") == before
-    program = (
-        "import sys, time, pathlib\nfrom gsjax.runtime.files import locked_folder\n"
-    )
-    program += "with locked_folder(pathlib.Path(sys.argv[1])):\n"
-    program += "    print('held', flush=True), time.sleep(600)"
-    arguments = [sys.executable, "-c", program, str(made)]
+    run, settings = made / "run", RunSettings(made / "data", CONFIG)
+    before = contents(run)
+    arguments = [sys.executable, "-c", HOLDS_A_LOCK, str(run)]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE) as other:
         try:
             assert other.stdout.readline() == b"held\n"
-            with pytest.raises(InputError, match="another"), locked_folder(made):
-                pass
+            with pytest.raises(InputError, match="another"):
+                start_run(settings, run, overwrite=True)
         finally:
             other.kill()
-    with locked_folder(made):  # a killed process holds nothing
-        pass
-
-
-@pytest.fixture(scope="module")
-def killed(whole, tmp_path_factory) -> Path:
-    """Return the run as a kill in the third step leaves it, and as an error does.
-
-    A checkpoint and evaluations were due in the second step. No test changes it.
-    """
-    folder = tmp_path_factory.mktemp("killed")
-    data, run = folder / "data", folder / "run"
-    shutil.copytree(whole / "data", data)
-
-    def watch(*_):
-        def look(_, progress):
-            if progress.metrics.step == 3:
-                shutil.copytree(run, folder / "killed")
-                raise RuntimeError("after a copy")
-
-        return look
-
-    config = CONFIG.replace(every_eval=1, every_checkpoint=2)
-    with pytest.raises(RuntimeError, match="after a copy"):
-        start_run(RunSettings(data, config), run, watch=watch)
-    return folder
+    # A killed process holds nothing.
+    with locked_folder(run), pytest.raises(InputError, match="another"):
+        resume_run(run)
+    assert contents(run) == before
 
 
 def steps_of(path: Path) -> list[int]:
     return [json.loads(line)["step"] for line in path.read_text().splitlines()]
 
 
-@pytest.mark.parametrize("name", ["killed", "run"])
-def test_each_step_is_logged_once(killed, tmp_path, name, capsys, monkeypatch):
-    """After a kill, after an error, and if a finished run is resumed."""
-    run = shutil.copytree(killed / name, tmp_path / "run")
-    assert steps_of(run / "held_out.jsonl") == [1, 2]
-    for devices in (2, 1):
-        with monkeypatch.context() as patch:
-            patch.setattr(run_module, "device_count", lambda _, n=devices: n)
+def test_each_step_is_logged_once(whole, tmp_path, capsys, monkeypatch):
+    """After a kill or an error in the third step, and if a finished run is resumed.
+
+    A checkpoint and evaluations were due in the second step.
+    """
+
+    def watch(*_):
+        def look(_, progress):
+            if progress.metrics.step == 3:
+                shutil.copytree(tmp_path / "error", tmp_path / "kill")
+                raise RuntimeError("after a copy")
+
+        return look
+
+    config = CONFIG.replace(every_eval=1, every_checkpoint=2)
+    with pytest.raises(RuntimeError, match="after a copy"):
+        start_run(RunSettings(whole / "data", config), tmp_path / "error", watch=watch)
+    for run in (tmp_path / "kill", tmp_path / "error"):
+        assert steps_of(run / "held_out.jsonl") == [1, 2]
+        for devices in (2, 1):
+            monkeypatch.setattr(run_module, "device_count", lambda _, n=devices: n)
             assert resume_run(run).finished
-        notes = capsys.readouterr().err
-        assert ("2 devices (cores) instead of 1" in notes) == (devices == 2)
-        for log in ("held_out.jsonl", "metrics.jsonl"):
-            assert steps_of(run / log) == [1, 2, 3, 4]
+            notes = capsys.readouterr().err
+            assert ("2 devices (cores) instead of 1" in notes) == (devices == 2)
+            for log in ("held_out.jsonl", "metrics.jsonl"):
+                assert steps_of(run / log) == [1, 2, 3, 4]
 
 
 def test_leftovers_of_killed_processes_are_removed(made):
@@ -225,7 +218,6 @@ def test_a_dataset_without_points_starts_at_random(whole, tmp_path, capsys):
     assert load_settings(run).config == config.replace(initial="random")
     shutil.rmtree(data)
     write_hostile(data, replace(bare, dataset=harmless().dataset))
-    capsys.readouterr()
     repeat(run)
     assert "--initial" not in capsys.readouterr().err
 
@@ -233,24 +225,22 @@ def test_a_dataset_without_points_starts_at_random(whole, tmp_path, capsys):
 @pytest.mark.parametrize("degree", [0, 2])
 def test_initial_gaussians_are_kept_bit_by_bit(whole, degree):
     """Except for bands that are dropped or added."""
-    dataset = load_dataset(whole / "data")
-    given = gsjax.load(whole / "run" / "splat.ply")
-    given = gsjax.with_sh_degree(given, 1)
+    dataset, config = load_dataset(whole / "data"), CONFIG.replace(sh_degree=degree)
+    given = gsjax.with_sh_degree(gsjax.load(whole / "run" / "splat.ply"), 1)
     keep = np.arange(given.capacity) % 3 != 0
     wanted = gsjax.compact(gsjax.select(given, keep), int(keep.sum()))
     wanted = gsjax.with_sh_degree(wanted, degree)
-    config = CONFIG.replace(sh_degree=degree)
     state = initial_state(dataset, config, gsjax.select(given, keep))
     assert int(state.step) == 0
     active = np.asarray(state.gaussians.active)
     assert active.sum() == keep.sum() > 0
     ours = jax.tree.map(lambda leaf: leaf[active], state.gaussians.params)
     jax.tree.map(np.testing.assert_array_equal, ours, wanted.params)
-    few = replace(config.mcmc, max_gaussians=given.capacity - 1)
+    few = config.replace(max_gaussians=given.capacity - 1)
     for count in (0, given.capacity):
         some = gsjax.select(given, np.arange(given.capacity) < count)
         with pytest.raises(InputError, match=f"1 to {given.capacity - 1}"):
-            initial_state(dataset, config.replace(mcmc=few), some)
+            initial_state(dataset, few, some)
 
 
 def test_a_run_starts_from_a_scene(made, capsys):
@@ -287,7 +277,7 @@ def test_a_scene_of_another_dataset_is_rejected(made, tmp_path, monkeypatch, cap
     gsjax.save(tmp_path / "far.ply", far)
     gsjax.save(tmp_path / "bands.ply", gsjax.with_sh_degree(given, 2))
     few = ["--max-gaussians", count - 1]
-    reduced = "SH degree 2 is reduced to 1 (--sh-degree)"
+    reduced = "SH degree 2 is reduced to 1"
     for scene, options, message in (
         (tmp_path / "far.ply", [], "in any of 2 views"),
         (made / "run", few, f"1 to {count - 1}"),
@@ -297,13 +287,6 @@ def test_a_scene_of_another_dataset_is_rejected(made, tmp_path, monkeypatch, cap
         assert train(made / "data", tmp_path / "new", *words) == 3
         assert message in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
-
-
-def test_a_trained_scene_is_used_in_full_from_the_first_step():
-    config = preset("default")
-    changed = continuation_config(config)
-    assert config.divisor(0) > changed.divisor(0) == 1
-    assert changed == config.replace(sh_every=1, levels=(Level(0.0, 1),))
 
 
 def test_dense_initialisation_counts_as_training(whole, tmp_path, monkeypatch, capsys):
@@ -369,7 +352,6 @@ def test_a_dataset_that_was_moved(made, capsys):
     notes = capsys.readouterr().err
     assert f"dataset is now {there}" in notes
     assert "finished before" in notes
-    assert "resuming" not in notes
     assert load_settings(run).dataset == there
     assert before[run / "splat.ply"] == contents(run)[run / "splat.ply"]
     evaluate_run(run)
@@ -444,42 +426,14 @@ def test_an_initial_scene_is_named_by_its_run_or_file(made, started, capsys):
     (made / "run" / "cameras.json").write_text("[]")
     assert start("--initial", made / "run") == 130
     assert "has refined cameras" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("options", "code", "message"),
-    [
-        ("--initial densely", 2, "--initial: expected points, dense, random"),
-        ("--initial none.ply", 3, "none.ply"),
-        ("--initial data", 3, "is a dataset; train on it first"),
-        ("--initial run -o run --overwrite", 2, "another folder with -o"),
-        ("--initial run --antialias", 2, "leave out --antialias"),
-        ("--test-images 0.png --test-every 0", 2, "exclude each other"),
-    ],
-)
-def test_invalid_options_of_train(options, code, message, whole, tmp_path, capsys):
-    before = contents(whole)
-    paths = {name: whole / name for name in ("data", "run")}
-    words = [paths.get(word, word) for word in options.split()]
-    assert train(paths["data"], tmp_path / "new", *words) == code
-    assert message in capsys.readouterr().err
-    assert contents(whole) == before
-    assert not (tmp_path / "new").exists()
-
-
-def test_evaluating_an_unfinished_run_is_reported(made, capsys):
-    path = made / "run" / "config.json"
-    for steps in (4, 8):
-        change(path, train={**json.loads(path.read_text())["train"], "steps": steps})
-        assert main(["eval", str(made / "run"), "--views", "train"]) == 0
-        unfinished = "unfinished: step 4 of 8" in capsys.readouterr().err
-        assert unfinished == (steps == 8)
+    # A trained scene is used in full from the first step.
+    config = load_settings(run).config
+    assert (config.levels, config.sh_every) == ((Level(0.0, 1),), 1)
 
 
 def test_renders_of_a_run_use_its_settings_with_occlusion_culling(whole):
-    source = open_scene_source(whole / "run")
-    assert CONFIG.raster != source.config
-    assert CONFIG.raster.replace(occlusion=True) == source.config
+    raster = open_scene_source(whole / "run").config
+    assert CONFIG.raster != raster == CONFIG.raster.replace(occlusion=True)
 
 
 def test_settings_of_older_versions_are_read():
@@ -493,3 +447,47 @@ def test_settings_of_older_versions_are_read():
     del data["rates"][-1]
     with pytest.raises(InputError, match="not the settings"):
         config_from_json(data)
+
+
+# Progress that a run reports.
+
+LEVELS = TrainConfig(steps=100, levels=(Level(0.0, 4), Level(0.5, 2), Level(0.8, 1)))
+
+
+def progress(step: int, compile_seconds: float = 0.0, **changes) -> Progress:
+    values = {**dict.fromkeys(Metrics._fields, 0), **changes, "step": step}
+    metrics = Metrics(*map(jnp.asarray, values.values()))
+    return Progress(metrics, 200.0, compile_seconds, 1, LEVELS.divisor(step), 64)
+
+
+def test_time_left_weighs_image_sizes_and_excludes_compilation(monkeypatch):
+    monkeypatch.setattr(report, "_LINE_SECONDS", 0.0)
+    clock = [time.time()]
+    reporter = Reporter(LEVELS)
+    monkeypatch.setattr(reporter.bar, "_time", lambda: clock[0])
+    reporter.bar.start_t = reporter.bar.last_print_t = clock[0]
+    clock[0] += 20.0
+    reporter.step(progress(1, compile_seconds=20.0))
+    for step in range(2, 51):
+        clock[0] += 1.0  # a step at a quarter of the size
+        reporter.step(progress(step, compile_seconds=20.0))
+    left = (reporter.bar.total - reporter.bar.n) / reporter.bar.format_dict["rate"]
+    assert left == pytest.approx(30 * 2 + 20 * 4, rel=0.02)
+    reporter.close()
+
+
+def test_the_mean_ignores_values_that_are_not_finite(capsys):
+    """The PSNR of a fully masked photograph is infinite."""
+    reporter, most = Reporter(LEVELS), LEVELS.max_gaussians
+    reporter.step(progress(1, psnr=math.inf))
+    assert math.isnan(reporter.psnr)
+    for step, psnr in enumerate((20.0, math.inf, math.nan), 2):
+        reporter.step(progress(step, psnr=psnr, wanted=most))
+        assert reporter.psnr == 20.0
+    reporter.step(progress(5, psnr=30.0))
+    assert 20 < reporter.psnr < 30
+    # Reaching the maximum is reported once.
+    for wanted in (most, most + 1, most + 2):
+        reporter.report_if_full(wanted)
+    assert capsys.readouterr().err.count(f"asks for {most + 1:,} Gaussians") == 1
+    reporter.close()

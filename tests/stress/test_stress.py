@@ -18,29 +18,23 @@ from gsjax.stress.types import Measurement, StressCase
 pytestmark = pytest.mark.as_users
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs/benchmarks/stability.md"
 SHORT = run.select_cases(False)
 # Of the thousand scenes of the full form, those with the largest errors of image and
 # gradient: benchmarks/results/stress.json.
 WORST = (94, 976)
 
 
-@pytest.fixture(scope="module")
-def results():
-    return {result.name: result for result in run.run_cases(SHORT, False)}
-
-
 @on_cpu
 @pytest.mark.long
-@pytest.mark.parametrize("name", [case.name for case in SHORT])
-def test_within_its_bound(results, name, report):
-    result = results[name]
-    report(name, result.measured, result.bound or 1)
+@pytest.mark.parametrize("case", SHORT, ids=lambda case: case.name)
+def test_within_its_bound(case, report):
+    (result,) = run.run_cases((case,), False)
+    report(case.name, result.measured, case.bound or 1)
     assert result.good, run.line(result)
 
 
 @on_cpu
-@settings(max_examples=25, deadline=None, derandomize=True, database=None)
+@settings(max_examples=25)
 @given(
     value=st.floats(width=32),
     entry=st.integers(0, 58),
@@ -62,7 +56,7 @@ def test_any_value_in_any_parameter(value, entry, slots):
 
 
 @on_cpu
-@settings(max_examples=25, deadline=None, derandomize=True, database=None)
+@settings(max_examples=25)
 @given(
     values=st.lists(st.floats(width=32), min_size=3, max_size=3),
     places=st.sets(st.sampled_from(list(poison.camera_entries())), max_size=3),
@@ -87,27 +81,25 @@ def test_the_worst_of_a_thousand_scenes(seed, report):
 
 
 def test_the_published_page_matches_the_cases_and_results():
-    names = [case.name for case in run.CASES]
-    assert len(set(names)) == len(names) > 40
-    left_out = set(run.select_cases(True)) - set(SHORT)
-    assert left_out
-    assert all(case.full_only for case in left_out)
-    page = PAGE.read_text(encoding="utf-8")
+    page = (ROOT / "docs/benchmarks/stability.md").read_text(encoding="utf-8")
     counts = re.search(r"short form, (\d+) of the (\d+)", " ".join(page.split()))
     assert counts is not None
     assert [*map(int, counts.groups())] == [len(SHORT), len(run.CASES)]
     told = json.loads((ROOT / "benchmarks/results/stress.json").read_text())
     assert told["form"] == "full"
-    table = page.split("<!-- gsjax stress -->\n")[1]
-    assert table.split("\n<!-- /gsjax stress -->")[0] == run.markdown(told)
+    assert between_marks(run.markdown(told)) in page
     rows = {row["name"]: row for row in told["rows"]}
-    assert set(rows) == set(names)
     worst = [rows[f"scenes/{n}"]["more"]["worst seed"] for n in ("image", "gradient")]
     assert tuple(worst) == WORST
+    assert len(rows) == len(run.CASES) > 40
     for case in run.CASES:
-        row = rows[case.name]
+        row = rows.pop(case.name)
         assert row["good"], case.name
         assert (row["claim"], row["bound"]) == (case.claim, case.bound), case.name
+
+
+def between_marks(text: str) -> str:
+    return f"<!-- gsjax stress -->\n{text}\n<!-- /gsjax stress -->\n"
 
 
 # --- the command ---
@@ -131,72 +123,57 @@ FAKE = {
 }
 
 
-def stress(monkeypatch, names: str, *args: str) -> int:
+def stress(monkeypatch, names: str, *args) -> int:
     cases = tuple(FAKE[name] for name in names.split())
     monkeypatch.setattr(run, "CASES", cases)
-    return main(["stress", *args])
+    return main(["stress", *map(str, args)])
 
 
 @pytest.mark.parametrize(
     ("names", "args", "code", "text"),
     [
-        ("well none full", [], 0, "2 of 2 cases within their bounds"),
-        ("well none", [], 0, "ok  a/well"),
-        ("well none", [], 0, "4 ×"),
-        ("well none", [], 0, "exact"),
-        ("well over", [], 1, "RED c/over"),
-        ("well nan", [], 1, "RED d/nan"),
-        ("well raises", [], 1, "ValueError: nothing to measure"),
-        ("well full", ["--full"], 1, "1 of 2 cases within their bounds"),
-        ("well over", ["--only", "a/"], 0, "1 of 1 cases"),
-        ("well full", ["--only", "full"], 2, "--full for f/full"),
-        ("well full", ["--full", "--only", "z"], 2, "--only 'z': no such case"),
+        ("well none full", "", 0, "2 of 2 cases within their bounds"),
+        ("well none", "", 0, "ok  a/well"),
+        ("well over", "", 1, "RED c/over"),
+        ("well nan", "", 1, "RED d/nan"),
+        ("well raises", "", 1, "ValueError: nothing to measure"),
+        ("well full", "--full", 1, "1 of 2 cases within their bounds"),
+        ("well over", "--only a/", 0, "1 of 1 cases"),
+        ("well full", "--only full", 2, "--full for f/full"),
+        ("well full", "--full --only z", 2, "--only 'z': no such case"),
+        ("well", "--markdown none.md", 3, "no such file"),
+        ("well", "--markdown latin.md", 3, "not UTF-8"),
+        ("well", "--markdown bare.md", 3, "no marks"),
     ],
 )
-def test_exit_code_and_output(names, args, code, text, monkeypatch, capsys):
-    assert stress(monkeypatch, names, *args) == code
+def test_exit_code_and_output(names, args, code, text, monkeypatch, tmp_path, capsys):
+    """Bad options and pages are rejected before measuring."""
+    monkeypatch.chdir(tmp_path)
+    Path("latin.md").write_bytes(b"caf\xe9")
+    Path("bare.md").write_text("without a table")
+    assert stress(monkeypatch, names, *args.split()) == code
     told = capsys.readouterr()
     assert text in told.out + told.err
+    assert (told.out == "") == (code > 1)
 
 
 def test_json_and_markdown(monkeypatch, tmp_path, capsys):
     path, page = tmp_path / "new" / "found.json", tmp_path / "page.md"
-    page.write_text("# a\n<!-- gsjax stress -->\nold\n<!-- /gsjax stress -->\nb\n")
-    args = ("--json", str(path), "--markdown", str(page))
+    page.write_text(f"# a\n{between_marks('old')}b\n")
+    args = ("--json", path, "--markdown", page)
     assert stress(monkeypatch, "well none nan raises", *args) == 1
     told = json.loads(path.read_text())
     assert told["form"] == "short"
     assert told["machine"]["jax"] == jax.__version__
     rows = {row["name"]: row for row in told["rows"]}
-    assert rows["a/well"]["margin"] == 4
-    assert rows["a/well"]["good"] is True
+    assert (rows["a/well"]["margin"], rows["a/well"]["good"]) == (4, True)
     assert rows["d/nan"]["measured"] is None
     assert rows["e/raises"]["error"].startswith("ValueError")
     text = page.read_text()
-    assert text.startswith("# a\n<!-- gsjax stress -->\n| case |")
-    assert text.endswith("\n<!-- /gsjax stress -->\nb\n")
-    assert "old" not in text
-    assert r"| a/well | share \|α\| | 0.25 | 1 | 4 × |" in text
-    rows = [line for line in text.splitlines() if line.startswith("|")]
-    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {6}
-    assert "| b/none | count | 0 px | 0 px | exact |" in text
+    assert text == f"# a\n{between_marks(run.markdown(told))}b\n"
+    table = [line for line in text.splitlines() if line.startswith("|")]
+    assert {len(re.findall(r"(?<!\\)\|", row)) for row in table} == {6}
+    assert r"| a/well | share \|α\| | 0.25 | 1 | 4 × |" in table
     assert "nan **(outside)**" in text
-    capsys.readouterr()
     assert stress(monkeypatch, "well", *args) == 3
     assert "--overwrite" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("content", "text"),
-    [(b"caf\xe9", "not UTF-8"), (b"no marks", "no marks"), (None, "no such file")],
-)
-def test_a_bad_page_is_rejected_before_measuring(
-    content, text, monkeypatch, tmp_path, capsys
-):
-    page = tmp_path / "page.md"
-    if content is not None:
-        page.write_bytes(content)
-    assert stress(monkeypatch, "well", "--markdown", str(page)) == 3
-    output = capsys.readouterr()
-    assert text in output.err
-    assert output.out == ""

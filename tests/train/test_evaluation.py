@@ -57,55 +57,34 @@ def renders(gaussians, scene):
     return [np.rint(r.render * 255).astype(np.uint8) for r in results]
 
 
-def test_a_photograph_of_the_scene_scores_its_rounding(gaussians, scene, renders):
-    photos = [photo_of(v, r) for v, r in zip(scene.views, renders)]
-    results = scored(gaussians, scene, photos)
-    for result in results:
-        assert result.psnr > 10 * np.log10(12 * 255**2) - 1.5
-        assert result.ssim > 0.999
-        np.testing.assert_allclose(result.psnr, psnr(result.render, result.truth), 1e-4)
-        np.testing.assert_allclose(result.ssim, ssim(result.render, result.truth), 1e-5)
-        assert result.valid is None
-    shifted = [p._replace(pixels=np.minimum(p.pixels, 229) + 26) for p in photos]
-    known = -20 * np.log10(26 / 255)
-    for result, pixels in zip(scored(gaussians, scene, shifted), renders):
-        if pixels.max() <= 229:
-            assert result.psnr == pytest.approx(known, abs=0.1)
-    assert min(p.max() for p in renders) <= 229
-
-
-def test_only_valid_pixels_count(gaussians, scene, renders):
-    valid = np.zeros((24, 32), bool)
-    valid[4:20, 3:28] = True
-    spoilt = np.where(valid[..., None], renders[0], 255 - renders[0])
-    (whole,) = scored(gaussians, scene, [photo_of(scene.views[0], spoilt)])
-    photo = photo_of(scene.views[0], spoilt, valid=valid)
-    (result,) = scored(gaussians, scene, [photo])
-    clean = photo_of(scene.views[0], renders[0], valid=valid)
-    (wanted,) = scored(gaussians, scene, [clean])
-    assert (result.psnr, result.ssim) == (wanted.psnr, wanted.ssim)
-    assert result.psnr > 50 > 20 > whole.psnr
-    np.testing.assert_array_equal(result.valid, valid)
-
-
-def test_fully_masked_views_are_left_out(gaussians, scene, renders):
-    masked = photo_of(scene.views[0], renders[0], valid=np.zeros((24, 32), bool))
-    photos = [masked, photo_of(scene.views[1], renders[1])]
-    first, second = scored(gaussians, scene, photos)
-    assert np.isnan([first.psnr, first.ssim]).all()
-    np.testing.assert_allclose(first.render * 255, renders[0], atol=0.51)
-    assert summarise([first, second])[:3] == (1, second.psnr, second.ssim)
-    assert summarise([first]).views == 0
-
-
-def test_transparent_photographs_are_over_the_background(gaussians, scene, renders):
-    alpha = np.zeros((24, 32), np.uint8)
-    alpha[:, ::2], alpha[:, 1::4] = 255, 51
-    photo = photo_of(scene.views[0], renders[0], alpha)
-    (result,) = scored(gaussians, scene, [photo])
-    share = alpha[..., None] / 255
-    wanted = renders[0] / 255 * share + np.asarray(BEHIND) * (1 - share)
-    np.testing.assert_allclose(result.truth, wanted, atol=1e-6)
+def test_scores_compare_the_render_with_the_photograph(gaussians, scene, renders):
+    """Over the background, if it is transparent; only valid pixels count."""
+    mixed, inner = np.zeros((24, 32), np.uint8), np.zeros((24, 32), bool)
+    mixed[:, ::2], mixed[:, 1::4], inner[4:20, 3:28] = 255, 51, True
+    spoilt = np.where(inner[..., None], renders[0], 255 - renders[0])
+    for pixels, alpha, valid in (
+        (renders[0], None, None),
+        (renders[0], mixed, None),
+        (spoilt, None, inner),
+        (spoilt, None, None),
+        (renders[0], None, np.zeros((24, 32), bool)),
+    ):
+        photo = photo_of(scene.views[0], pixels, alpha, valid)
+        (result,) = scored(gaussians, scene, [photo])
+        share = 1 if alpha is None else alpha[..., None] / 255
+        truth = np.float32(pixels / 255 * share + np.asarray(BEHIND) * (1 - share))
+        np.testing.assert_allclose(result.truth, truth, atol=1e-6)
+        np.testing.assert_allclose(result.render * 255, renders[0], atol=0.51)
+        np.testing.assert_equal(result.valid, valid)
+        if valid is not None and not valid.any():
+            assert np.isnan([result.psnr, result.ssim]).all()
+            continue
+        given = result.render, truth, None if valid is None else np.float32(valid)
+        np.testing.assert_allclose(result.psnr, psnr(*given), rtol=1e-4)
+        np.testing.assert_allclose(result.ssim, ssim(*given), rtol=1e-5)
+        if pixels is renders[0] and alpha is None:  # only rounded
+            assert result.psnr > 10 * np.log10(12 * 255**2) - 1.5
+            assert result.ssim > 0.999
 
 
 def test_photographs_of_unequal_sizes_score_as_alone(gaussians, scene, renders):
@@ -129,12 +108,6 @@ def test_photographs_of_unequal_sizes_score_as_alone(gaussians, scene, renders):
         assert alone.psnr > 40
 
 
-def test_missing_photographs_are_rejected(gaussians, scene, renders):
-    photo = photo_of(scene.views[0], renders[0])
-    with pytest.raises(ValueError, match="shorter"):
-        list(evaluate(gaussians, scene.views, [photo], config=CONFIG))
-
-
 @pytest.mark.parametrize(
     ("part", "value"),
     [
@@ -151,21 +124,26 @@ def test_missing_photographs_are_rejected(gaussians, scene, renders):
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_malformed_photographs_are_rejected(part, value, gaussians, scene):
-    view = scene.views[0]
-    photo = photo_of(view, np.zeros((24, 32, 3), np.uint8))._replace(**{part: value})
-    with pytest.raises(InputError, match=f"{view.name}: {part} of the photo"):
+    view, part_of = scene.views[0], f"{scene.views[0].name}: {part} of the photo"
+    good = photo_of(view, np.zeros((24, 32, 3), np.uint8))
+    photo = good._replace(**{part: value})
+    with pytest.raises(InputError, match=part_of):
         scored(gaussians, scene, [photo])
-    with pytest.raises(InputError, match=f"{view.name}: {part} of the photo"):
+    with pytest.raises(InputError, match=part_of):
         check_photos(replace(scene, views=scene.views[:1]), [photo])
+    with pytest.raises(ValueError, match="shorter"):
+        list(evaluate(gaussians, scene.views, [good], config=CONFIG))
 
 
 def test_summary_is_the_mean_of_the_views():
+    """Those that are fully masked do not count."""
     none = np.zeros((1, 1, 3))
-    results = [
+    masked, *results = (
         ViewResult(str(i), p, s, none, none, none[..., 0], None)
-        for i, (p, s) in enumerate([(20.0, 0.5), (30.0, 0.9), (25.0, 0.7)])
-    ]
-    assert summarise(iter(results)) == (3, 25.0, pytest.approx(0.7), LPIPS_NOTE)
-    nothing = summarise([])
-    assert nothing.views == 0
-    assert np.isnan([nothing.psnr, nothing.ssim]).all()
+        for i, (p, s) in enumerate([(np.nan,) * 2, (20, 0.5), (30, 0.9), (25, 0.7)])
+    )
+    found = summarise(iter([*results, masked]))
+    assert found == (3, 25.0, pytest.approx(0.7), LPIPS_NOTE)
+    for nothing in (summarise([]), summarise([masked])):
+        assert nothing.views == 0
+        assert np.isnan([nothing.psnr, nothing.ssim]).all()

@@ -10,14 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import as_compiled, on_cpu
+from conftest import on_cpu
 from training import (
     EXTENT,
-    HEIGHT,
     POINTS,
     RASTER,
     VIEWS,
-    WIDTH,
     bits,
     changed,
     dataset,
@@ -32,7 +30,6 @@ from gsjax.densify.mcmc import McmcSettings
 from gsjax.densify.schedule import EditSchedule
 from gsjax.errors import CapacityError, InputError
 from gsjax.raster.exact import count_demand
-from gsjax.runs.checkpoint import load_latest, restore, save_checkpoint
 from gsjax.train.capacity_policy import (
     as_spheres,
     expected_pairs,
@@ -42,13 +39,14 @@ from gsjax.train.capacity_policy import (
 )
 from gsjax.train.config import Level, TrainConfig
 from gsjax.train.frames import make_frames
-from gsjax.train.initialisation import empty_state, initial_state, resolve_initial
+from gsjax.train.initialisation import initial_state, resolve_initial
 from gsjax.train.loop import Hooks, fit, subset
 from gsjax.train.state import init_state, make_setup
 from gsjax.train.visibility_pruning import prune_invisible
 
 STEPS, FINER = 60, 30
 _PAUSE = 2.0  # s
+EDITS = {"start": 0, "stop": 50, "every": 7, "max_gaussians": 200}
 CONFIG = TrainConfig(
     steps=STEPS,
     levels=(Level(0.0, 2), Level(0.5, 1)),
@@ -57,17 +55,9 @@ CONFIG = TrainConfig(
     every_checkpoint=7,
     every_eval=25,
     adaptive=AdaptiveSettings(
-        start=0,
-        stop=50,
-        every=7,
-        threshold=1e-5,
-        reset_every=0,
-        max_gaussians=200,
-        initial_opacity=0.5,
+        **EDITS, threshold=1e-5, reset_every=0, initial_opacity=0.5
     ),
-    mcmc=McmcSettings(
-        start=0, stop=50, every=7, growth=1.2, max_gaussians=200, initial_scale=1.0
-    ),
+    mcmc=McmcSettings(**EDITS, growth=1.2, initial_scale=1.0),
     exposure=True,
     raster=RASTER.replace(pair_capacity=None),
 )
@@ -81,34 +71,24 @@ pytestmark = pytest.mark.usefixtures("float32", "shared_programs")
 
 
 class Log:
-    """Records of a run; optionally stops it and saves its checkpoints."""
+    """Records of a run, and the step at which it is stopped."""
 
-    def __init__(self, stop_at=None, folder=None):
+    def __init__(self, stop_at=None):
         self.records, self.phases, self.saved, self.measured = [], [], [], []
-        self.stop_at, self.folder = stop_at, folder
+        self.stop_at = stop_at
 
     def hooks(self):
         return Hooks(
-            step=self.step,
+            step=lambda progress: self.records.append(progress.record()),
             phase=self.phases.append,
             checkpoint=self.checkpoint,
             measure=self.measure,
-            stop=self.stop,
+            stop=lambda: self.records[-1]["step"] == self.stop_at,
         )
 
-    def step(self, progress):
-        self.records.append(progress.record())
-
-    def stop(self):
-        return self.records[-1]["step"] == self.stop_at
-
-    def checkpoint(self, state, pair_capacity, progress):
+    def checkpoint(self, state, _, progress):
         assert progress.metrics.step == state.step
         self.saved.append(int(state.step))
-        if self.folder:
-            save_checkpoint(
-                self.folder, state, {"pair_capacity": pair_capacity, "seconds": 0.0}
-            )
 
     def measure(self, state, progress):
         assert progress.metrics.step == state.step
@@ -156,30 +136,18 @@ def test_the_loss_falls(whole, strategy):
     finer = len(CONFIGS[strategy].levels) > 1
     wanted = np.where(finer & (np.arange(STEPS) >= FINER), 1, 2)
     np.testing.assert_array_equal(divisors, wanted)
-    assert f"{WIDTH // 2} × {HEIGHT // 2} px" in log.phases[0]
     assert result.state.gaussians.params.means.dtype == np.float32
     for leaf in jax.tree.leaves(result.gaussians.params):
         assert np.isfinite(leaf).all()
 
 
 @on_cpu
-@pytest.mark.parametrize(
-    ("strategy", "stop_at"),
-    [("adaptive", FINER), ("mcmc", 17)],
-)
-def test_a_resumed_run_is_bit_equal(whole, strategy, stop_at, tmp_path):
+def test_a_resumed_run_is_bit_equal(whole):
     """Across changes of resolution, edits and checkpoints."""
-    config, (wanted, full) = CONFIGS[strategy], whole[strategy]
-    first, log = run(config, Log(stop_at))
-    assert int(first.state.step) == stop_at
-    saved = save_checkpoint(
-        tmp_path, first.state, {"pair_capacity": first.pair_capacity, "seconds": 0.0}
-    )
-    found = load_latest(saved.parent)
-    template = empty_state(config, EXTENT, VIEWS, found.meta["capacity"])
-    state = restore(found, template)
-    assert changed(state, first.state) == []
-    second, rest = run(config, state=state, pair_capacity=found.meta["pair_capacity"])
+    config, (wanted, full) = CONFIGS["adaptive"], whole["adaptive"]
+    first, log = run(config, Log(stop_at=FINER))
+    assert int(first.state.step) == FINER
+    second, rest = run(config, state=first.state, pair_capacity=first.pair_capacity)
     assert changed(second.state, wanted.state) == []
     names = ("step", "loss", "psnr", "gaussians", "wanted", "pairs", "capacity")
     assert log.told(*names) + rest.told(*names) == full.told(*names)
@@ -187,7 +155,7 @@ def test_a_resumed_run_is_bit_equal(whole, strategy, stop_at, tmp_path):
 
 
 @on_cpu
-def test_capacities_grow_without_changing_bits(shared_programs):
+def test_capacities_grow_without_changing_bits():
     """Until the first edit; from then on random draws depend on the slots."""
     config = CONFIGS["adaptive"]
     state = init_state(rough_start(1, 64), config, EXTENT, VIEWS)
@@ -200,7 +168,6 @@ def test_capacities_grow_without_changing_bits(shared_programs):
     assert changed(grow_state(small.state, 1024), large.state) == []
     assert log.told("step", "loss", "pairs") == other.told("step", "loss", "pairs")
     assert len(log.records) == 6
-    assert ["7 pairs" in phase for phase in log.phases] == [True, False]
     pairs = small.pair_capacity
     assert 7 < pairs < large.pair_capacity
     assert small.gaussians.capacity == 1024  # recompiled anyway
@@ -212,33 +179,25 @@ def test_capacities_grow_without_changing_bits(shared_programs):
     assert result.gaussians.capacity == 1024
     assert int(result.gaussians.active.sum()) == 64
     assert bits(state) == before  # not donated
-    # Only differentiation depends on the pair capacity.
-    (compiled,) = [v for k, v in shared_programs.items() if as_compiled(limited) in k]
-    assert [len(programs) for programs in compiled] == [3, 2]
 
 
 @on_cpu
-def test_the_state_is_saved_before_a_capacity_error(monkeypatch):
-    """Not after a failed step."""
-    config = CONFIGS["adaptive"]
+def test_a_failed_state_is_not_saved_before_a_capacity_error(monkeypatch):
+    config, log = CONFIGS["adaptive"], Log()
     begun, _ = run(config, Log(stop_at=FINER - 1))
-    given = {"state": begun.state, "pair_capacity": begun.pair_capacity}
 
     def too_many(*_):
         raise CapacityError("too many")
 
+    def fail(health, _):
+        health.bad = 1
+
     monkeypatch.setattr(fit_module, "pairs_for", too_many)
-    for bad, saved in ((0, [FINER]), (1, [])):
-        log = Log()
-        monkeypatch.setattr(
-            fit_module.Health,
-            "check",
-            lambda self, _, bad=bad: setattr(self, "bad", bad),
-        )
-        with pytest.raises(CapacityError, match="too many"):
-            run(config, log, **given)
-        assert [record["step"] for record in log.records] == [FINER]
-        assert log.saved == saved
+    monkeypatch.setattr(fit_module.Health, "check", fail)
+    with pytest.raises(CapacityError, match="too many"):
+        run(config, log, state=begun.state, pair_capacity=begun.pair_capacity)
+    assert log.told("step") == [(FINER,)]
+    assert log.saved == []
 
 
 @on_cpu
@@ -278,20 +237,18 @@ def test_pruning_invisible_gaussians_keeps_the_views_bit_equal():
 
 def test_initial_points():
     """Non-finite points do not count. A finished run makes no step."""
-    config, bare = CONFIGS["mcmc"], replace(dataset(), points=np.zeros((0, 3)))
-    wild = replace(dataset(), points=np.full((POINTS, 3), np.nan))
-    assert config.initial == "auto"
-    assert resolve_initial(dataset(), config).initial == "points"
-    for initial in ("points", "random"):
-        given = config.replace(initial=initial)
+    config, points = CONFIGS["mcmc"], CONFIGS["mcmc"].replace(initial="points")
+    assert resolve_initial(dataset(), config) == points
+    random = config.replace(initial="random")
+    for given in (points, random):
         assert resolve_initial(dataset(), given) == given
-    for without in (bare, wild):
-        random = resolve_initial(without, config)
-        assert random == config.replace(initial="random")
+    for points_of in (np.zeros((0, 3)), np.full((POINTS, 3), np.nan)):
+        without = replace(dataset(), points=points_of)
+        assert resolve_initial(without, config) == random
         first, second = (initial_state(without, c) for c in (config, random))
         assert changed(first, second) == []
         with pytest.raises(InputError, match="points"):
-            resolve_initial(without, config.replace(initial="points"))
+            resolve_initial(without, points)
     state = first.replace(step=jnp.int32(STEPS))
     result, log = run(config, state=state, pair_capacity=99)
     assert (result.progress, result.pair_capacity) == (None, 99)
@@ -314,25 +271,16 @@ def test_the_slots_minimise_the_cost():
     first, last = 20_000, 200_000
     for steps in (1000, 4000, 30_000):
         schedule = EditSchedule(0, steps, 1, 2.0, last)
-        config = TrainConfig(steps=steps)
-        chosen = slots_for(first, 0, config, schedule) - first
+        chosen = slots_for(first, 0, TrainConfig(steps=steps), schedule) - first
         cost = [
             (last - first) / lot * 1e7 + steps * lot / 2
             for lot in (chosen, *range(1000, last - first, 1000))
         ]
         assert cost[0] < 1.1 * min(cost)
-
-
-@on_cpu
-def test_slots_are_limited_by_the_growth():
+    # Limited by the growth, which ends with the last edit; in eighths of a power of 2.
     few = replace(CONFIG.adaptive, max_gaussians=50_000).schedule
-    grows = replace(CONFIG.mcmc, max_gaussians=50_000, growth=1.05).schedule
-    assert slots_for(40_000, 0, CONFIG, few) == 53_248  # 50,000, in eighths of 32,768
-    assert slots_for(40_000, 60, CONFIG, few) == 40_960  # after the last edit
-    # Four edits until the resolution changes.
-    assert slots_for(20_000, 0, CONFIG, grows) == 24_576
-    assert slots_for(24_310, FINER, CONFIG, grows) == 28_672
-    assert slots_for(60_000, 0, CONFIG, few) == 61_440
+    assert slots_for(40_000, 0, CONFIG, few) == 53_248
+    assert slots_for(40_000, 60, CONFIG, few) == 40_960
 
 
 def test_estimate_of_the_initial_pairs():
@@ -362,25 +310,12 @@ def test_the_last_step_is_not_followed_by_an_edit(strategy):
 
 
 @on_cpu
-def test_spare_pairs_grow_with_the_expected_gaussians():
-    """Limited by the growth, and by the cost of a compilation."""
-    state = initial_state(dataset(), CONFIG)
-
-    def margin(pairs, step, steps, growth=100, stop=5000):
-        config = TrainConfig(steps=steps)
-        schedule = EditSchedule(0, stop, 1, 2.0, growth * POINTS)
-        now = state.replace(step=jnp.int32(step))
-        return with_margin(pairs, now, config, schedule) / pairs
-
-    roomy = margin(300_000, 0, 100)
-    assert roomy == pytest.approx(4, rel=0.4)
-    assert margin(300_000, 0, 10_000) == pytest.approx(2.5, rel=0.2)
-    assert margin(60_000, 0, 1500) == pytest.approx(3, rel=0.2)
-    settled = margin(300_000, 60, 100, stop=60)
-    assert settled == margin(300_000, 1, 100, growth=1) < 2
-    # Initial Gaussians are narrow.
-    assert 1.1 * settled < margin(300_000, 0, 100, growth=1) < roomy
-    done = state.replace(step=jnp.int32(CONFIG.schedule.stop))
-    assert with_margin(2**30 - 9, done, CONFIG, CONFIG.schedule) == 2**30 - 1
+def test_pair_capacities_have_a_margin_and_a_limit():
+    """The margin is wider while Gaussians are added."""
+    state, schedule = initial_state(dataset(), CONFIG), CONFIG.schedule
+    settled = state.replace(step=jnp.int32(schedule.stop))
+    most, least = (with_margin(3e5, x, CONFIG, schedule) for x in (state, settled))
+    assert 3e5 < least < 6e5 < most
+    assert with_margin(2**30 - 9, settled, CONFIG, schedule) == 2**30 - 1
     with pytest.raises(CapacityError, match="2,147,483,647 or more"):
-        with_margin(2**31 - 1, done, CONFIG, CONFIG.schedule)
+        with_margin(2**31 - 1, settled, CONFIG, schedule)

@@ -2,9 +2,13 @@
 
 import numpy as np
 import pytest
+from training import dataset
 
 from gsjax.data.types import Photo
 from gsjax.train.frames import make_frames, views_of_step
+
+VIEW = dataset().views[0]
+PIXELS = np.random.default_rng(0).integers(0, 256, (24, 32, 3)).astype(np.uint8)
 
 
 def photo_of(pixels, alpha=None) -> Photo:
@@ -12,15 +16,8 @@ def photo_of(pixels, alpha=None) -> Photo:
     return Photo(pixels, alpha, None, K)
 
 
-def shrunk(photo, divisor, view) -> np.ndarray:
-    return np.asarray(make_frames([view], [photo], divisor).pixels[0], np.float64)
-
-
-@pytest.fixture
-def view():
-    from training import dataset
-
-    return dataset().views[0]
+def shrunk(photo, divisor) -> np.ndarray:
+    return np.asarray(make_frames([VIEW], [photo], divisor).pixels[0], np.float64)
 
 
 def over(pixels, alpha, background):
@@ -29,67 +26,50 @@ def over(pixels, alpha, background):
     return share * pixels + (1 - share) * background
 
 
+@pytest.mark.parametrize("transparent", [False, True])
 @pytest.mark.parametrize("divisor", [2, 4])
-def test_downscaling_averages_the_image_over_any_background(divisor, view):
+def test_downscaling_averages_the_image_over_any_background(divisor, transparent):
     rng = np.random.default_rng(0)
-    pixels = rng.integers(0, 256, (24, 32, 3)).astype(np.uint8)
     alpha = rng.choice(np.asarray([0, 0, 1, 90, 255, 255], np.uint8), (24, 32))
-    alpha[:8, :8] = 0
-    small = shrunk(photo_of(pixels, alpha), divisor, view)
+    alpha[:8, :8] = 0  # where colours have no effect
+    alpha = alpha if transparent else np.full((24, 32), 255, np.uint8)
+    small = shrunk(photo_of(PIXELS, alpha), divisor)
+    if not transparent:
+        plain = shrunk(photo_of(PIXELS), divisor)
+        assert (small[..., 3] == 255).all()
+        assert np.abs(small[..., :3] - plain).max() <= 1
     for background in (0.0, 255.0, 77.0):
-        seen = over(pixels, alpha, background)
+        seen = over(PIXELS, alpha, background)
         blocks = seen.reshape(24 // divisor, divisor, 32 // divisor, divisor, 3)
         found = over(small[..., :3], small[..., 3], background)
         # Rounding of colour and opacity.
         assert np.abs(found - blocks.mean(axis=(1, 3))).max() <= 1.0 + 1e-3
 
 
-def test_transparent_colours_have_no_effect(view):
-    rng = np.random.default_rng(1)
-    pixels = rng.integers(0, 256, (24, 32, 3)).astype(np.uint8)
-    alpha = rng.choice(np.asarray([0, 128, 255], np.uint8), (24, 32))
-    alpha[:8] = 0
-    other = np.where(alpha[..., None] > 0, pixels, 255 - pixels)
-    small = shrunk(photo_of(pixels, alpha), 2, view)
-    np.testing.assert_array_equal(small, shrunk(photo_of(other, alpha), 2, view))
-    assert (small[..., 3] == 0).any()
-    assert (small[small[..., 3] == 0] == 0).all()
-    assert small.max() > 100
-
-
-def test_an_opaque_alpha_channel_has_no_effect(view):
-    pixels = np.random.default_rng(2).integers(0, 256, (24, 32, 3)).astype(np.uint8)
-    plain = shrunk(photo_of(pixels), 3, view)
-    opaque = shrunk(photo_of(pixels, np.full((24, 32), 255, np.uint8)), 3, view)
-    assert (opaque[..., 3] == 255).all()
-    assert np.abs(opaque[..., :3] - plain).max() <= 1
-
-
 @pytest.mark.parametrize("divisor", [1, 2])
-def test_the_opacity_channel_is_added_if_any_photograph_has_one(view, divisor):
-    pixels = np.full((24, 32, 3), 90, np.uint8)
-    clear = photo_of(pixels, np.full((24, 32), 60, np.uint8))
-    both = make_frames([view, view], [photo_of(pixels), clear], divisor).pixels
+def test_the_opacity_channel_is_added_if_any_photograph_has_one(divisor):
+    plain = photo_of(PIXELS)
+    clear = photo_of(PIXELS, np.full((24, 32), 60, np.uint8))
+    both = make_frames([VIEW] * 2, [plain, clear], divisor).pixels
     assert both.shape[-1] == 4
     assert (both[0, ..., 3] == 255).all()
     assert (both[1, ..., 3] == 60).all()
-    assert make_frames([view], [photo_of(pixels)], divisor).pixels.shape[-1] == 3
+    assert make_frames([VIEW], [plain], divisor).pixels.shape[-1] == 3
 
 
-def test_smaller_photographs_are_padded(view):
+def test_smaller_photographs_are_padded():
     """Padding is not valid; intrinsics scale with the divisor."""
-    pixels = np.random.default_rng(3).integers(0, 256, (24, 32, 3)).astype(np.uint8)
-    large, small = photo_of(pixels), photo_of(pixels[:20, :30])
-    frames = make_frames([view] * 2, [large, small])
+    large, small = photo_of(PIXELS), photo_of(PIXELS[:20, :30])
+    frames = make_frames([VIEW] * 2, [large, small])
     np.testing.assert_array_equal(frames.pixels[1, :20, :30], small.pixels)
     assert frames.valid[0].all()
     assert frames.valid[1].sum() == 20 * 30
     assert frames.size.tolist() == [[32, 24], [30, 20]]
-    half = make_frames([view] * 2, [large, small], 2)
+    half = make_frames([VIEW] * 2, [large, small], 2)
     assert half.pixels.shape == (2, 12, 16, 3)
     assert half.valid[1].sum() == 10 * 15
     np.testing.assert_allclose(half.camera.K[1], np.diag([0.5, 0.5, 1]) @ small.K)
-    assert make_frames([view] * 2, [large, large]).valid is None
+    assert make_frames([VIEW] * 2, [large, large]).valid is None
 
 
 @pytest.mark.parametrize("batch", [1, 3])

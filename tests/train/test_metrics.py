@@ -1,4 +1,4 @@
-"""Laws of PSNR and SSIM, against direct sums over windows."""
+"""Laws of PSNR, SSIM and the photometric loss, against direct sums over windows."""
 
 import jax
 import jax.numpy as jnp
@@ -6,20 +6,25 @@ import numpy as np
 import pytest
 
 from gsjax.errors import InputError
+from gsjax.train import ssim_window
+from gsjax.train.losses import photometric, photometric_batch
 from gsjax.train.metrics import psnr, ssim, ssim_map, weighted_mean
 
 # One pixel, smaller than the window, and larger than the blocks.
 SIZES = [(1, 1), (3, 20), (24, 32), (70, 400)]
+# Smaller than the window, one block, several blocks, several segments.
+PLANES = [(1, 1, 3), (4, 3, 1), (70, 40, 3), (3, 700, 3)]
+METHODS = {"loops": ssim_window._by_loops, "products": ssim_window._by_products}
 
 maps = jax.jit(ssim_map)
-scores = jax.jit(lambda x, y, w: (psnr(x, y, w), ssim(x, y, w)))
 
 
 @jax.jit
-def gradients(image, target, weight):
-    return jax.grad(lambda x, y: psnr(x, y, weight) + ssim(x, y, weight), (0, 1))(
-        image, target
-    )
+def scores(x, y, weight):
+    return psnr(x, y, weight), ssim(x, y, weight), photometric(x, y, weight)
+
+
+gradients = jax.jit(jax.grad(lambda *given: sum(scores(*given)), (0, 1)))
 
 
 def pair(height, width, channels=3, seed=0):
@@ -31,26 +36,54 @@ def pair(height, width, channels=3, seed=0):
     return first, np.clip(first + noise, 0, 1)
 
 
-def dense_ssim(x, y):
-    """Return the SSIM of each pixel by sums over 11 × 11 px, zero padded."""
-    offsets = np.arange(-5, 6)
-    window = np.exp(-0.5 * (offsets / 1.5) ** 2)
+def dense_means(plane):
+    """Return the means by sums over 11 × 11 px, zero padded."""
+    window = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
     window = np.outer(window, window) / window.sum() ** 2
-    height, width = x.shape[:2]
+    height, width = plane.shape[:2]
+    padded = np.pad(plane, ((5, 5), (5, 5), (0, 0)))
+    total = np.zeros_like(plane)
+    for i in range(11):
+        for j in range(11):
+            total += window[i, j] * padded[i : i + height, j : j + width]
+    return total
 
-    def means(values):
-        padded = np.pad(values, ((5, 5), (5, 5), (0, 0)))
-        total = np.zeros_like(values)
-        for i in range(11):
-            for j in range(11):
-                total += window[i, j] * padded[i : i + height, j : j + width]
-        return total
 
-    mx, my = means(x), means(y)
-    vx, vy, covar = means(x * x) - mx**2, means(y * y) - my**2, means(x * y) - mx * my
+def dense_ssim(x, y):
+    mx, my, xx, yy, xy = map(dense_means, (x, y, x * x, y * y, x * y))
+    vx, vy, covar = xx - mx**2, yy - my**2, xy - mx * my
     return ((2 * mx * my + 1e-4) * (2 * covar + 9e-4)) / (
         (mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4)
     )
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("shape", PLANES, ids=str)
+def test_means_are_weighted_sums(shape, method):
+    planes = list(np.random.default_rng(0).normal(size=(2, *shape)))
+    found = METHODS[method](list(map(jnp.asarray, planes)))
+    for one, plane in zip(found, planes, strict=True):
+        np.testing.assert_allclose(one, dense_means(plane), rtol=0, atol=1e-14)
+
+
+def test_derivatives_of_means_are_the_map_itself():
+    x, slope, other = jnp.asarray(np.random.default_rng(1).normal(size=(3, 9, 14, 3)))
+
+    def means(x):
+        return ssim_window.window_means((x,))[0]
+
+    first = means(slope)
+    slopes = jax.grad(lambda x: jnp.sum(means(x) ** 2) / 2)
+    one_by_one = jnp.stack([slopes(x), slopes(other)])
+    for found, wanted in (
+        (jax.jvp(means, (x,), (slope,))[1], first),
+        (jax.vjp(means, x)[1](slope)[0], first),
+        (jax.jvp(slopes, (x,), (slope,))[1], means(first)),
+        (jax.grad(lambda x: jnp.vdot(slopes(x), slope))(x), means(first)),
+        (jax.vmap(slopes)(jnp.stack([x, other])), one_by_one),
+    ):
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(jnp.vdot(first, other), jnp.vdot(slope, means(other)))
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
@@ -64,8 +97,7 @@ def test_ssim_is_the_sum_over_windows(size, report):
         error = np.abs(found - wanted).max()
         report(f"ssim {size} {dtype.__name__}", error, bar)
         assert error <= bar
-    if size == (24, 32):
-        np.testing.assert_allclose(scores(x, y, None)[1], wanted.mean(), rtol=1e-11)
+    np.testing.assert_allclose(ssim(x, y), wanted.mean(), rtol=1e-11)
 
 
 @pytest.mark.parametrize("types", [("float32", "float64"), ("float64", "float32")])
@@ -84,16 +116,17 @@ def test_mixed_dtypes_promote(types):
 def test_symmetry_bounds_and_identity(channels):
     for seed in range(3):
         x, y = pair(24, 32, channels, seed)
-        (quality, between), back = scores(x, y, None), scores(y, x, None)
-        assert quality == back[0]
-        np.testing.assert_allclose(between, back[1], rtol=1e-12)
-        assert -1 <= between < 1 - 1e-3
-        assert scores(x, 1 - x, None)[1] < between
+        found, back = scores(x, y, None), scores(y, x, None)
+        assert found[0] == back[0]
+        np.testing.assert_allclose(found[1:], back[1:], rtol=1e-12)
+        assert -1 <= found[1] < 1 - 1e-3
+        assert scores(x, 1 - x, None)[1] < found[1]
         for dtype, bar in ((np.float32, 1e-6), (np.float64, 1e-12)):
             same = jnp.asarray(x, dtype)
-            quality, likeness = scores(same, same, None)
+            quality, likeness, loss = scores(same, same, None)
             assert quality == np.inf
             assert abs(likeness - 1) <= bar
+            assert abs(loss) <= bar
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32, bool])
@@ -101,10 +134,9 @@ def test_symmetry_bounds_and_identity(channels):
 def test_integer_images_are_rejected(dtype, measure):
     x, y = (picture.astype(np.float32) for picture in pair(24, 32))
     for both in ((x.astype(dtype), y), (x, y.astype(dtype))):
-        with pytest.raises(InputError, match=r"image: expected .*image / 255"):
-            measure(*both)
-        with pytest.raises(InputError, match=r"image: expected .*image / 255"):
-            jax.jit(measure)(*both)
+        for call in (measure, jax.jit(measure)):
+            with pytest.raises(InputError, match=r"image: expected .*image / 255"):
+                call(*both)
 
 
 def test_weights():
@@ -128,9 +160,7 @@ def test_excluded_pixels_have_no_effect(garbage):
     x, y = (np.float32(a) for a in pair(24, 32))
     weight = np.float32(np.random.default_rng(1).uniform(size=(24, 32)) > 0.3)
     hidden = (weight == 0)[..., None]
-    spoilt = np.where(hidden, garbage, x), np.where(hidden, garbage, y)
-    spoilt = [np.float32(a) for a in spoilt]
-    assert not np.array_equal(spoilt[0], x)
+    spoilt = [np.float32(np.where(hidden, garbage, image)) for image in (x, y)]
     for given in ((spoilt[0], y), (x, spoilt[1]), spoilt):
         for a, b in zip(scores(x, y, weight), scores(*given, weight)):
             assert np.isfinite(a)
@@ -157,3 +187,61 @@ def test_gradients_are_finite_differences(weighted, report):
         error = abs(slope - wanted) / max(1, abs(wanted))
         report(f"gradient, weighted {weighted}", error, 1e-6)
         assert error <= 1e-6
+
+
+# The photometric loss.
+
+
+def pictures():
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(size=(2, 15, 14, 3))
+    return x, y, np.float64(rng.uniform(size=(15, 14)) > 0.3)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
+def test_the_formula(share):
+    x, y, weight = pictures()
+    for mask in (None, weight):
+        mean = np.average(np.abs(x - y).mean(-1), weights=mask)
+        wanted = (1 - share) * mean + share * (1 - ssim(x, y, mask))
+        np.testing.assert_allclose(photometric(x, y, mask, share), wanted, rtol=1e-12)
+    assert photometric(x, y) == photometric(x, y, None, 0.2)
+
+
+def test_pixels_that_are_equal_or_all_excluded_have_no_gradient():
+    x, y, weight = pictures()
+    image = x.copy()
+    image[3:9, 4:] = y[3:9, 4:]
+    slope = jax.grad(photometric)(image, y, None, 0.0)
+    np.testing.assert_allclose(slope, np.sign(image - y) / image.size, atol=1e-18)
+    for share in (0.0, 0.2):
+        slope = jax.grad(photometric)(y, y, None, share)
+        np.testing.assert_allclose(slope, 0, atol=1e-15)
+    value, slope = jax.value_and_grad(photometric)(x, y, 0 * weight)
+    assert np.isfinite(value)
+    assert (slope == 0).all()
+
+
+@pytest.mark.parametrize(("height", "share"), [(7, 0.2), (30, 0.0)])
+def test_devices_do_not_change_the_loss(height, share):
+    """Also with an odd number of rows, and bands smaller than the window."""
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(size=(2, 2, height, 14, 3))
+    mask = np.float64(rng.uniform(size=(2, height, 14)) > 0.3)
+    mask[1] = 0
+
+    def apart(images, weights):
+        weights = [None, None] if weights is None else weights
+        losses = [photometric(*one, share) for one in zip(images, y, weights)]
+        return losses[0] + 2 * losses[1]
+
+    def spread(images, weights):
+        losses = photometric_batch(images, y, weights, share, devices=2)
+        return losses[0] + 2 * losses[1]
+
+    for weights in (mask, None):
+        found, slope = jax.jit(jax.value_and_grad(spread))(x, weights)
+        wanted, wanted_slope = jax.jit(jax.value_and_grad(apart))(x, weights)
+        np.testing.assert_allclose(found, wanted, rtol=1e-12)
+        np.testing.assert_allclose(slope, wanted_slope, atol=1e-15)
+        assert (slope != 0).any()

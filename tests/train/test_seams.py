@@ -6,22 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from training import (
-    EXTENT,
-    RASTER,
-    VIEWS,
-    changed,
-    copy,
-    dataset,
-    photos,
-    rough_start,
-)
+from training import EXTENT, RASTER, VIEWS, changed, copy, dataset, photos, rough_start
 
 import gsjax
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.densify.types import SlotEdit, Strategy
 from gsjax.errors import InputError
-from gsjax.math.rotations import quaternion_to_matrix
 from gsjax.raster.types import RasterConfig
 from gsjax.train.config import TrainConfig, preset
 from gsjax.train.frames import draw, make_frames
@@ -39,44 +29,41 @@ CONFIG = TrainConfig(
     mcmc=McmcSettings(start=1000, opacity_penalty=0.0, scale_penalty=0.0),
     raster=RASTER,
 )
-FRAMES = make_frames(dataset().views, photos())
 
 
 def _move(params, view):
-    """Rotate and shift the scene, in proportion to the time."""
-    motion, gaussians = params.model.shared["motion"], params.gaussians
-    turn, shift = view.time * motion[:3], view.time * motion[3:]
-    rotation = quaternion_to_matrix(jnp.concatenate([jnp.ones(1), turn]))
-    means = gaussians.params.means @ rotation.T + shift + params.model.slots["offset"]
+    """Shift the scene in proportion to the time, and each Gaussian by its offset."""
+    shift, gaussians = params.model.shared["shift"], params.gaussians
+    means = gaussians.params.means + view.time * shift + params.model.slots["offset"]
     return gaussians.replace(params=gaussians.params.replace(means=means))
 
 
-RIGID = Model(
+MOVING = Model(
     init=lambda gaussians: ModelParams(
         slots={"offset": jnp.zeros((gaussians.capacity, 3))},
-        shared={"motion": jnp.zeros(6)},
+        shared={"shift": jnp.zeros(3)},
     ),
     apply=_move,
-    rates={"motion": 2e-3, "offset": lambda fraction: 1e-4 * (1 - fraction)},
+    rates={"shift": 2e-3, "offset": lambda fraction: 1e-4 * (1 - fraction)},
 )
 
 
-def clone_all(gaussians):
+def clone_all(slots):
     """Return a strategy that clones all Gaussians after the second step."""
-    slots = gaussians.capacity
+    rows = np.arange(slots)
 
     def plan(key, step, gaussians, stats):
         del key, step
         count = jnp.sum(gaussians.active)
-        rows = jnp.arange(slots)
         born = (rows >= count) & (rows < 2 * count)
-        source = jnp.where(born, rows - count, slots)
-        params = jax.tree.map(
-            lambda a: a[jnp.where(born, rows - count, rows)], gaussians.params
-        )
-        active = gaussians.active | born
+        parent = jnp.where(born, rows - count, rows)
         edit = SlotEdit(
-            params, active, born, jnp.asarray(False), 2 * count, source=source
+            params=jax.tree.map(lambda a: a[parent], gaussians.params),
+            active=gaussians.active | born,
+            cleared=born,
+            opacities_reset=jnp.asarray(False),
+            wanted=2 * count,
+            source=jnp.where(born, parent, slots),
         )
         return edit, stats
 
@@ -88,40 +75,34 @@ def clone_all(gaussians):
     )
 
 
-@pytest.fixture(scope="module")
-def given():
-    """The other arguments of `fit`; runs share their programs."""
-    gaussians = rough_start(0, SLOTS)
-    term = LossTerm("zero", lambda *_: jnp.asarray(0.0))
-    return {"strategy": clone_all(gaussians), "model": RIGID, "loss_terms": (term,)}
+SEAMS = {"strategy": clone_all(SLOTS), "model": MOVING}
+# The other arguments of `fit`; runs share their programs.
+GIVEN = {**SEAMS, "loss_terms": (LossTerm("zero", lambda *_: jnp.asarray(0.0)),)}
+
+
+def state_of(slots=SLOTS, **seams):
+    return init_state(rough_start(0, slots), CONFIG, EXTENT, VIEWS, **seams)
 
 
 def captured(turn=1):
-    """Return the photographs of the dataset, taken at time 1, from arrays."""
-    cameras = [
-        gsjax.make_camera(
-            viewmat=np.diag([turn, 1, turn, 1]) @ view.viewmat, K=view.K,
-            width=view.width, height=view.height,
-        )
+    """Return dataset and photographs of time 1; a turn of -1 looks away."""
+    views = [
+        replace(view, time=1.0, viewmat=np.diag([turn, 1, turn, 1]) @ view.viewmat)
         for view in dataset().views
-    ]  # fmt: skip
-    made, taken = gsjax.make_dataset([p.pixels for p in photos()], cameras)
-    views = tuple(replace(view, time=1.0) for view in made.views)
-    return replace(made, views=views), taken
+    ]
+    return replace(dataset(), views=tuple(views)), photos()
 
 
-def test_fit_takes_all_of_them(tmp_path, given, shared_programs):
+@pytest.mark.usefixtures("shared_programs")
+def test_fit_takes_all_of_them(tmp_path):
     """Rows of a model follow the edit, and their moments are cleared."""
-    del shared_programs
-    seams = {name: given[name] for name in ("strategy", "model")}
-    state = init_state(rough_start(0, SLOTS), CONFIG, EXTENT, VIEWS, **seams)
-    states, records = [], []
+    state, states, records = state_of(**SEAMS), [], []
     hooks = Hooks(
         step=records.append,
         state=lambda state, _: states.append(copy(state)),
         stop=lambda: len(states) == 2,
     )
-    result = fit(*captured(), CONFIG, state=state, hooks=hooks, **given)
+    result = fit(*captured(), CONFIG, state=state, hooks=hooks, **GIVEN)
     before, after = states
     assert changed(result.state, after) == []
     count, metrics = int(gsjax.num_active(before.gaussians)), records[-1].metrics
@@ -133,15 +114,14 @@ def test_fit_takes_all_of_them(tmp_path, given, shared_programs):
     for rows in (moments.model["offset"], moments.gaussians.means):
         assert (np.asarray(rows)[count:] == 0).all()
         assert (np.asarray(rows)[:count] != 0).any()
-    assert (np.asarray(after.shared_moments[0].mu.model["motion"]) != 0).all()
+    assert (np.asarray(after.shared_moments[0].mu.model["shift"]) != 0).all()
     assert (after.stats > 0).any()
     # The state can be saved and loaded.
     path = tmp_path / "state.npz"
     save_state(path, after)
     assert changed(load_state(path, state), after) == []
-    other = init_state(rough_start(0, 64), CONFIG, EXTENT, VIEWS, **seams)
     with pytest.raises(InputError, match=r"expected .* \(64,"):
-        load_state(path, other)
+        load_state(path, state_of(64, **SEAMS))
     path.write_bytes(path.read_bytes()[:1000])
     for bad in (path, tmp_path / "none.npz"):
         with pytest.raises(InputError, match=bad.name):
@@ -150,15 +130,13 @@ def test_fit_takes_all_of_them(tmp_path, given, shared_programs):
         save_state(tmp_path / "none" / "state.npz", state)
 
 
-def test_nothing_in_view_warns_once(given, shared_programs):
+@pytest.mark.usefixtures("shared_programs")
+def test_nothing_in_view_warns_once():
     """Cameras that look away."""
-    del shared_programs
-    seams = {name: given[name] for name in ("strategy", "model")}
-    state = init_state(rough_start(0, SLOTS), CONFIG, EXTENT, VIEWS, **seams)
     stops = iter([False, False, True])
-    hooks = Hooks(stop=lambda: next(stops))
+    options = {"state": state_of(**SEAMS), "hooks": Hooks(stop=lambda: next(stops))}
     with pytest.warns(UserWarning, match="poses may be inverted") as told:
-        fit(*captured(turn=-1), CONFIG, state=state, hooks=hooks, **given)
+        fit(*captured(turn=-1), CONFIG, **options, **GIVEN)
     assert len(told) == 1
 
 
@@ -171,8 +149,8 @@ def test_loss_terms_are_weighted_and_scheduled():
 
     term = LossTerm("depth", depth, weight=lambda step: 0.1 * step, start=2,
                     outputs=("depth",))  # fmt: skip
-    state = init_state(rough_start(0, SLOTS), CONFIG, EXTENT, VIEWS)
-    batch = draw(FRAMES, jnp.zeros(1, jnp.int32))
+    state = state_of()
+    batch = draw(make_frames(dataset().views, photos()), jnp.zeros(1, jnp.int32))
     step = jax.jit(make_train_step(CONFIG, EXTENT, loss_terms=(term,)))
     told = [step(state.replace(step=jnp.int32(s)), batch)[1] for s in range(3)]
     camera = jax.tree.map(lambda a: a[0], batch.camera)
@@ -184,12 +162,11 @@ def test_loss_terms_are_weighted_and_scheduled():
 
 
 def test_models_are_checked():
-    gaussians = rough_start(0, SLOTS)
     with pytest.raises(InputError, match=r"model\.offset"):
-        init_state(gaussians, CONFIG, EXTENT, VIEWS, model=RIGID._replace(rates={}))
-    few = RIGID._replace(init=lambda _: ModelParams(slots={"offset": jnp.zeros(3)}))
+        state_of(model=MOVING._replace(rates={}))
+    few = MOVING._replace(init=lambda _: ModelParams(slots={"offset": jnp.zeros(3)}))
     with pytest.raises(InputError, match="expected slots"):
-        init_state(gaussians, CONFIG, EXTENT, VIEWS, model=few)
+        state_of(model=few)
 
 
 def test_settings_of_a_preset():

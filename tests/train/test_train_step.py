@@ -21,7 +21,6 @@ from training import (
     SMOOTH,
     VIEWS,
     WIDTH,
-    bits,
     changed,
     copy,
     dataset,
@@ -33,7 +32,6 @@ from training import (
 import gsjax
 from gsjax.densify.adaptive import AdaptiveSettings
 from gsjax.densify.mcmc import McmcSettings
-from gsjax.densify.types import Observation
 from gsjax.math.sh import num_bases
 from gsjax.train.camera_refinement import refine_camera
 from gsjax.train.config import TrainConfig
@@ -85,6 +83,7 @@ def by_stages(config):
 
 plain_gradients, plain_advance, plain_step = by_stages(PLAIN)
 tuned_gradients, _, donating_step = by_stages(TUNED)
+alone_gradients, *_ = by_stages(TUNED.replace(skip_masked=False))
 
 
 def tuned_step(state, batch):
@@ -114,20 +113,6 @@ def run_plain(state, steps):
         state, metrics = plain_step(state, plain_batch(state.step))
         told.append(metrics)
     return state, told
-
-
-def test_the_step_is_pure():
-    start = plain_state()
-    first, second = (run_plain(start, 3) for _ in range(2))
-    assert bits(first) == bits(second)
-    moved = changed(start, first[0])
-    for name in (".means", ".quats", ".log_scales", ".logit_opacities", ".sh", ".step"):
-        assert any(m.endswith(name) for m in moved), name
-    assert ".key" not in moved
-    assert int(first[0].step) == 3
-    # The edit after the second step densifies until slots run out.
-    assert [int(m.wanted) for m in first[1]] == [0, 120, 0]
-    assert [int(m.gaussians) for m in first[1]] == [60, SLOTS, SLOTS]
 
 
 def test_the_state_can_be_donated():
@@ -184,6 +169,7 @@ def test_the_stages_compose_to_the_step():
             assert np.isclose(a, b, rtol=1e-4, atol=1e-6).mean() > 0.98
         np.testing.assert_allclose(metrics.loss, [m.loss for m in told], rtol=1e-6)
         means.append(np.asarray(found.gaussians.params.means))
+        assert len(changed(start.gaussians.params, wanted.gaussians.params)) == 5
     assert np.abs(means[0] - means[1]).max() > 0.01  # splits draw from the seed
 
 
@@ -199,19 +185,6 @@ def test_no_edit_is_due_after_a_step_that_does_not_count():
         assert bool(edit) == due
         assert moved is None or changed(state, after) == moved
         assert bool(metrics.finite) == ("loss" not in changes)
-
-
-def test_a_non_finite_loss_changes_only_the_step():
-    start = tuned_state()
-    # The renderer ignores non-finite Gaussians and cameras.
-    exposures = start.refinement.exposures.at[:, 0, 3].set(jnp.inf)
-    start = start.replace(refinement=replace(start.refinement, exposures=exposures))
-    after, metrics = tuned_step(start, tuned_batch())
-    assert not metrics.finite
-    assert not metrics.overflowed
-    assert changed(start, after) == [".step"]
-    assert int(after.step) == int(metrics.step) == 1
-    assert metrics.wanted == 0
 
 
 def test_numbers_that_would_become_non_finite_are_kept():
@@ -274,16 +247,14 @@ def exact_gaussians():
     return cast(true_gaussians(), jnp.float64)
 
 
-def tuned_batch(index=(0, 2), gain=1.0, viewmats=None, K=None, seed=None):
-    """Return a batch with some padding."""
+def tuned_batch(gain=1.0, viewmats=None, K=None):
+    """Return two views, with some padding."""
+    index = (0, 2)
     views = [dataset().views[i] for i in index]
     taken = [photos()[i].pixels for i in index]
     pixels = np.rint(gain * np.stack(taken)).astype(np.uint8)
     valid = np.ones(pixels.shape[:3], bool)
     valid[:, -3:] = valid[1, :, -5:] = False
-    if seed is not None:
-        garbage = np.random.default_rng(seed).integers(0, 256, pixels.shape)
-        pixels = np.where(valid[..., None], pixels, garbage).astype(np.uint8)
     camera = gsjax.make_camera(
         viewmat=np.stack([v.viewmat for v in views] if viewmats is None else viewmats),
         K=views[0].K if K is None else K,
@@ -299,25 +270,9 @@ def tuned_state(gaussians=None):
     return init_state(gaussians, TUNED, EXTENT, VIEWS)
 
 
-def test_padding_has_no_effect():
-    start = tuned_state()
-    first, second, third = (
-        tuned_step(start, tuned_batch(gain=0.7, seed=seed)) for seed in (None, 1, 2)
-    )
-    assert bits(first) == bits(second) == bits(third)
-    assert first[1].loss > 0.01
-
-
-@cache
-def alone_gradients():
-    return jax.jit(
-        make_stages(make_setup(TUNED.replace(skip_masked=False), EXTENT)).differentiate
-    )
-
-
 @pytest.mark.parametrize("masked", [False, True])
 def test_a_padded_view_is_as_the_view_alone(masked, report):
-    """In its gradients and statistics; skipped tiles have no gradient."""
+    """In its gradients and statistics; what is outside has no effect."""
     width, height = 20, 15
     batch = tuned_batch(gain=0.7)
     rows, columns = np.arange(HEIGHT)[:, None] < height, np.arange(WIDTH) < width
@@ -334,7 +289,7 @@ def test_a_padded_view_is_as_the_view_alone(masked, report):
     gaussians = exact_gaussians()
     params = gaussians.params.replace(log_scales=gaussians.params.log_scales - 0.5)
     state = tuned_state(gaussians.replace(params=params))
-    found, wanted = tuned_gradients(state, padded), alone_gradients()(state, alone)
+    found, wanted = tuned_gradients(state, padded), alone_gradients(state, alone)
     assert masked == (int(found.pairs) < 0.9 * int(wanted.pairs))
     worst = abs(float(found.loss / wanted.loss) - 1)
     for name in ("by_slots", "by_shared", "by_probe"):
@@ -344,18 +299,10 @@ def test_a_padded_view_is_as_the_view_alone(masked, report):
             worst = max(worst, float(jnp.abs(a - b).max()) / scale)
     report(f"padded view, masked {masked}", worst, 1e-10)
     assert worst < 1e-10
+    np.testing.assert_array_equal(found.size, wanted.size)
     if not masked:
-        strategy = PLAIN.make_strategy(EXTENT)
-        stats = [
-            strategy.observe(
-                strategy.init(gaussians), Observation(g.by_probe, g.radii, *g.size.T)
-            )
-            for g in (found, wanted)
-        ]
-        assert (stats[1].gradient > 1e-4).sum() > 15
-        assert (stats[1].views < 2).sum() > 10
-        for a, b in zip(*stats):
-            np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(found.radii, wanted.radii, rtol=1e-6)
+        assert (wanted.radii == 0).any(0).sum() > 10
 
 
 def test_the_first_step_of_each_correction_is_its_rate():
@@ -437,12 +384,21 @@ def test_the_background_has_no_exposure():
     assert float(plain_gradients(state, batch).loss) > 0.01
 
 
-def test_an_overflow_changes_nothing():
+def test_a_step_that_does_not_count_changes_only_its_number():
+    """An overflow changes nothing at all."""
+    start = tuned_state()
+    # The renderer ignores non-finite Gaussians and cameras.
+    exposures = start.refinement.exposures.at[:, 0, 3].set(jnp.inf)
+    start = start.replace(refinement=replace(start.refinement, exposures=exposures))
+    after, metrics = tuned_step(start, tuned_batch())
+    assert (metrics.finite, metrics.overflowed) == (False, False)
+    assert changed(start, after) == [".step"]
+    assert int(after.step) == int(metrics.step) == 1
+    assert metrics.wanted == 0
     gaussians = exact_gaussians()
     params = gaussians.params.replace(log_scales=gaussians.params.log_scales + 4)
     start = tuned_state(gaussians.replace(params=params))
-    batch = tuned_batch()
-    after, metrics = tuned_step(start, batch)
+    after, metrics = tuned_step(start, tuned_batch())
     assert metrics.overflowed
     assert metrics.pair_capacity > 512
     assert metrics.step == metrics.wanted == 0
@@ -461,15 +417,3 @@ def test_targets():
     found, weight = targets(opaque, jnp.float64)
     np.testing.assert_allclose(found, rgb)
     assert weight is None
-
-
-@pytest.mark.parametrize("strategy", ["adaptive", "mcmc"])
-def test_dtypes_are_kept(strategy):
-    settings = replace(PLAIN.adaptive, absgrad=True)
-    config = PLAIN.replace(strategy=strategy, adaptive=settings)
-    for dtype in (jnp.float32, jnp.float64):
-        gaussians = cast(rough_start(2, SLOTS), dtype)
-        state = init_state(gaussians, config, EXTENT, VIEWS)
-        after, _ = jax.eval_shape(make_train_step(config, EXTENT), state, plain_batch())
-        for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(after)):
-            assert (a.shape, a.dtype) == (b.shape, b.dtype)
