@@ -44,9 +44,9 @@ made = torus_knot_scene(4000, frames=FRAMES, width=WIDTH, height=HEIGHT)
 cameras, background = made.cameras, jnp.asarray(made.background)
 
 # %% [markdown]
-# The scene is a torus knot over a floor, plus what every trained scene has: 3000 faint
-# Gaussians that float about and hardly show. Its SH degree is 3, as in most files,
-# although all bands above the first are zero.
+# The scene is a torus knot over a floor, plus 3000 faint floating Gaussians that hardly
+# show; every trained scene has some. Its degree of spherical harmonics (SH) is 3, as in
+# most files, although all bands above the first are zero.
 
 # %%
 rng = np.random.default_rng(0)
@@ -133,8 +133,8 @@ assert bytes_of(planned.gaussians) < 0.5 * size
 # %% [markdown]
 # ## Smaller with loss
 #
-# Further reduction changes the image: it removes Gaussians that are visible, if hardly,
-# and the band with the highlights.
+# Further reduction changes the image: it removes barely visible Gaussians, and the SH
+# band with the highlights.
 
 
 # %%
@@ -179,8 +179,8 @@ show(*[row[2] for row in rows.values()], captions=list(rows), columns=3)
 # %% [markdown]
 # Selecting by opacity works well here, because the dust is faint and little of it is in
 # front of anything. At 0.5 the rim of the floor, which fades out with faint Gaussians,
-# disappears too. Degree 0 removes the highlights of the knot, and the nine of 26
-# numbers that encode them.
+# disappears too. Degree 0 removes the highlights of the knot, and with them nine of the
+# 26 numbers of each Gaussian.
 
 # %%
 quality = {name: psnr for name, (_, psnr, _) in rows.items()}
@@ -210,8 +210,9 @@ assert psnr > 45
 # %% [markdown]
 # ## An orbit
 #
-# The orbit as a movie within the notebook. To a file: `gsjax render SCENE.ply --cameras
-# DATASET --path orbit -o orbit.webm`, or `gsjax.io.movies.write_movie` from Python.
+# `movie` shows the orbit within the notebook. To write a file, use
+# `gsjax render SCENE.ply --cameras DATASET --path orbit -o orbit.webm`, or
+# `gsjax.io.movies.write_movie` in Python.
 
 # %%
 light = smaller["opacity > 0.05"]
@@ -227,10 +228,11 @@ assert len(turntable.data) < 500_000
 # %% [markdown]
 # ## In a browser, offline
 #
-# `gsjax view SCENE.ply` starts an interactive viewer. `gsjax view SCENE.ply --html
-# scene.html` writes it as one page, Gaussians included, that needs neither network nor
-# Python. The page is drawn by viser, an extra: `pip install viser`. It shows one colour
-# from all sides (SH degree 0), so the highlights do not move.
+# `gsjax view SCENE.ply` starts an interactive viewer.
+# `gsjax view SCENE.ply --html scene.html` writes it as one page, Gaussians included,
+# that needs neither network nor Python. The page is drawn by viser, an extra:
+# `pip install viser`. It shows the same colour from all sides (SH degree 0), so the
+# highlights do not move.
 
 # %%
 if importlib.util.find_spec("viser") is None:
@@ -252,8 +254,9 @@ temporary.cleanup()
 # %% [markdown]
 # ## Summary
 #
-# - `save` and `load` lose nothing in a PLY. You choose what to lose: `select` by any
-#   mask, `with_sh_degree`, `plan` within a given error, `.spz`.
+# - `save` and `load` lose nothing in a PLY. To make files smaller, you choose what to
+#   lose: `select` by any mask, `with_sh_degree`, `plan` within a given error, or
+#   `.spz`.
 # - Look before you cut: a histogram shows whether there are two kinds of Gaussians, and
 #   images show what a threshold removes.
 # - Movies and pages are single files that can be passed on.

@@ -18,7 +18,7 @@
 # training needs. `gsjax.render` also supports `jvp`, `linearize`, `vmap` and second
 # derivatives, and their combinations. This notebook uses them for four things:
 #
-# 1. **Forward mode**: the change of an image with the pose of its camera, for
+# 1. **Forward mode**: how an image changes with the pose of its camera, for
 #    Gauss–Newton.
 # 2. **`vmap` over seeds**: three training runs as one program.
 # 3. **`vmap` over cameras**.
@@ -65,7 +65,7 @@ def compiled(function, *arguments):
 # A motion is three angles and three lengths, in the camera's own axes. The quaternion
 # $(1, \omega/2)$ is normalised where it is used; to first order it rotates by $\omega$,
 # and nothing is singular at 0. The preset is `accurate`, because pose gradients of the
-# default preset miss what enters and leaves its α cut.
+# default preset miss Gaussians that cross its α threshold of 1/255.
 
 # %%
 POSE = gsjax.RasterConfig.accurate(pair_capacity=8192, **SMALL)
@@ -97,8 +97,8 @@ posing = compiled(with_tangents, jnp.zeros(6))
 # **Three training runs.** Photographs of the still life of `gsjax demo`, 48 × 36
 # pixels, from 12 places; every fourth is held out. 250 Gaussians of SH degree 0, Adam,
 # one random view per step, and `lax.scan` over all steps. The seed chooses the initial
-# points and the views. `jax.vmap(fit)` is all runs at once; it starts now and continues
-# in a thread.
+# points and the views. `jax.vmap(fit)` does all runs at once; it starts here and
+# continues in a thread.
 
 # %%
 WIDTH, HEIGHT, VIEWS, N, SEEDS, STEPS = 48, 36, 12, 250, 3, 120
@@ -175,7 +175,7 @@ seeing = compiled(jax.vmap(picture_from, in_axes=(None, 0)), first, cameras)
 #
 # At $m = 1$ this is 0, and so is its gradient; the Hessian there is exactly
 # Gauss–Newton's $J^\top J$. It has 62 500 entries and is never formed. Forward mode
-# over reverse mode multiplies it with a vector for the cost of a few gradients.
+# over reverse mode multiplies it by a vector, at the cost of a few gradients.
 
 
 # %%
@@ -316,9 +316,9 @@ assert float(jnp.abs(after - photo).max()) < 0.02
 # %% [markdown]
 # ## 2. Three seeds, one program
 #
-# One call trains all three, each from other points and with other views. Their final
-# difference is chance; it shows how much of a difference between two settings is
-# significant.
+# One call trains all three, each from different points and with different views. The
+# spread of the results is chance. A difference between two settings is significant only
+# if it exceeds this spread.
 
 # %%
 scenes, losses, demands = fitting.result()
@@ -373,16 +373,15 @@ show(images[0], columns=6, zoom=2)
 # %% [markdown]
 # ## 4. Which Gaussians can be removed?
 #
-# Removing Gaussian $i$ means $m_i = 0$, a step of −1, and costs $\tfrac12 H_{ii}$ by
-# the Hessian. The diagonal is estimated from products with random signs, $H_{ii} =
-# \mathrm{E}[v_i (H v)_i]$ (Hutchinson), here 32 of them.
+# Three methods choose the Gaussians to remove. The baseline removes the least opaque
+# first. The second uses the Hessian: removing Gaussian $i$ means $m_i = 0$, a step of
+# −1, and costs $\tfrac12 H_{ii}$. The diagonal is estimated from products with random
+# signs, $H_{ii} = \mathrm{E}[v_i (H v)_i]$ (Hutchinson), here 32 of them.
 #
-# That holds for one Gaussian at a time. Of two that replace each other, either may go,
-# but not both. If a set $S$ is gone already, one more costs $\tfrac12 H_{ii} + (H
-# 1_S)_i$: one more product. So a third method prunes in rounds of 10 % each and
-# evaluates the cost again after each.
-#
-# The baseline removes the least opaque first.
+# That holds for one Gaussian at a time. If two Gaussians can replace each other, either
+# may be removed, but not both. If a set $S$ is removed already, one more costs
+# $\tfrac12 H_{ii} + (H 1_S)_i$, which takes one more product. So the third method
+# prunes in rounds of 10 % and evaluates the cost again after each.
 
 # %%
 scene = one_of(scenes, 0)
@@ -462,7 +461,7 @@ assert curves["H, in rounds of 10 %"][half] > curves["opacity"][half] + 0.5
 #   renders, and with them the pose of a camera is a least-squares problem: a dozen
 #   steps to the limit of float32, where Adam has not converged after fifty.
 # - A training run is a function like any other: `vmap` gives error bars.
-# - Curvature knows what opacity does not: who covers how much, and who is behind whom.
-#   With half of the Gaussians removed, held-out views are better by the diagonal than
-#   by opacity, and better still in rounds. Training on after pruning repairs most of
-#   either.
+# - Curvature contains what opacity does not: how much each Gaussian covers, and what it
+#   hides. With half of the Gaussians removed, held-out views are better by the diagonal
+#   than by opacity, and better still in rounds. Further training after pruning repairs
+#   most of the loss in either case.

@@ -14,7 +14,7 @@
 # %% [markdown]
 # # Project, sort, blend
 #
-# This notebook repeats what `gsjax.render` does in plain NumPy, with an image of each
+# This notebook repeats in plain NumPy what `gsjax.render` does, with an image of each
 # step:
 #
 # 1. **Project**: each Gaussian becomes an ellipse on the image.
@@ -69,17 +69,18 @@ camera
 # The mean of a Gaussian is projected like any point: to camera coordinates, $p = R\,\mu
 # + t$, and onto the image, $u = f_x\,x/z + c_x$, $v = f_y\,y/z + c_y$.
 #
-# Its covariance $\Sigma = R_q\,S^2 R_q^\top$ does not stay Gaussian under a perspective
-# projection. EWA splatting (Zwicker et al. 2001) linearises the projection at $p$. With
-# the Jacobian
+# A perspective projection does not map the Gaussian with covariance
+# $\Sigma = R_q\,S^2 R_q^\top$ to a Gaussian. EWA splatting (Zwicker et al. 2001)
+# linearises the projection at $p$. Its Jacobian $J$ gives the covariance $\Sigma'$ on
+# the image:
 #
 # $$ J = \begin{pmatrix} f_x / z & 0 & -f_x\,x / z^2 \\
 #    0 & f_y / z & -f_y\,y / z^2 \end{pmatrix}, \qquad
 #    \Sigma' = J R\,\Sigma\,R^\top J^\top + 0.3\,I. $$
 #
 # The 0.3 px² keep an ellipse from falling between the pixels. Far outside the view the
-# linearisation is poor, and ellipses there would become huge; $J$ is therefore
-# evaluated at most 1.3 times half the view from the middle. Colours depend on the
+# linearisation is poor, and ellipses there would become huge. $J$ is therefore
+# evaluated within 1.3 times half the view from the middle. Colours depend on the
 # viewing direction, here by spherical harmonics of degree 1.
 
 # %%
@@ -113,10 +114,10 @@ colors = np.maximum(colors, 0)
 print(f"{N} Gaussians at depths of {z.min():.1f} to {z.max():.1f}")
 
 # %% [markdown]
-# An ellipse has no end, but at some distance α falls below 1/255 and nobody can see it.
-# It is cut there: where $\tfrac12 Q = \ln(255\,o)$, with $Q = d^\top \Sigma'^{-1} d$
-# and the opacity $o$. For an opacity of 0.6 that is at 3.2 standard deviations, for
-# 0.01 at 1.4.
+# A Gaussian has no edge, but at some distance α falls below 1/255 and is invisible. It
+# is cut there: where $\tfrac12 Q = \ln(255\,o)$, with $Q = d^\top \Sigma'^{-1} d$ and
+# the opacity $o$. For an opacity of 0.6 that is at 3.2 standard deviations, for 0.01 at
+# 1.4.
 
 # %%
 reach = 2 * np.log(np.maximum(255 * opacities, 1))  # Q at the cut
@@ -214,11 +215,11 @@ assert met[example].sum() < boxed[example].sum()
 # %% [markdown]
 # ### Pairs, and one sort for all tiles
 #
-# Each meeting is a *pair* of a tile and a Gaussian. Pairs are written in any order and
-# sorted once, by (tile, depth). Then each list is a range of one array, in depth order,
-# and a tile only needs to know where its range begins and ends. In JAX this part needs
-# a capacity: the number of pairs depends on the scene, and arrays under `jit` have
-# fixed sizes.
+# Each Gaussian that meets a tile makes a *pair* of tile and Gaussian. Pairs are written
+# in any order and sorted once, by (tile, depth). Then each list is a range of one
+# array, in depth order, and a tile only needs to know where its range begins and ends.
+# In JAX this part needs a capacity: the number of pairs depends on the scene, and
+# arrays under `jit` have fixed sizes.
 
 # %%
 gaussian, row, col = np.nonzero(met)
@@ -320,10 +321,10 @@ for py in range(HEIGHT):
         seen[py, px] = len(told)
 
 # %% [markdown]
-# One pixel, to which most Gaussians contribute. Bars are weights, $\alpha\,T$, in the
-# colour of the Gaussian; the line is the transmittance behind each entry. The weights
-# and the final transmittance add up to 1, so a pixel is a weighted mean of colours and
-# background.
+# The plot shows the pixel to which most Gaussians contribute. Bars are weights,
+# $\alpha\,T$, in the colour of the Gaussian; the line is the transmittance behind each
+# entry. The weights and the final transmittance add up to 1, so a pixel is a weighted
+# mean of colours and background.
 
 # %%
 py, px = np.unravel_index(np.argmax(seen), seen.shape)
@@ -380,8 +381,8 @@ gsjax.notebook.show(
 )
 
 # %% [markdown]
-# `first_entries` works the other way round, Gaussian by Gaussian over the whole image,
-# without tiles. Without a limit it gives the same image: tiles only serve speed.
+# `first_entries` works the other way round: Gaussian by Gaussian over the whole image,
+# without tiles. With all entries it gives the same image; tiles only serve speed.
 
 # %%
 np.testing.assert_allclose(first_entries(N), image, rtol=0, atol=1e-12)
@@ -389,9 +390,10 @@ np.testing.assert_allclose(first_entries(N), image, rtol=0, atol=1e-12)
 # %% [markdown]
 # ## Comparison with `gsjax.render`
 #
-# The same scene, camera and constants, in float32, compiled, and differentiable. Its
-# number of pairs nearly equals ours: it leaves a little room for rounding where an
-# ellipse touches a tile, and tests columns of pixels, not only their rectangle.
+# `gsjax.render` draws the same scene, camera and constants in float32, compiled and
+# differentiable. Its number of pairs nearly equals ours: it leaves a little room for
+# rounding where an ellipse touches a tile, and tests columns of pixels, not only their
+# rectangle.
 
 # %%
 result = gsjax.render_exact(scene, camera, CONFIG)
@@ -415,7 +417,7 @@ gsjax.notebook.show(
 # ## Summary
 #
 # - Projection costs once per Gaussian, blending once per pixel and entry. The lists in
-#   between make the second affordable: a pixel visits tens of entries instead of all
+#   between make blending affordable: a pixel visits tens of entries instead of all
 #   Gaussians.
 # - Exact lists are shorter than boxes, here by three tenths, and leave the image
 #   unchanged.

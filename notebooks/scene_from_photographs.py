@@ -14,14 +14,14 @@
 # %% [markdown]
 # # A scene from photographs
 #
-# From photographs with known cameras to Gaussians, with `load_dataset`, `split_views`,
-# `load_photos`, `fit` and `evaluate`. On the command line, `gsjax train DATASET -o RUN`
-# does the same.
+# This notebook trains a scene from photographs with known cameras, with `load_dataset`,
+# `split_views`, `load_photos`, `fit` and `evaluate`. On the command line,
+# `gsjax train DATASET -o RUN` does the same.
 #
 # There is nothing to download: a small ray caster takes the photographs of a still life
 # that exists as formulas only. It knows nothing of Gaussians, so the task is realistic,
-# only small. For photographs of your own, replace the folder with one that `gsjax sfm
-# PHOTOS -o DATASET` writes, and adapt the sizes.
+# if small. For photographs of your own, replace the folder with one that
+# `gsjax sfm PHOTOS -o DATASET` writes, and adapt the sizes.
 
 # %%
 import tempfile
@@ -45,9 +45,9 @@ PHOTOS, WIDTH, HEIGHT, STEPS = 24, 112, 84, 300
 # %% [markdown]
 # ## The photographs
 #
-# A dataset is a folder: photographs, and a file with their cameras, here
-# `transforms.json` with a few thousand coloured points, slightly inaccurate, as
-# structure from motion would have found them.
+# A dataset is a folder with photographs and a file with their cameras, here
+# `transforms.json`. It also has two thousand coloured points, slightly inaccurate, as
+# structure from motion would find them.
 
 # %%
 temporary = tempfile.TemporaryDirectory(prefix="gsjax-")
@@ -74,9 +74,9 @@ show(
 # %% [markdown]
 # ## Initialisation
 #
-# One round Gaussian per point, half as wide as the distance to its neighbours, of the
-# point's colour, and half opaque, as in the preset `fast` used below. With real
-# photographs `fast` would first search for more points on which they agree
+# Each point becomes a round Gaussian of the point's colour, half as wide as the
+# distance to its neighbours, and half opaque, as in the preset `fast` used below. With
+# real photographs `fast` would first search for more points on which they agree
 # (`initial="dense"`); here there are enough. Gaussians display themselves as a sketch:
 
 # %%
@@ -86,11 +86,11 @@ gsjax.init_gaussians(dataset, sh_degree=1, opacity=0.5, scale=0.5)
 # ## Training
 #
 # The settings are those of the preset `fast`, made shorter: L1 and SSIM, Adam with a
-# learning rate for each field. Different from `fast`, adaptive density control adds and
-# removes Gaussians, up to 4000.
+# learning rate for each field. The strategy differs: instead of MCMC, adaptive density
+# control adds and removes Gaussians, up to 4000.
 #
-# `fit` calls its hooks after each step. `live` is such a hook: it redraws the held-out
-# view it is given, beside its photograph, in the same place.
+# `fit` calls its hooks after each step. `live` returns such a hook, which redraws one
+# held-out view beside its photograph, always in the same place.
 
 # %%
 config = scaled(preset("fast"), STEPS)
@@ -136,7 +136,7 @@ print(
 # ## Evaluation
 #
 # Training views say little: enough Gaussians reproduce any of them and may still look
-# wrong from elsewhere. What counts is the held-out views.
+# wrong from elsewhere. Judge a scene by its held-out views.
 
 # %%
 results = list(
@@ -167,8 +167,8 @@ show(
 # Errors are at outlines and between stripes, where colours change abruptly; more
 # Gaussians would help there.
 #
-# Depth was not supervised. The ray caster knows it, so its error can be measured where
-# the render is opaque.
+# Depth was not supervised. The ray caster knows the true depth, so the error can be
+# measured where the render is opaque.
 
 # %%
 off = []
@@ -228,7 +228,7 @@ movie(turn, fps=10, width=336)
 # %% [markdown]
 # ## Save
 #
-# A standard PLY, for gsjax and any other viewer.
+# `save` writes a standard PLY, for gsjax and any other viewer.
 
 # %%
 path = folder / "still_life.ply"
@@ -250,7 +250,7 @@ temporary.cleanup()
 # ## Summary
 #
 # - Cameras and a few points in, Gaussians out. Most of the time here was compiling,
-#   which a longer run does not notice.
+#   which hardly matters in a longer run.
 # - Measure on held-out views, and look at error and depth beside the image: a good
 #   image with wrong depth falls apart between the views.
 # - `fit` runs in memory and reports through hooks. `make_train_step` is the same step

@@ -14,10 +14,11 @@
 # %% [markdown]
 # # Splats and pictures
 #
-# Three small experiments with the rasteriser alone: `gsjax.render`, its gradient, and
-# Adam.
+# This notebook has three small experiments with the rasteriser alone: `gsjax.render`,
+# its gradient, and Adam.
 #
-# 1. **Order matters.** Two overlapping splats, whose colours can be computed by hand.
+# 1. **Order matters.** Two overlapping splats (projected Gaussians), whose colours can
+#    be computed by hand.
 # 2. **Fitting a picture.** A grey picture of 48 × 48 pixels from 20 to 200 Gaussians.
 # 3. **Signs of failure.** Too few Gaussians, or a bad start: how their widths show it,
 #    and what density control does about it.
@@ -123,8 +124,8 @@ for name, depths in DEPTHS.items():
     rows[name] = row
 
 # %% [markdown]
-# Only the dilation had to be turned off: by default 0.3 px² is added to the projected
-# covariance, which would widen both splats.
+# For this comparison the dilation is turned off: by default 0.3 px² is added to the
+# projected covariance, which would widen both splats.
 #
 # The order comes from the depth alone. The order in which splats are *stored* makes no
 # difference, not even in the last bit:
@@ -182,7 +183,7 @@ camera = flat_camera(SIZE, SIZE)
 print(f"{np.sum(smooth > 1)} pixels clipped at 1, {np.sum(smooth < 0)} at 0")
 
 # %% [markdown]
-# **Parameters.** All fields of `GaussianParams` of an ordinary scene of degree 0.
+# **Parameters.** All fields of `GaussianParams`, for an ordinary scene of SH degree 0.
 # Nothing tells the optimiser that the scene is flat: along z, depth and the third scale
 # do not affect the image, so their gradient is zero and the order stays as it was.
 #
@@ -193,7 +194,7 @@ print(f"{np.sum(smooth > 1)} pixels clipped at 1, {np.sum(smooth < 0)} at 0")
 # **Optimiser.** Adam on the mean squared error, one learning rate per field, reduced
 # along a cosine to 1 %.
 #
-# **Settings.** `accurate`: its cut of 1e-5 lets Gaussians end softly, where the 1/255
+# **Settings.** `accurate`: with its α threshold of 1e-5 Gaussians end softly; the 1/255
 # of `compat` ends each with a small step. One device, one compiled size
 # (`num_size_buckets=1`) and only `rgb`, because compiling is most of the time here.
 
@@ -289,9 +290,9 @@ for count, bar in BARS.items():
 print(f"{time.perf_counter() - begin:.0f} s, compiling included")
 
 # %% [markdown]
-# The fits, and what is left over, each error on its own scale. The outlines are at one
-# standard deviation, filled with the splat's colour and opacity, drawn from back to
-# front.
+# The figure shows the fits and their errors, each error on its own scale. The outlines
+# are at one standard deviation, filled with the splat's colour and opacity, and drawn
+# from back to front.
 
 
 # %%
@@ -345,8 +346,8 @@ plt.show()
 # ## 3. Signs of failure, and density control
 #
 # All of this went well because the start was good: an even spread, with widths that
-# meet each other. A real scene starts with points where a matcher found something, and
-# none elsewhere. Two signs can be read from the widths, σ along the two axes of each
+# overlap. A real scene starts with points where a matcher found something, and none
+# elsewhere. Two signs of failure show in the widths, σ along the two axes of each
 # ellipse:
 #
 # - **At the floor.** The renderer adds 0.3 px² to every projected covariance, so below
@@ -354,11 +355,12 @@ plt.show()
 #   learnt either: the derivative of the variance by log σ is 2 σ². A dot tends to stay
 #   a dot.
 # - **At the cap.** Where there are too few Gaussians, each has to cover more than it
-#   can resolve, and smears. Nothing in the loss ends that; here σ is limited to half of
-#   the picture's side.
+#   can resolve, and smears. Nothing in the loss prevents that; here σ is limited to
+#   half of the picture's side.
 #
-# A third sign is the gradient of the loss by the projected means, the *pull*. Density
-# control uses it: where the image pulls a Gaussian step after step, one is not enough.
+# A third sign is the gradient of the loss with respect to the projected means, the
+# *pull*. Density control uses it: where the image pulls a Gaussian step after step, one
+# is not enough.
 
 # %%
 FEW, MANY = 8, 60
@@ -427,19 +429,19 @@ def watched_fit(gaussians, controlled, key):
 
 
 # %% [markdown]
-# The fit is that of section 2, with the limit and with a `probe`: zeros that are added
-# to the projected means, whose gradient is the pull. Whether the strategy edits is an
-# argument, so that all fits are runs of one program.
+# The fit is that of section 2, with the limit on σ and with a `probe`: zeros that are
+# added to the projected means, whose gradient is the pull. An argument switches the
+# strategy on or off, so that all fits are runs of one program.
 #
-# Three choices: the scene is *thin*, 0.1 px along z, because the halves of a split are
-# drawn from the Gaussian in all three directions and must stay in front of the camera.
-# Adam *forgets* faster ($\beta_2$ = 0.95), because a new Gaussian has moments of zero
-# while the bias correction counts the steps of all. Opacities are *not reset*; the run
-# is too short to recover.
+# Three choices matter. The scene is *thin*, 0.1 px along z, because the halves of a
+# split are drawn from the Gaussian in all three directions and must stay in front of
+# the camera. Adam *forgets* faster ($\beta_2$ = 0.95), because a new Gaussian has
+# moments of zero while the bias correction counts the steps of all. Opacities are *not
+# reset*; the run is too short to recover.
 #
-# Four fits: 8 and 60 Gaussians from an even spread; 60 from a bad start, all in one
-# corner, as dots of σ = 0.003 px; and 8 from such a start with density control up to
-# 60.
+# There are four fits: 8 and 60 Gaussians from an even spread; 60 from a bad start, all
+# in one corner, as dots of σ = 0.003 px; and 8 from such a start with density control
+# up to 60.
 
 # %%
 few_even, many_even = f"{FEW}, even", f"{MANY}, even"
@@ -480,9 +482,9 @@ assert quality[grown] > quality[many_bad] + 2
 assert quality[many_even] > quality[grown]  # a good start is better still
 
 # %% [markdown]
-# The widths. Each Gaussian counts twice, with its narrow and with its wide axis;
-# narrower than 0.001 px is drawn there. Grey: at the floor, and at the cap. Below, the
-# errors on one scale and the outlines.
+# The first row shows the widths. Each Gaussian counts twice, with its narrow and with
+# its wide axis; axes narrower than 0.001 px are drawn at 0.001 px. The grey ranges are
+# the floor and the cap. Below are the errors, on one scale, and the outlines.
 
 # %%
 figure, axes = plt.subplots(3, 4, figsize=(12, 8), layout="constrained")
@@ -509,18 +511,17 @@ figure.colorbar(shown, ax=axes[1], pad=0.01, aspect=12, ticks=[-0.04, 0, 0.04])
 plt.show()
 
 # %% [markdown]
-# 8 Gaussians from an even spread are too few: the image pulls at them many times as
-# hard as at
-# 60. Of 60 from the bad start many stay at the floor; they are drawn as dots and
-#     needles, but the others describe the picture.
+# From an even spread, 8 Gaussians are too few: the image pulls at them many times as
+# hard as at 60 of them. From the bad start, many of the 60 stay at the floor; they are
+# drawn as dots and needles, but the others describe the picture.
 #
-# Density control does not repair a dot. It starts with so few that each has something
-# to do and grows out of the floor, waits for that (`start=40`), and then adds where the
-# image pulls: small Gaussians are cloned, large ones are split, and the new ones
-# inherit a useful width.
+# Density control does not repair a dot. The run starts with so few Gaussians that each
+# has something to do and grows out of the floor. The strategy waits for that
+# (`start=40`) and then adds where the image pulls: small Gaussians are cloned, large
+# ones are split, and the new ones inherit a useful width.
 #
-# It is no better than a good start. Control is for where one does not know a good
-# start.
+# The result is no better than that of a good start. Use density control if no good
+# start is known.
 
 # %% [markdown]
 # ## Summary
@@ -531,7 +532,7 @@ plt.show()
 #   changed.
 # - A renderer that is differentiable in every parameter needs no special optimiser:
 #   Adam, one learning rate per field, and a falling schedule.
-# - Look at the widths. Many at the cap may mean too few Gaussians; many at the floor, a
-#   start that was too narrow and does not recover.
+# - Look at the widths. Many at the cap may mean too few Gaussians; many at the floor
+#   mean a start that was too narrow and does not recover.
 # - Settings of size and speed (tiles, chunks, capacity, devices) leave the image
 #   unchanged. Under `jit` the capacity is fixed: check `overflowed`.

@@ -14,14 +14,14 @@
 # %% [markdown]
 # # Run time against error
 #
-# A render leaves things out: what is too faint at a pixel, and what lies behind a
-# nearly opaque pixel. Each is a setting of `RasterConfig` and causes an error; whether
-# it saves time depends on the scene. This notebook changes them one by one on a scene
-# that is sensitive to them.
+# A render leaves out Gaussians that are too faint at a pixel, and those behind others
+# that are nearly opaque together. Settings of `RasterConfig` control this. Each causes
+# an error; whether it saves time depends on the scene. This notebook changes them one
+# by one on a scene that is sensitive to them.
 #
 # `gsjax bench` does this thoroughly: with gradients, tile and chunk sizes, float64, and
-# every point compared with its theoretical bound. Here are the forward pass, four
-# settings, and `gsjax.plan`, which chooses settings by itself.
+# every point compared with its theoretical bound. This notebook covers the forward
+# pass, four settings, and `gsjax.plan`, which chooses settings by itself.
 
 # %%
 from concurrent.futures import ThreadPoolExecutor
@@ -66,17 +66,18 @@ scene
 # %% [markdown]
 # ## The settings
 #
-# - `alpha_min`: a Gaussian is left out of a pixel where its α is below it. A low cut
-#   means wide ellipses, and more pairs of tile and Gaussian to sort and blend.
+# - `alpha_min`: a Gaussian is left out of a pixel where its α is below it. A low
+#   threshold (α cut) means wide ellipses, and more pairs of tile and Gaussian to sort
+#   and blend.
 # - `transmittance_min`: a pixel terminates at this transmittance. Only opaque scenes
 #   gain.
 # - `stop_rule`, `alpha_max`: the preset `compat` terminates a pixel *before* the
 #   Gaussian that would bring it there, and limits α to 0.99, as other implementations
 #   do.
 #
-# Two presets, and two settings changed from `accurate`. The presets differ most in the
-# cut: 1e-5 in `accurate`, 1/255 in `compat`. The room for pairs is given here, which
-# saves the compilations of `exact_config`, and checked later.
+# The cases are two presets, and two changes of `accurate`. The presets differ most in
+# the α cut: 1e-5 in `accurate`, 1/255 in `compat`. The capacity for pairs is given
+# here, which saves the compilations of `exact_config`, and is checked later.
 
 # %%
 MANY, FEW = 65_536, 24_576  # pairs
@@ -97,12 +98,12 @@ def compiled(gaussians, config):
 
 # %% [markdown]
 # The reference is the **exact** image: in float64, with cut and termination at 1e-9.
-# "Exact" means the method as it is: the linearised projection and the order by centres
-# are part of it.
+# "Exact" refers to the method as it is: the linearised projection and the order by
+# centres are part of it.
 #
 # `gsjax.plan` gets the largest acceptable error, here two grey levels of 255 at any
-# pixel and channel, and chooses the settings. What it cannot bound for all cameras, it
-# measures on the given ones and adds a margin.
+# pixel and channel, and chooses the settings. If it cannot bound an error for all
+# cameras, it measures the error on the given ones and adds a margin.
 #
 # XLA compiles a program on one core; threads compile several side by side.
 
@@ -202,10 +203,11 @@ show(
 # ## Bounds
 #
 # Errors on one view are measurements. For some there are bounds that hold for every
-# camera. What lies behind a transmittance of ε contributes at most ε times the range D
-# of the colours; the effect of SH bands follows from their coefficients; a cap on α
-# costs at most D (1 − cap) / cap. The bound of the α cut adds the cut over all
-# Gaussians as if they all overlapped, and in fog says nothing: `plan` measures there.
+# camera. Gaussians behind a transmittance of ε contribute at most ε times the range D
+# of the colours. The effect of spherical-harmonic (SH) bands follows from their
+# coefficients. A cap on α costs at most D (1 − cap) / cap. The bound of the α cut sums
+# over all Gaussians as if they all overlapped, which says nothing in fog; there, `plan`
+# measures.
 
 # %%
 spread = bounds.color_range(scene, solid.background)
