@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from gsjax.cameras.lenses import PINHOLE, Length, Lens, find_lens
-from gsjax.cameras.shutter import GLOBAL, Shutter
+from gsjax.cameras.shutter import GLOBAL, Shutter, find_shutter, twist_between
 from gsjax.errors import InputError
 from gsjax.math.numerics import real_floats
 from gsjax.runtime.devices import place
@@ -38,7 +38,15 @@ Array = jax.Array
 # Not a chex dataclass: those have no static fields, and sizes must be static.
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=("viewmat", "K", "near", "far", "coefficients", "visible_size"),
+    data_fields=(
+        "viewmat",
+        "K",
+        "near",
+        "far",
+        "coefficients",
+        "visible_size",
+        "twist",
+    ),
     meta_fields=("width", "height", "lens", "shutter"),
 )
 @dataclass(frozen=True, repr=False)
@@ -48,13 +56,15 @@ class Camera:
     Attributes:
       viewmat: [4, 4] or [B, 4, 4], world → camera.
       K: [3, 3] or [B, 3, 3] intrinsics in px, without skew.
-      near, far: [] or [B], range of camera z that is drawn, in world units.
+      near, far: [] or [B], range of the lens's depth that is drawn, in world units.
       width, height: image size in px, static.
       lens: the lens functions, static.
       coefficients: [M] or [B, M] coefficients of the lens, or None if it has none.
       visible_size: [2] or [B, 2], width and height in px of the upper left part of the
         image that is drawn; None for the whole image.
-      shutter: the shutter functions, static.
+      shutter: when each place of the image is exposed, static.
+      twist: [6] or [B, 6], rotation vector and translation of the view matrix over the
+        exposure, see `gsjax.cameras.shutter`; None unless the shutter is rolling.
     """
 
     viewmat: Array
@@ -67,6 +77,7 @@ class Camera:
     coefficients: Array | None = None
     visible_size: Array | None = None
     shutter: Shutter = GLOBAL
+    twist: Array | None = None
 
     @property
     def batched(self) -> bool:
@@ -111,7 +122,7 @@ def make_camera(
 ) -> Camera:
     """Return a camera, or a batch, from arrays.
 
-    Traceable in ``viewmat``, ``K``, ``near``, ``far`` and ``coefficients``.
+    Traceable in all arrays.
 
     Args:
       viewmat: [4, 4] or [B, 4, 4] world → camera, OpenCV axes.
@@ -124,7 +135,7 @@ def make_camera(
       coefficients: [M] (shared) or [B, M] coefficients of the lens, or None.
 
     Raises:
-      InputError: on wrong shapes or sizes, an empty batch, an unknown lens or a wrong
+      InputError: on wrong shapes or sizes, an empty batch, an unknown lens, a wrong
         number of coefficients, non-finite values, a focal length that is not positive,
         skew, a rotation part that scales or shears by more than 1 % or mirrors, or a
         last row other than 0 0 0 1 (of K: 0 0 1). Only shapes of tracers are checked.
@@ -176,6 +187,52 @@ def _coefficients(lens: Lens, values, batch: tuple[int, ...]):
             f"{lens.name} lens, got {max(count, 0)}"
         )
     return None if values is None else _broadcast(values, (*batch, count))
+
+
+def with_shutter(
+    camera: Camera, shutter: str | Shutter, *, twist=None, viewmat_end=None
+) -> Camera:
+    """Return a camera that exposes its image while it moves.
+
+    ``camera.viewmat`` is the pose at the start of the exposure.
+
+    Args:
+      camera: one camera, or a batch B.
+      shutter: a name of `gsjax.cameras.shutter.SHUTTERS`, or a `Shutter`.
+      twist: [6] or [B, 6] motion over the exposure, see `gsjax.cameras.shutter`; may be
+        traced.
+      viewmat_end: [4, 4] or [B, 4, 4] pose at the end, in place of ``twist``.
+
+    Raises:
+      InputError: if the shutter is unknown, a rolling one has not exactly one of
+        ``twist`` and ``viewmat_end``, another one has any, or their shapes or values
+        are not valid.
+    """
+    shutter, viewmat = find_shutter(shutter), camera.viewmat
+    if (twist is not None) + (viewmat_end is not None) != int(shutter.rolling):
+        expected = "one of twist and viewmat_end" if shutter.rolling else "neither"
+        raise InputError(
+            f"twist and viewmat_end: expected {expected} for the {shutter.name} shutter"
+        )
+    if viewmat_end is not None:
+        if any(isinstance(v, Tracer) for v in (viewmat, viewmat_end)):
+            raise InputError("viewmat_end: needs concrete values; pass twist instead")
+        end = np.asarray(viewmat_end, np.float64)
+        if end.shape != viewmat.shape:
+            raise InputError(
+                f"viewmat_end: expected shape {viewmat.shape}, got {end.shape}"
+            )
+        _check_values(end, np.eye(3), np.ones(()), 2 * np.ones(()))
+        twist = twist_between(viewmat, end)
+    if twist is None:
+        return camera.replace(shutter=shutter, twist=None)
+    twist, shape = real_floats("twist", twist), (*viewmat.shape[:-2], 6)
+    if twist.shape not in ((6,), shape):
+        raise InputError(f"twist: expected shape {shape}, got {twist.shape}")
+    if not isinstance(twist, Tracer) and not np.isfinite(np.asarray(twist)).all():
+        raise InputError(f"twist: expected finite values, got {np.asarray(twist)}")
+    moving = place(_broadcast(twist, shape))
+    return camera.replace(shutter=shutter, twist=moving)
 
 
 def _broadcast(value: Array | np.ndarray, shape: tuple[int, ...]):
@@ -276,19 +333,20 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
 
 
 def stack_cameras(cameras: list[Camera]) -> Camera:
-    """Return a batch of single cameras with one image size and lens.
+    """Return a batch of single cameras with one image size, lens and shutter.
 
     Args:
       cameras: B of them, arrays [4, 4], [3, 3], [] each; [B, …] in the batch.
 
     Raises:
-      InputError: if the list is empty, or sizes or lenses differ.
+      InputError: if the list is empty, or sizes, lenses or shutters differ.
     """
-    kinds = {(c.width, c.height, c.lens) for c in cameras}
+    kinds = {(c.width, c.height, c.lens, c.shutter) for c in cameras}
     if len(kinds) != 1:
-        found = sorted((w, h, lens.name) for w, h, lens in kinds)
+        found = sorted((w, h, lens.name, roll.name) for w, h, lens, roll in kinds)
         raise InputError(
-            f"stack_cameras: expected cameras of one size and lens, got {found}"
+            "stack_cameras: expected cameras of one size, lens and shutter, got "
+            f"{found}"
         )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
 

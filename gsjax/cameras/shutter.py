@@ -1,30 +1,112 @@
 """Shutters: the pose from which each point is seen.
 
 A global shutter exposes the whole image at one pose. A rolling shutter exposes rows or
-columns one after another while the camera moves; its pose then depends on the point.
+columns one after another while the camera moves. The time at which a point is exposed
+then depends on where it falls, and that on the time: `expose` solves for both.
+
+The motion is `Camera.twist`, a rotation vector ω and a translation τ: at time t of the
+exposure, in 0 … 1, the rotation of the view matrix is exp(t ω) R and its translation is
+T + t τ. That is the interpolation of world → camera poses by slerp and lerp.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from gsjax.cameras.lens import sine_ratio
+from gsjax.errors import InputError
+
 Array = Any
+Camera = Any  # `gsjax.cameras.camera.Camera`, which imports this module
+Point = tuple[Array, ...]  # x, y, z
+
+_NEWTON_STEPS = 4  # without derivative, before two that are differentiated
+_TIMES = (-0.5, 1.5)  # what lies farther outside the image is not followed
 
 
 class Shutter(NamedTuple):
-    """A shutter as pure functions.
+    """When a point of the image is exposed, as a linear function of its place.
+
+    The time is start + along_u · u / width + along_v · v / height, from 0 to 1 over the
+    image. All three are 0 for a global shutter.
 
     Attributes:
       name: the name in files and messages.
-      world_to_camera: (viewmat, point) → (camera point, viewmat at its exposure).
-        ``viewmat`` is [4, 4], or has entries of the shape of the components if the pose
-        differs from point to point; ``point`` is (x, y, z) in world coordinates.
+      start, along_u, along_v: the coefficients of the time.
     """
 
     name: str
-    world_to_camera: Callable[[Array, Any], tuple[Any, Array]]
+    start: float = 0.0
+    along_u: float = 0.0
+    along_v: float = 0.0
+
+    @property
+    def rolling(self) -> bool:
+        """Return whether places of the image are exposed at different times."""
+        return bool(self.along_u or self.along_v)
 
 
-def transform_point(viewmat: Array, point) -> tuple:
+GLOBAL = Shutter("global")
+SHUTTERS = {
+    shutter.name: shutter
+    for shutter in (
+        GLOBAL,
+        Shutter("top_to_bottom", 0.0, 0.0, 1.0),
+        Shutter("bottom_to_top", 1.0, 0.0, -1.0),
+        Shutter("left_to_right", 0.0, 1.0, 0.0),
+        Shutter("right_to_left", 1.0, -1.0, 0.0),
+    )
+}
+
+
+def find_shutter(shutter: str | Shutter) -> Shutter:
+    """Return the shutter of a name; a `Shutter` is returned unchanged.
+
+    Raises:
+      InputError: if the name is unknown, or ``shutter`` is of another type.
+    """
+    if isinstance(shutter, Shutter):
+        return shutter
+    if isinstance(shutter, str) and shutter in SHUTTERS:
+        return SHUTTERS[shutter]
+    raise InputError(
+        f"shutter: expected a gsjax.cameras.shutter.Shutter or one of "
+        f"{sorted(SHUTTERS)}, got {shutter!r}"
+    )
+
+
+class Exposure(NamedTuple):
+    """Points as a camera saw them.
+
+    Attributes:
+      point: (x, y, z) in camera coordinates.
+      viewmat: [4, 4] world → camera; a rolling shutter has rows of entries of the
+        shape of the components.
+      velocity: change of ``point`` over the exposure, or None.
+    """
+
+    point: Point
+    viewmat: Array
+    velocity: Point | None = None
+
+
+def entry(viewmat: Array, i: int, j: int) -> Array:
+    """Return an entry of `Exposure.viewmat`."""
+    return viewmat[i][j] if isinstance(viewmat, tuple) else viewmat[i, j]
+
+
+def centre(exposure: Exposure) -> Point:
+    """Return the position of the camera in world coordinates."""
+    view = exposure.viewmat
+    return tuple(
+        -sum(entry(view, i, j) * entry(view, i, 3) for i in range(3)) for j in range(3)
+    )
+
+
+def transform_point(viewmat: Array, point: Point) -> Point:
     """Return camera coordinates of a world point, as components; viewmat is [4, 4]."""
     return tuple(
         sum(viewmat[i, j] * point[j] for j in range(3)) + viewmat[i, 3]
@@ -32,8 +114,126 @@ def transform_point(viewmat: Array, point) -> tuple:
     )
 
 
-def _global(viewmat: Array, point) -> tuple[tuple, Array]:
-    return transform_point(viewmat, point), viewmat
+def expose(camera: Camera, point: Point) -> Exposure:
+    """Return world points in camera coordinates at the time of their exposure.
+
+    Args:
+      camera: a single camera.
+      point: (x, y, z) in world coordinates.
+    """
+    if not camera.shutter.rolling or camera.twist is None:
+        return Exposure(transform_point(camera.viewmat, point), camera.viewmat)
+    fixed, still = lax.stop_gradient((camera, point))
+    t = jnp.full_like(still[0], 0.5)
+    t = lax.fori_loop(0, _NEWTON_STEPS, lambda _, t: _step(fixed, still, t), t)
+    t = lax.stop_gradient(t)
+    # Differentiated: see `gsjax.cameras.solvers`.
+    t = _step(camera, point, _step(camera, point, t))
+    seen, velocity = _moving(camera, point, t)
+    return Exposure(seen, _viewmat(camera, t), velocity)
 
 
-GLOBAL = Shutter("global", _global)
+def _step(camera: Camera, point: Point, t: Array) -> Array:
+    """Return ``t`` after a Newton step towards the time of exposure."""
+    seen, velocity = _moving(camera, point, t)
+    good = camera.lens.depth(seen) > 0.5 * camera.near
+    seen = tuple(jnp.where(good, p, e) for p, e in zip(seen, (0, 0, 1)))
+    velocity = tuple(jnp.where(good, v, 0) for v in velocity)
+    (u, v), (du, dv) = jax.jvp(lambda *p: camera.project(p), seen, velocity)
+    width, height = camera.visible
+    shutter = camera.shutter
+    off = shutter.start + shutter.along_u * u / width + shutter.along_v * v / height - t
+    slope = shutter.along_u * du / width + shutter.along_v * dv / height - 1
+    # A slope of zero: the point moves along with the shutter.
+    good &= jnp.abs(slope) > 1e-3
+    t = t - jnp.where(good, off / jnp.where(good, slope, 1), 0)
+    low, high = _TIMES
+    return jnp.where(t > low, jnp.where(t < high, t, high), low)
+
+
+def _moving(camera: Camera, point: Point, t: Array) -> tuple[Point, Point]:
+    """Return camera coordinates at time ``t``, and their change by it."""
+    view, twist = camera.viewmat, camera.twist
+    turned = [sum(view[i, j] * point[j] for j in range(3)) for i in range(3)]
+
+    def at(t: Array):
+        rotated = _rotate([t * twist[i] for i in range(3)], turned)
+        shift = [view[i, 3] + t * twist[3 + i] for i in range(3)]
+        return tuple(r + s for r, s in zip(rotated, shift))
+
+    return jax.jvp(at, (t,), (jnp.ones_like(t),))
+
+
+def _viewmat(camera: Camera, t: Array):
+    """Return the entries of the view matrix at times ``t``, as rows of components."""
+    view, twist = camera.viewmat, camera.twist
+    turn = [t * twist[i] for i in range(3)]
+    columns = [_rotate(turn, [view[i, j] for i in range(3)]) for j in range(3)]
+    columns.append([view[i, 3] + t * twist[3 + i] for i in range(3)])
+    return tuple(tuple(column[i] for column in columns) for i in range(3))
+
+
+def _rotate(w, v) -> list[Array]:
+    """Rotate v by the rotation vector w (Rodrigues), smoothly at w = 0."""
+
+    def cross(a, b):
+        return [
+            a[1] * b[2] - a[2] * b[1],
+            a[2] * b[0] - a[0] * b[2],
+            a[0] * b[1] - a[1] * b[0],
+        ]
+
+    square = sum(p * p for p in w)
+    once = cross(w, v)
+    twice = cross(w, once)
+    sine, half = sine_ratio(square), sine_ratio(0.25 * square)
+    return [p + sine * q + 0.5 * half * half * r for p, q, r in zip(v, once, twice)]
+
+
+def image_rows(camera: Camera, exposure: Exposure, jacobian):
+    """Return the rows d(u, v) / d world of the image of a point, [3] each.
+
+    Under a rolling shutter a moved point is exposed at another time:
+    dt/dp = ∇τ J W / (1 − ∇τ · du/dt), and its image moves by du/dt · dt/dp.
+
+    Args:
+      camera: a single camera.
+      exposure: from `expose`.
+      jacobian: rows (du/d·, dv/d·) of the lens at the point.
+    """
+    rows = [
+        [
+            sum(row[i] * entry(exposure.viewmat, i, j) for i in range(3))
+            for j in range(3)
+        ]
+        for row in jacobian
+    ]
+    if exposure.velocity is None:
+        return rows
+    width, height = camera.visible
+    slopes = camera.shutter.along_u / width, camera.shutter.along_v / height
+    speeds = [sum(j * v for j, v in zip(row, exposure.velocity)) for row in jacobian]
+    below = 1 - sum(s * v for s, v in zip(slopes, speeds))
+    small = jnp.abs(below) < 1e-3
+    below = jnp.where(small, jnp.where(below < 0, -1e-3, 1e-3), below)
+    by_time = [
+        sum(s * row[j] for s, row in zip(slopes, rows)) / below for j in range(3)
+    ]
+    return [
+        [r + speed * t for r, t in zip(row, by_time)]
+        for row, speed in zip(rows, speeds)
+    ]
+
+
+def twist_between(start, end) -> np.ndarray:
+    """Return the twist [..., 6] that takes one view matrix [..., 4, 4] to another.
+
+    On the host. The rotation takes the shorter way.
+    """
+    from scipy.spatial.transform import Rotation
+
+    start, end = (np.asarray(m, np.float64) for m in (start, end))
+    turn = end[..., :3, :3] @ np.swapaxes(start[..., :3, :3], -1, -2)
+    vector = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec()
+    shift = end[..., :3, 3] - start[..., :3, 3]
+    return np.concatenate([vector.reshape(shift.shape), shift], -1)

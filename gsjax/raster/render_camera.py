@@ -3,12 +3,11 @@
 Axis legend: N Gaussians (capacity), H W image, B cameras, C channels.
 """
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from gsjax.cameras.camera import Camera
 from gsjax.errors import InputError
 from gsjax.math.numerics import safe_divide
 from gsjax.raster.argument_checks import check_real
@@ -17,6 +16,7 @@ from gsjax.raster.lists import binning, occlusion_culling
 from gsjax.raster.lists.blocks import by_blocks
 from gsjax.raster.lists.depth_order import depth_order
 from gsjax.raster.primitives.ellipsoid import ELLIPSOID
+from gsjax.raster.primitives.unscented import period_of
 from gsjax.raster.tile_render import device_count, render_tiles
 from gsjax.raster.types import (
     COLOR_LIMIT,
@@ -26,6 +26,7 @@ from gsjax.raster.types import (
     Inputs,
     Primitive,
     RasterConfig,
+    Splat,
 )
 from gsjax.runtime.devices import on_cpu, shard_rows
 
@@ -44,23 +45,54 @@ def render_camera(
     # The names that a profile shows.
     with jax.named_scope("order"):
         order, visible = visible_order(primitive, inputs, config)
+        order, offset = _of_copies(order, inputs)
     if inputs.features is None and gaussians.sh_degree > 0 and on_cpu():
         # Colours that depend on the view are worth the cost of joining the parts again;
         # a mean and a covariance alone are not.
         order = shard_rows(order, device_count(config), fill=gaussians.capacity)
     with jax.named_scope("project"):
         out = primitive.project(inputs, config, order, visible)
+        if offset is not None:
+            out = out._replace(
+                footprint=out.footprint._replace(u=out.footprint.u + offset),
+                splat=out.splat._replace(u=out.splat.u + offset),
+            )
     radii = jnp.zeros(gaussians.capacity, out.splat.u.dtype)
     seen = binning.radii(lax.stop_gradient(out.footprint), *camera.visible)
     size = camera.width, camera.height
     sums, demand, overflowed = render_tiles(out, size, config, inputs.mask)
-    room = min(config.visible_capacity or gaussians.capacity, gaussians.capacity)
+    most = copies(camera) * gaussians.capacity
+    room = min(config.visible_capacity or most, most)
+    radii = radii.at[order]
     return (
         sums,
-        radii.at[order].set(seen, mode="drop"),
+        (radii.set if offset is None else radii.max)(seen, mode="drop"),
         demand._replace(visible=visible),
         overflowed | (visible > room),
     )
+
+
+_TURNS = (0, -1, 1)
+
+
+def copies(camera: Camera) -> int:
+    """Return how often a Gaussian may appear in one image."""
+    return 1 if camera.lens.period is None else len(_TURNS)
+
+
+def _turn(order: Array, slots: int) -> Array:
+    """Return the turn by which copies of slots are shifted."""
+    copy = order // slots
+    return jnp.where(copy == 1, -1, jnp.where(copy == 2, 1, 0))
+
+
+def _of_copies(order: Array, inputs: Inputs) -> tuple[Array, Array | None]:
+    """Return slots [R], N past the last, and their shifts in px or None."""
+    period, slots = period_of(inputs.camera), inputs.gaussians.capacity
+    if period is None:
+        return order, None
+    used = order < len(_TURNS) * slots
+    return jnp.where(used, order % slots, slots), _turn(order, slots) * period
 
 
 def visible_order(
@@ -70,32 +102,55 @@ def visible_order(
 
     Conservative: a slot that is left out has no pixel with α at or above the limit, or,
     with ``config.occlusion``, lies behind pixels that have all stopped. No derivative
-    is taken. See `depth_order` for the shapes.
+    is taken. See `depth_order` for the shapes. An image that wraps around has three
+    copies of each slot, a turn apart: slot + N and slot + 2 N are shifted.
     """
     inputs = lax.stop_gradient(inputs._replace(mask=None, probe=None))
     camera, params = inputs.camera, inputs.gaussians.params
 
-    def bound(active: Array, values) -> Bounds:
-        return primitive.bounds(active, values, camera, config, inputs.alpha_min)
-
-    def none(active: Array, values) -> Bounds:
-        shapes = jax.eval_shape(bound, active, values)
-        nothing = jax.tree.map(jnp.zeros_like, shapes)
-        return nothing._replace(z=jnp.full_like(nothing.z, jnp.inf))
-
+    slots, period = inputs.gaussians.capacity, period_of(camera)
     values = (params.means, params.log_scales, params.logit_opacities)
-    bounds = by_blocks(bound, none, inputs.gaussians.active, values)
+    if config.projection == "unscented":
+        values = (*values, params.quats)
+
+    def bounds_of(camera: Camera) -> Bounds:
+        def bound(active: Array, values) -> Bounds:
+            return primitive.bounds(active, values, camera, config, inputs.alpha_min)
+
+        def none(active: Array, values) -> Bounds:
+            shapes = jax.eval_shape(bound, active, values)
+            nothing = jax.tree.map(jnp.zeros_like, shapes)
+            return nothing._replace(z=jnp.full_like(nothing.z, jnp.inf))
+
+        return by_blocks(bound, none, inputs.gaussians.active, values)
+
+    if period is None:
+        bounds = bounds_of(camera)
+    else:  # shifting the principal point shifts the image
+        shifted = [camera.K.at[0, 2].add(turn * period) for turn in _TURNS]
+        parts = [bounds_of(camera.replace(K=K)) for K in shifted]
+        bounds = jax.tree.map(lambda *some: jnp.concatenate(some), *parts)
     z = bounds.z
+
+    def occluders(some: Array, count: Array) -> Splat:
+        assert primitive.occluders is not None
+        splat = primitive.occluders(
+            inputs, config, some if period is None else some % slots, count
+        )
+        if period is None:
+            return splat
+        return splat._replace(u=splat.u + _turn(some, slots) * period)
+
     if config.occlusion and primitive.occluders is not None:
-        occluders = partial(primitive.occluders, inputs, config)
         size = camera.width, camera.height
         z = occlusion_culling.cull(bounds, occluders, size, config)
 
-    def exact_depth(slots: Array | None) -> Array:
-        means = params.means
-        if slots is not None:
-            means = means.at[slots].get(mode="clip")
-        return primitive.order_depth(means, camera)
+    def exact_depth(some: Array | None) -> Array:
+        if some is None:
+            depth = primitive.order_depth(params.means, camera)
+            return depth if period is None else jnp.tile(depth, len(_TURNS))
+        means = params.means.at[some if period is None else some % slots]
+        return primitive.order_depth(means.get(mode="clip"), camera)
 
     return depth_order(z, exact_depth, config)
 

@@ -26,6 +26,15 @@ COLOR_LIMIT = 1e32  # a coefficient or feature from here on counts as infinite
 OUTPUTS = ("rgb", "alpha", "depth", "median_depth")
 STOP_RULES = ("before", "after")
 OVERFLOW_RULES = ("flag", "nan")
+PROJECTIONS = ("ewa", "unscented")
+
+
+def _sigma_weights(values) -> bool:
+    """Return whether α, β, κ of an unscented transform are usable."""
+    if not (isinstance(values, tuple) and len(values) == 3):
+        return False
+    alpha, beta, kappa = values
+    return 1e-3 <= alpha <= 100 and alpha * alpha <= beta < 1e6 and -3 < kappa < 1e6
 
 
 @dataclass(frozen=True)
@@ -48,7 +57,11 @@ class RasterConfig:
       outputs: images to compute, of `OUTPUTS`; others are not in the program.
       absgrad: make the gradient by ``probe`` of `render` the sum of absolute per-pixel
         gradients (reverse mode only).
-      primitive: the `Primitive` that is drawn; None for ellipsoids (EWA splatting).
+      primitive: the `Primitive` that is drawn; None for ellipsoids.
+      projection: how an ellipsoid is brought to the image: "ewa" linearises lens and
+        shutter at its mean; "unscented" sends seven sigma points through them, for wide
+        lenses and large Gaussians. Where a sigma point has no image, EWA is used.
+      unscented: α, β, κ of the sigma points (Julier and Uhlmann 1997), β ≥ α².
 
     Size and speed. None of these changes the image beyond rounding.
 
@@ -88,6 +101,8 @@ class RasterConfig:
     outputs: tuple[str, ...] = ("rgb", "alpha", "depth")
     absgrad: bool = False
     primitive: "Primitive | None" = None
+    projection: str = "ewa"
+    unscented: tuple[float, float, float] = (1.0, 2.0, 0.0)
     tile_size: int = 8
     chunk_size: int = 32
     tiles_per_step: int | None = None
@@ -100,6 +115,8 @@ class RasterConfig:
 
     def __post_init__(self):
         convert_fields(self)
+        if isinstance(self.unscented, list):  # from JSON
+            object.__setattr__(self, "unscented", tuple(self.unscented))
         outputs = isinstance(self.outputs, tuple) and len(self.outputs) > 0
         outputs = outputs and set(self.outputs) <= set(OUTPUTS)
         own = self.primitive is not None and self.primitive.alpha is not None
@@ -110,6 +127,11 @@ class RasterConfig:
             "stop_rule": STOP_RULES,
             "dilation": "[0, 1e9]",  # its square fits float32
             "outputs": (outputs, f"a tuple of {', '.join(OUTPUTS)}"),
+            "projection": PROJECTIONS,
+            "unscented": (
+                _sigma_weights(self.unscented),
+                "(α, β, κ): 0 < α² ≤ β, κ > −3",
+            ),
             "absgrad": (not (own and self.absgrad), "False for a primitive with own α"),
             "tile_size": "[1, inf)",
             "chunk_size": "[1, inf)",

@@ -1,106 +1,151 @@
-"""Lenses against independent references: float64 tables, and OpenCV."""
+"""Every lens against independent references: float64 tables, OpenCV and pycolmap."""
 
-import cv2
+from functools import cache, partial
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import DATA
 
-import gsjax
-from gsjax.cameras.distortion import Distortion, distort
-from gsjax.cameras.lenses import FISHEYE, LENSES, OPENCV, ORTHOGRAPHIC, PINHOLE
+from gsjax.cameras import lenses
+from gsjax.cameras.lenses import Lens
 
-TABLES = {
-    "pinhole": PINHOLE,
-    "ortho": ORTHOGRAPHIC,
-    "opencv": OPENCV,
-    "opencv_rational": OPENCV,
-    "opencv_fisheye": FISHEYE,
+FILES = ("lenses", "lenses_colmap1", "lenses_colmap2", "lenses_colmap3")
+
+
+class Case(NamedTuple):
+    """A lens of the tables.
+
+    Attributes:
+      lens: that of gsjax.
+      order: index of each of its coefficients among the table's values after the
+        intrinsics; −1 for 0.
+      focals: number of focal lengths in the table.
+    """
+
+    lens: Lens
+    order: tuple[int, ...] = ()
+    focals: int = 2
+
+
+_FISHEYE, _OPENCV = lenses.FISHEYE, lenses.OPENCV
+CASES = {
+    "pinhole": Case(lenses.PINHOLE),
+    "ortho": Case(lenses.ORTHOGRAPHIC),
+    "opencv": Case(_OPENCV, (0, 1, 2, 3, 4)),
+    "opencv_rational": Case(_OPENCV, tuple(range(8))),
+    "opencv_thin_prism": Case(_OPENCV, tuple(range(12))),
+    "opencv_fisheye": Case(_FISHEYE, (0, 1, 2, 3)),
+    "PINHOLE": Case(lenses.PINHOLE),
+    "SIMPLE_PINHOLE": Case(lenses.PINHOLE, focals=1),
+    "SIMPLE_RADIAL": Case(_OPENCV, (0, -1, -1, -1), 1),
+    "RADIAL": Case(_OPENCV, (0, 1, -1, -1), 1),
+    "OPENCV": Case(_OPENCV, (0, 1, 2, 3)),
+    "FULL_OPENCV": Case(_OPENCV, tuple(range(8))),
+    "OPENCV_FISHEYE": Case(_FISHEYE, (0, 1, 2, 3)),
+    "RADIAL_FISHEYE": Case(_FISHEYE, (0, 1, -1, -1), 1),
+    "SIMPLE_RADIAL_FISHEYE": Case(_FISHEYE, (0, -1, -1, -1), 1),
+    "FISHEYE": Case(_FISHEYE, (-1, -1, -1, -1)),
+    "SIMPLE_FISHEYE": Case(_FISHEYE, (-1, -1, -1, -1), 1),
+    "THIN_PRISM_FISHEYE": Case(lenses.THIN_PRISM_FISHEYE, tuple(range(8))),
+    "RAD_TAN_THIN_PRISM_FISHEYE": Case(
+        lenses.RAD_TAN_THIN_PRISM_FISHEYE, tuple(range(12))
+    ),
+    "FOV": Case(lenses.FOV, (0,)),
+    "DIVISION": Case(lenses.DIVISION, (0,)),
+    "SIMPLE_DIVISION": Case(lenses.DIVISION, (0,), 1),
+    "EUCM": Case(lenses.EUCM, (0, 1)),
+    "EQUIRECTANGULAR": Case(lenses.EQUIRECTANGULAR),
+    "equirectangular": Case(lenses.EQUIRECTANGULAR),
+    "ftheta_fwd": Case(lenses.FTHETA),
+    "ftheta_bwd": Case(lenses.FTHETA_INVERSE),
 }
 
 
-@pytest.fixture(scope="module")
-def tables():
-    path = DATA / "cameras" / "lenses.npz"
-    if not path.exists():
-        pytest.skip(f"{path.name} is absent (../shared/data/cameras)")
-    with np.load(path, allow_pickle=False) as file:
-        return dict(file)
+@cache
+def tables() -> dict[str, np.ndarray]:
+    found = {}
+    for name in FILES:
+        path = DATA / "cameras" / f"{name}.npz"
+        if not path.exists():
+            pytest.skip(f"{path.name} is absent (../shared/data/cameras)")
+        with np.load(path, allow_pickle=False) as file:
+            found.update(file)
+    return found
 
 
-@pytest.mark.parametrize("index", [0, 2])
-@pytest.mark.parametrize("name", TABLES)
-def test_tables(tables, name, index, report):
-    def table(field):
-        return tables[f"{name}/{index}/{field}"]
+def read(name: str, index: int):
+    """Return the values of a table, and the lens with K and coefficients."""
+    start = f"{name}/{index}/"
+    table = {k[len(start) :]: v for k, v in tables().items() if k.startswith(start)}
+    case, K = CASES[name], np.eye(3)
+    if name.lower() == "equirectangular":
+        return table, case.lens, lenses.panorama_intrinsics(*table["size"]), None
+    if name.startswith("ftheta"):
+        K[:2, 2] = table["principal_point"] + 0.5
+        key = "angle_to_pixeldist" if name == "ftheta_fwd" else "pixeldist_to_angle"
+        values = (table[f"{key}_poly"], table["linear_cde"], table["max_angle"])
+        return table, case.lens, K, np.concatenate([np.atleast_1d(v) for v in values])
+    values, focals = table["params"], case.focals
+    K[0, 0], K[1, 1] = values[0], values[focals - 1]
+    K[:2, 2] = values[focals : focals + 2]
+    rest = np.append(values[focals + 2 :], 0)
+    return table, case.lens, K, rest[list(case.order)] if case.order else None
 
-    lens = TABLES[name]
-    fx, fy, cx, cy, *rest = table("params")
-    if name == "opencv":
-        assert str(table("param_names")) == "fx,fy,cx,cy,k1,k2,p1,p2,k3"
-    K = jnp.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    c = jnp.asarray(rest) if rest else None
-    points, front = table("points"), table("front")
-    seen = front & table("injective") & table("defined")
-    if name in ("pinhole", "ortho"):
-        seen = front & table("defined")
-    point = tuple(jnp.asarray(points[seen].T))
-    uv = jnp.stack(lens.project(K, c, point), -1)
-    error = np.abs(uv - table("uv")[seen]).max()
-    report(f"{name} {index}, px", error, 1e-8)
-    assert error <= 1e-8 * max(1, np.abs(table("uv")[seen]).max())
+
+@partial(jax.jit, static_argnums=0)
+def evaluate(lens: Lens, K, c, points):
+    """Return pixels, Jacobians [M, 2, 3] and validity of points [M, 3]."""
 
     def one(p):
         return jnp.stack(lens.project(K, c, tuple(p)))
 
-    jacobian = jax.jit(jax.vmap(jax.jacfwd(one)))(jnp.asarray(points[seen]))
-    wanted = table("J")[seen]
+    at = tuple(points.T)
+    valid = jnp.asarray(lens.valid(K, c, at)) & jnp.ones(len(points), bool)
+    return jax.vmap(one)(points), jax.vmap(jax.jacfwd(one))(points), valid
+
+
+@partial(jax.jit, static_argnums=0)
+def there_and_back(lens: Lens, K, c, pixels):
+    ray = lens.unproject(K, c, tuple(pixels.T))
+    return jnp.stack(ray, -1), jnp.stack(lens.project(K, c, ray), -1)
+
+
+@pytest.mark.parametrize("index", range(3))
+@pytest.mark.parametrize("name", CASES)
+def test_tables(name, index, report):
+    table, lens, K, c = read(name, index)
+    uv, jacobian, valid = evaluate(lens, K, c, table["points"])
+    seen = table["defined"] & table["injective"]
+    if lens.depth is lenses.z_depth:
+        valid &= table["points"][:, 2] > 0
+        seen = seen & table["front"]
+    np.testing.assert_array_equal(valid, seen)
+    scale = np.maximum(1, np.abs(table["uv"][seen]))
+    error = (np.abs(uv - table["uv"])[seen] / scale).max()
+    report(f"{name} {index}, relative", error, 1e-9)
+    assert error <= 1e-9
+    wanted = table["J"][seen]
     size = np.linalg.norm(wanted, axis=(1, 2))
-    assert (np.linalg.norm(jacobian - wanted, axis=(1, 2)) <= 1e-9 * size).all()
-    if rest:
-        valid = np.asarray(lens.valid(K, c, tuple(jnp.asarray(points[front].T))))
-        tangent = np.hypot(*points[front, :2].T) / points[front, 2]
-        limit = float(table("crit"))
-        angle = np.arctan(tangent) if name == "opencv_fisheye" else tangent
-        clear = np.abs(angle - limit) > 1e-2 * min(limit, 10)
-        np.testing.assert_array_equal(valid[clear], (angle < limit)[clear])
-    rays, wanted = table("ray_dir"), table("ray_valid") & (table("ray_dir")[:, 2] > 0.1)
-    if name != "ortho":
-        found = np.stack(lens.unproject(K, c, tuple(table("pixels")[wanted].T)), -1)
-        found /= np.linalg.norm(found, axis=-1, keepdims=True)
-        np.testing.assert_allclose(found, rays[wanted], atol=1e-7)
+    known = np.isfinite(size)
+    off = np.linalg.norm(jacobian[seen] - wanted, axis=(1, 2))
+    assert (off[known] <= 1e-9 * size[known]).all()
 
+    single = [None if a is None else np.float32(a) for a in (K, c)]
+    image = seen & table["in_image"]
+    short, _, _ = evaluate(lens, *single, np.float32(table["points"]))
+    error = np.abs(np.float64(short) - table["uv"])[image].max(initial=0)
+    report(f"{name} {index}, float32 px", error, 1e-3)
+    assert error <= 1e-3
 
-DISTORTIONS = {
-    "radial": Distortion("opencv", (-0.12, 0.02, 0.003, -0.002)),
-    "rational": Distortion("opencv", (0.3, 0.1, 1e-3, 2e-3, 0.02, 0.35, 0.1, 0.01)),
-    "fisheye": Distortion("fisheye", (0.05, -0.01, 0.002, -0.001)),
-}
-
-
-@pytest.mark.parametrize("name", DISTORTIONS)
-def test_opencv_agrees(name):
-    """The host functions of undistortion are those of OpenCV."""
-    distortion = DISTORTIONS[name]
-    x, y = np.random.default_rng(0).uniform(-0.8, 0.8, (2, 50))
-    c, zero = np.array(distortion.coefficients), np.zeros(3)
-    points = np.stack([x, y, np.ones_like(x)], -1)[:, None]
-    project = cv2.fisheye.projectPoints if name == "fisheye" else cv2.projectPoints
-    wanted, _ = project(points, zero, zero, np.eye(3), c)
-    found = np.stack(distort(distortion, x, y), -1)
-    np.testing.assert_allclose(found, wanted[:, 0], atol=1e-12)
-    u, v = distortion.lens.unproject(np.eye(3), c, tuple(found.T))[:2]
-    np.testing.assert_allclose(np.stack([u, v]), np.stack([x, y]), atol=1e-7)
-
-
-def test_number_of_coefficients_is_checked():
-    for name, lens in LENSES.items():
-        for count in {0, 3, *lens.counts}:
-            values = None if count == 0 else np.zeros(count)
-            arguments = {"lens": name, "coefficients": values, "width": 4, "height": 4}
-            if count in lens.counts:
-                gsjax.make_camera(viewmat=np.eye(4), K=np.eye(3), **arguments)
-                continue
-            with pytest.raises(gsjax.InputError, match="coefficients"):
-                gsjax.make_camera(viewmat=np.eye(4), K=np.eye(3), **arguments)
+    known = table["ray_valid"]
+    ray, again = there_and_back(lens, K, c, table["pixels"])
+    np.testing.assert_allclose(again[known], table["pixels"][known], atol=1e-9)
+    if name == "ortho":
+        found, wanted = np.asarray(ray)[:, :2], table["ray_origin"][:, :2]
+    else:
+        found = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+        wanted = table["ray_dir"]
+    np.testing.assert_allclose(found[known], wanted[known], atol=1e-10)

@@ -1,4 +1,6 @@
-"""Ellipsoids by EWA splatting (Zwicker et al. 2001): the default primitive.
+"""Ellipsoids by EWA splatting (Zwicker et al. 2001), or by the unscented transform.
+
+The default primitive.
 
 Axis legend: N Gaussians (capacity), R ranks (front to back), K slots, C channels.
 """
@@ -12,6 +14,7 @@ from jax import lax
 
 from gsjax.cameras.camera import LENS_RANGE, NEAREST, Camera, camera_centre
 from gsjax.cameras.lenses import everywhere, z_depth
+from gsjax.cameras.shutter import Exposure, centre, expose, image_rows
 from gsjax.math import sh as sh_lib
 from gsjax.math.numerics import (
     exp_log_scale,
@@ -22,6 +25,7 @@ from gsjax.math.numerics import (
 )
 from gsjax.raster.lists.occlusion_culling import is_wide
 from gsjax.raster.primitives.ewa import covariance_factor, dilated, ewa_jacobian
+from gsjax.raster.primitives.unscented import unscented_image
 from gsjax.raster.size_buckets import run_at_bucket
 from gsjax.raster.types import (
     COLOR_LIMIT,
@@ -45,6 +49,9 @@ def usable(camera: Camera) -> Array:
     focal = jnp.stack([camera.K[0, 0], camera.K[1, 1]])
     centre = jnp.abs(jnp.stack([camera.K[0, 2], camera.K[1, 2]]))
     good = jnp.all(jnp.isfinite(camera.viewmat[:3]))
+    for extra in (camera.coefficients, camera.twist):
+        if extra is not None:
+            good &= jnp.all(jnp.isfinite(extra))
     return good & jnp.all((focal > low) & (focal < high) & (centre < high))
 
 
@@ -65,7 +72,7 @@ def _alpha_min(alpha_min: Array | None, config: RasterConfig) -> float | Array:
 
 def bounds(
     active: Array,
-    values: tuple[Array, Array, Array],
+    values: tuple[Array, ...],
     camera: Camera,
     config: RasterConfig,
     alpha_min: Array | None = None,
@@ -74,13 +81,15 @@ def bounds(
 
     Args:
       active: [K] bool.
-      values: means [K, 3], log scales [K, 3] and logits of the opacities [K].
+      values: means [K, 3], log scales [K, 3] and logits of the opacities [K]; for the
+        unscented transform, the quaternions [K, 4] too.
       camera: a single camera.
       config: dilation and alpha_min are used.
       alpha_min: [] in place of that of ``config``, or None.
     """
     means, log_scales, logits = values[0].T, values[1].T, values[2]
-    (x, y, z), _ = camera.shutter.world_to_camera(camera.viewmat, means)
+    exposure = expose(camera, tuple(means))
+    x, y, z = exposure.point
     depth = camera.lens.depth((x, y, z))
     if depth.dtype == jnp.float32:
         # Rounded once, so that a Gaussian behind another one is not before it.
@@ -95,30 +104,58 @@ def bounds(
     z = depth if camera.lens.depth is z_depth else z
     point = (jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1))
     centres = camera.project(point)
-    # A view matrix that scales, as one being optimised may, enlarges what it shows.
-    rotation = camera.viewmat[:3, :3]
-    gram = jnp.sum(rotation[:, None] * rotation[None], axis=-1)
-    stretch = jnp.maximum(jnp.max(jnp.sum(jnp.abs(gram), axis=1)), 1)
     a, b, c = (jnp.where(live, s, 0) for s in log_scales)
     low, high = jnp.minimum(a, b), jnp.maximum(a, b)
     largest = exp_log_scale(jnp.maximum(high, c))
     middle = exp_log_scale(jnp.maximum(low, jnp.minimum(high, c)))
+    gains = _gains(camera, exposure._replace(point=point))
+    squares = [largest * largest * gain for gain in gains]
+    if config.projection == "unscented":
+        centres, squares = _unscented_bounds(
+            values, live, camera, config, centres, squares
+        )
     opacity = jax.nn.sigmoid(logits)
     reach = reach_of(opacity, _alpha_min(alpha_min, config))
     extents, wide = [], jnp.zeros_like(live)
-    for centre, row, size in zip(centres, ewa_jacobian(camera, point), camera.visible):
-        gain = stretch * sum(j * j for j in row)
-        square = largest * largest * gain
+    for place, gain, square, size in zip(centres, gains, squares, camera.visible):
         extent = jnp.sqrt(reach * (square + config.dilation))
         extent = extent * 1.001 + 0.01  # room for rounding
         # Phrased so that neither an overflow nor a NaN gets through.
-        live &= (square < jnp.inf) & (jnp.abs(centre) < jnp.inf)
-        live &= (centre + extent >= 0.5) & (centre - extent <= size - 0.5)
+        live &= (square < jnp.inf) & (jnp.abs(place) < jnp.inf)
+        live &= (place + extent >= 0.5) & (place - extent <= size - 0.5)
         extents.append(extent)
         wide |= is_wide(middle * middle * gain, opacity)
     live &= reach > 0
     box = Box(*centres, *extents)
     return Bounds(jnp.where(live, depth, jnp.inf), box, live & wide)
+
+
+def _gains(camera: Camera, exposure: Exposure) -> list[Array]:
+    """Return the largest squared stretch of world lengths along u and v."""
+    jacobian = ewa_jacobian(camera, exposure.point)
+    if exposure.velocity is not None:
+        rows = image_rows(camera, exposure, jacobian)
+        return [jnp.sum(jnp.square(jnp.stack(row)), axis=0) for row in rows]
+    # A view matrix that scales, as one being optimised may, enlarges what it shows.
+    rotation = camera.viewmat[:3, :3]
+    gram = jnp.sum(rotation[:, None] * rotation[None], axis=-1)
+    stretch = jnp.maximum(jnp.max(jnp.sum(jnp.abs(gram), axis=1)), 1)
+    return [stretch * sum(j * j for j in row) for row in jacobian]
+
+
+def _unscented_bounds(values, live: Array, camera: Camera, config, centres, squares):
+    """Return centres and variances of the transform, where it holds."""
+    means, log_scales, _, quats = values
+    quat, good = near_one(
+        tuple(jnp.where(live, q, 1) for q in quats.T), (1.0, 0.0, 0.0, 0.0)
+    )
+    means = [jnp.where(live, m, 0) for m in means.T]
+    scales = [exp_log_scale(jnp.where(live, s, 0)) for s in log_scales.T]
+    shift, factor, holds = unscented_image(camera, config, means, quat, scales)
+    holds &= good
+    centres = [jnp.where(holds, a + d, a) for a, d in zip(centres, shift)]
+    sums = [sum(m * m for m in row) for row in factor]
+    return centres, [jnp.where(holds, s, e) for s, e in zip(sums, squares)]
 
 
 def order_depth(means: Array, camera: Camera) -> Array:
@@ -131,6 +168,10 @@ def _wide_depth(means, camera: Camera) -> Array:
 
     def wide(value: Array) -> Array:
         return lax.convert_element_type(value, jnp.float64)
+
+    if camera.shutter.rolling:
+        exact = jax.tree.map(wide, camera)
+        return camera.lens.depth(expose(exact, tuple(wide(m) for m in means)).point)
 
     def coordinate(i: int) -> Array:
         row = camera.viewmat[i]
@@ -328,7 +369,8 @@ def _project_components(
     live = materialize_mask(live & good)
     means = tuple(jnp.where(live, m, 0) for m in rows.means)
     scales = tuple(exp_log_scale(jnp.where(live, s, 0)) for s in rows.log_scales)
-    (x, y, z), viewmat = camera.shutter.world_to_camera(camera.viewmat, means)
+    exposure = expose(camera, means)
+    x, y, z = exposure.point
     # Far from the world's origin, float32 may put a Gaussian elsewhere: not at the
     # lens.
     live &= camera.lens.depth((x, y, z)) > 0.5 * camera.near
@@ -336,11 +378,16 @@ def _project_components(
     x, y, z = jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1)
     x, y, z = materialize((x, y, z), live)
     u, v = camera.project((x, y, z))
+    exposure = exposure._replace(point=(x, y, z))
+    m1, m2 = covariance_factor(camera, exposure, quat, scales)
+    if config.projection == "unscented":
+        shift, (w1, w2), holds = unscented_image(camera, config, means, quat, scales)
+        u, v = (a + jnp.where(holds, d, 0) for a, d in zip((u, v), shift))
+        m1, m2 = _either(holds, w1, m1), _either(holds, w2, m2)
     if rows.shift is not None:
         u, v = (a + b.astype(a.dtype) for a, b in zip((u, v), rows.shift))
     live = materialize_mask(live & (jnp.abs(u) < jnp.inf) & (jnp.abs(v) < jnp.inf))
 
-    m1, m2 = covariance_factor(camera, viewmat, (x, y, z), quat, scales)
     m1, m2 = materialize(m1, live), materialize(m2, live)
     a, b, c, det, det_sharp = dilated(m1, m2, config.dilation)
     live = materialize_mask(
@@ -357,7 +404,7 @@ def _project_components(
     alpha_min = _alpha_min(rows.alpha_min, config)
     reach = jnp.where(live, reach_of(lax.stop_gradient(opacity), alpha_min), 0)
     if harmonic:
-        colors = _sh_colors(camera, means, rows.colors, live)
+        colors = _sh_colors(camera, exposure, means, rows.colors, live)
     else:
         (features,) = rows.colors
         colors = jnp.where(live, features, 0)
@@ -376,7 +423,15 @@ def _project_components(
     )
 
 
-def _sh_colors(camera: Camera, means, coefficients, live: Array) -> Array:
+def _either(holds: Array, wide, narrow) -> tuple[Array, ...]:
+    """Return a row of seven columns, or one of three where that does not hold."""
+    zeros = (jnp.zeros_like(narrow[0]),) * (len(wide) - len(narrow))
+    return tuple(jnp.where(holds, w, n) for w, n in zip(wide, (*narrow, *zeros)))
+
+
+def _sh_colors(
+    camera: Camera, exposure: Exposure, means, coefficients, live: Array
+) -> Array:
     """Return the colour [3, R] of K coefficients [3, R]: 0.5 + Σ, at least 0.
 
     The channels are handled together: a third as many derivatives, each a kernel to
@@ -387,8 +442,10 @@ def _sh_colors(camera: Camera, means, coefficients, live: Array) -> Array:
     if degree == 0:
         basis = [sh_lib.C0]
     else:
-        centre = camera_centre(camera.viewmat)
-        offset = tuple(m - c for m, c in zip(means, centre))
+        eye = camera_centre(camera.viewmat)
+        if exposure.velocity is not None:
+            eye = centre(exposure)
+        offset = tuple(m - c for m, c in zip(means, eye))
         direction, _ = safe_normalize(offset, (0.0, 0.0, 1.0))
         basis = sh_lib.sh_basis(degree, *direction)
     raw = sum(value * jnp.where(live, c, 0) for value, c in zip(basis, coefficients))

@@ -4,13 +4,15 @@ All arithmetic is on components. No matrix product is used, so no accelerator ca
 its precision.
 """
 
+from itertools import combinations
+
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from gsjax.cameras.camera import Camera
+from gsjax.cameras.shutter import Exposure, image_rows
 from gsjax.math import rotations
-from gsjax.raster.types import Array
 
 # Longest σ in px that is drawn; squares of squares then fit float32.
 _LONGEST = 1e9
@@ -31,16 +33,12 @@ def ewa_jacobian(camera: Camera, point):
     return tuple(zip(*columns))
 
 
-def covariance_factor(camera: Camera, viewmat: Array, point, quat, scales):
+def covariance_factor(camera: Camera, exposure: Exposure, quat, scales):
     """Return the rows m1, m2 of M = J W R S; the 2D covariance is M Mᵀ.
-
-    Columns longer than `_LONGEST` are shortened to it. Their products would overflow
-    and the Gaussian would vanish, although it only appears flat.
 
     Args:
       camera: a single camera.
-      viewmat: [4, 4] pose at the exposure of the point.
-      point: (x, y, z) in camera coordinates, [R] each.
+      exposure: points in camera coordinates, [R] each, from `expose`.
       quat: (w, x, y, z), any norm above zero, [R] each.
       scales: three standard deviations, [R] each.
     """
@@ -48,22 +46,28 @@ def covariance_factor(camera: Camera, viewmat: Array, point, quat, scales):
     per_square = 1 / sum(q * q for q in quat)
     scales = tuple(s * per_square for s in scales)
     rows = []
-    for jacobian_row in ewa_jacobian(camera, point):
-        in_world = [
-            sum(jacobian_row[i] * viewmat[i, j] for i in range(3)) for j in range(3)
-        ]
+    for in_world in image_rows(camera, exposure, ewa_jacobian(camera, exposure.point)):
         rows.append(
             tuple(
                 sum(in_world[i] * rotation[i][j] for i in range(3)) * scales[j]
                 for j in range(3)
             )
         )
+    return shortened(*rows)
+
+
+def shortened(m1, m2):
+    """Shorten the columns of a factor to `_LONGEST`.
+
+    Their products would overflow and the Gaussian would vanish, although it only
+    appears flat.
+    """
     shrinks = []
-    for p, q in zip(*rows):
+    for p, q in zip(m1, m2):
         length = lax.stop_gradient(jnp.maximum(jnp.abs(p), jnp.abs(q)))
         long = length > _LONGEST
         shrinks.append(jnp.where(long, _LONGEST / jnp.where(long, length, 1), 1))
-    return [tuple(m * k for m, k in zip(row, shrinks)) for row in rows]
+    return [tuple(m * k for m, k in zip(row, shrinks)) for row in (m1, m2)]
 
 
 def dilated(m1, m2, dilation: float):
@@ -73,16 +77,15 @@ def dilated(m1, m2, dilation: float):
     It cannot turn negative, while a c − b² cancels for needles.
 
     Args:
-      m1, m2: rows of the factor M, from `covariance_factor`.
+      m1, m2: rows of the factor M, of three or more columns.
       dilation: px² added to a and c.
     """
     sharp_a, sharp_c = sum(m * m for m in m1), sum(m * m for m in m2)
     b = sum(p * q for p, q in zip(m1, m2))
-    minors = (
-        m1[1] * m2[2] - m1[2] * m2[1],
-        m1[2] * m2[0] - m1[0] * m2[2],
-        m1[0] * m2[1] - m1[1] * m2[0],
-    )
+    pairs = [(1, 2), (2, 0), (0, 1)]
+    if len(m1) > 3:
+        pairs = list(combinations(range(len(m1)), 2))
+    minors = [m1[i] * m2[j] - m1[j] * m2[i] for i, j in pairs]
     det_sharp = sum(n * n for n in minors)
     det = det_sharp + dilation * (sharp_a + sharp_c) + dilation * dilation
     return sharp_a + dilation, b, sharp_c + dilation, det, det_sharp
