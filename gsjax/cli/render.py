@@ -45,6 +45,10 @@ class RenderCommand(HeavyCommand):
     size: OptionalSize = None
     """Size of the images, e.g. 800x600; default: as in the camera file, or as in
     training."""
+    lens: Literal["equirectangular", "fisheye"] | None = None
+    """Render through another lens: equirectangular is a 360° panorama, twice as wide as
+    it is high, and fisheye shows 180° across the shorter side. Default: the lens of the
+    cameras."""
     what: Kinds = ("rgb",)
     """rgb, alpha or depth, or for images several with commas. The first is written as
     NAME.png, others as e.g. NAME.depth.png."""
@@ -62,10 +66,12 @@ class RenderCommand(HeavyCommand):
         start_jax()
         from gsjax.io.movies import played_rate
         from gsjax.runs.scene_source import RASTER_PRESETS, open_scene_source
-        from gsjax.runs.trajectories import render_movie
+        from gsjax.runs.trajectories import render_movie, through_lens
         from gsjax.runs.views import render_images
 
         entries, origin = self._entries(path)
+        if self.lens is not None:
+            entries = [through_lens(entry, self.lens) for entry in entries]
         raster = RASTER_PRESETS[self.preset]() if self.preset else None
         source = open_scene_source(
             self.scene, origin=origin, raster=raster, background=self.background
@@ -95,13 +101,14 @@ class RenderCommand(HeavyCommand):
         from gsjax.runs.folder import SplitDataset
         from gsjax.runs.trajectories import CAMERA_PATHS, path_entries, view_entries
 
-        max_size = None
+        max_size, undistort = None, False
         if self.cameras is None:
             settings = run_folder.load_settings(self.scene)
             split = run_folder.with_refined_cameras(
                 run_folder.load_split(settings), run_folder.run_files(self.scene)
             )
             max_size = settings.config.max_size
+            undistort = settings.config.undistort
         elif self.cameras.is_dir():
             dataset = load_dataset(self.cameras, poses_only=True)
             test = [i for i, view in enumerate(dataset.views) if view.split == "test"]
@@ -113,7 +120,9 @@ class RenderCommand(HeavyCommand):
             frames, follow = self.frames or 120, CAMERA_PATHS[path]
             entries = path_entries(dataset, follow, frames=frames, max_size=max_size)
         else:
-            entries = view_entries(split.views(path), max_size=max_size)
+            entries = view_entries(
+                split.views(path), max_size=max_size, undistort=undistort
+            )
         if not entries:
             raise UsageError(f"--path {path}: there are no {path} views; pass another")
         if self.size is not None:

@@ -25,6 +25,9 @@ class SfmCommand(Command):
     camera: Literal["auto", "single", "per-image"] = "auto"
     """Which photographs share intrinsics. auto: those of the same size, camera and
     focal length (EXIF)."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """Camera model of COLMAP that is estimated, such as OPENCV or OPENCV_FISHEYE. The
+    photographs of the dataset are undistorted by it."""
     max_size: Annotated[int, arg(metavar="PX"), integer(0)] = 1600
     """Longest side in px, to which larger photographs are scaled down, for features and
     in the dataset; 0 for no limit."""
@@ -52,6 +55,7 @@ class SfmCommand(Command):
         settings = SfmSettings(
             matcher=self.matcher,
             camera=self.camera,
+            camera_model=self.camera_model.upper(),
             max_size=self.max_size,
             frames=self.frames or SfmSettings.frames,
             masks=self.masks,

@@ -67,7 +67,18 @@ class TrainCommand(HeavyCommand):
     """Optimise the camera poses together with the scene, with accurate render
     thresholds."""
     refine_intrinsics: bool = False
-    """Optimise focal length and principal point together with the scene."""
+    """Optimise focal length, principal point and lens distortion together with the
+    scene."""
+    shutter: Literal[
+        "global", "top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"
+    ] = "global"
+    """Direction in which the rolling shutter of all cameras exposes the image."""
+    refine_shutter: bool = False
+    """Optimise the motion of each camera during the exposure of its rolling
+    --shutter."""
+    undistort: bool = False
+    """Resample the photographs to ideal pinholes, in place of rendering through their
+    lenses."""
     exposure: bool = False
     """Optimise an exposure for each photograph."""
     keep_unseen: bool = False
@@ -258,6 +269,9 @@ class TrainCommand(HeavyCommand):
             seed=self.seed,
             refine_poses=self.refine_poses,
             refine_intrinsics=self.refine_intrinsics,
+            shutter=self.shutter,
+            refine_shutter=self.refine_shutter,
+            undistort=self.undistort,
             exposure=self.exposure,
             prune_invisible=not self.keep_unseen,
         )

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gsjax.cameras.camera import Camera
-from gsjax.cameras.lenses import PINHOLE
+from gsjax.cameras.distortion import distortion_of
+from gsjax.cameras.lenses import LENSES, ORTHOGRAPHIC
 from gsjax.data.dataset import finish_dataset
 from gsjax.data.types import Dataset, Photo, View, unexpected
 
@@ -29,9 +30,9 @@ def make_dataset(
 
     Args:
       images: V images [H, W, 3] or [H, W, 4] (RGB or straight RGBA), uint8 or floats in
-        [0, 1], without distortion. Their sizes may differ.
-      cameras: a batch of V pinhole cameras, or a sequence of single ones, of the size
-        of the images.
+        [0, 1]. Their sizes may differ.
+      cameras: a batch of V cameras, or a sequence of single ones, of the size of the
+        images. Lenses are those of `gsjax.cameras.lenses.LENSES` but orthographic.
       points: [M, 3] known points of the scene, in world units; None for no points.
       colors: [M, 3] colours of the points, uint8 or floats in [0, 1]; default grey.
       names: V unique names of the views, by which both results are sorted; the default
@@ -57,7 +58,7 @@ def make_dataset(
         photo = photos[name] = _photo(name, np.asarray(image), camera, mask)
         pose = np.asarray(camera.viewmat, np.float64)
         size = camera.width, camera.height
-        views.append(View(name, Path(name), pose, photo.K, *size))
+        views.append(View(name, Path(name), pose, photo.K, *size, photo.lens))
     xyz, rgb = _points(points, colors)
     dataset = finish_dataset(Dataset(Path("arrays"), "arrays", tuple(views), xyz, rgb))
     return dataset, [photos[view.name] for view in dataset.views]
@@ -67,14 +68,22 @@ def _single_cameras(cameras: Camera | Sequence[Camera]) -> list[Camera]:
     if isinstance(cameras, Camera):
         poses = np.reshape(cameras.viewmat, (-1, 4, 4))
         K = np.broadcast_to(cameras.K, (len(poses), 3, 3))
-        cameras = [cameras.replace(viewmat=p, K=k) for p, k in zip(poses, K)]
+        c = cameras.coefficients
+        if c is not None:
+            c = np.broadcast_to(c, (len(poses), np.shape(c)[-1]))
+        cameras = [
+            cameras.replace(viewmat=p, K=k, coefficients=None if c is None else c[i])
+            for i, (p, k) in enumerate(zip(poses, K))
+        ]
     for index, camera in enumerate(cameras):
         where = f"cameras[{index}]"
         if not isinstance(camera, Camera) or camera.batched:
             raise unexpected(where, "a single Camera", repr(camera), "use make_camera")
-        if camera.lens is not PINHOLE:
+        if camera.lens not in LENSES.values() or camera.lens is ORTHOGRAPHIC:
             remedy = "undistort the images first"
-            raise unexpected(where, "a pinhole", camera.lens.name, remedy)
+            raise unexpected(
+                where, f"one of {sorted(LENSES)}", camera.lens.name, remedy
+            )
     return list(cameras)
 
 
@@ -87,7 +96,8 @@ def _photo(name: str, image: np.ndarray, camera: Camera, mask) -> Photo:
     opaque = pixels.shape[2] == 3 or (pixels[..., 3] == 255).all()
     alpha = None if opaque else pixels[..., 3].copy()
     valid, K = None if mask is None else np.asarray(mask), np.asarray(camera.K, float)
-    photo = Photo(np.ascontiguousarray(pixels[..., :3]), alpha, valid, K)
+    lens, rgb = distortion_of(camera), np.ascontiguousarray(pixels[..., :3])
+    photo = Photo(rgb, alpha, valid, K, lens)
     photo.require(where)
     return photo
 

@@ -10,6 +10,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from gsjax.cameras.distortion import Distortion
+from gsjax.cameras.lenses import panorama_intrinsics
 from gsjax.data.types import intrinsic_matrix, unexpected
 from gsjax.errors import InputError
 
@@ -28,7 +29,7 @@ class CameraKind(NamedTuple):
       size: number of parameters.
       focals: how many of them are focal lengths (1: fx = fy); cx and cy follow.
       lens: model of the `Distortion` that the remaining parameters describe, "" if
-        there is none; None if unsupported.
+        there is none.
       order: index of each remaining parameter in the distortion's coefficients.
     """
 
@@ -36,11 +37,12 @@ class CameraKind(NamedTuple):
     number: int
     size: int
     focals: int = 2
-    lens: str | None = None
+    lens: str = ""
     order: tuple[int, ...] = ()
 
 
 _RADIAL, _FISHEYE = "opencv", "fisheye"
+_ALL = tuple(range(12))
 CAMERA_KINDS = (
     CameraKind("SIMPLE_PINHOLE", 0, 3, 1, ""),
     CameraKind("PINHOLE", 1, 4, 2, ""),
@@ -49,21 +51,23 @@ CAMERA_KINDS = (
     CameraKind("OPENCV", 4, 8, 2, _RADIAL, (0, 1, 2, 3)),
     CameraKind("OPENCV_FISHEYE", 5, 8, 2, _FISHEYE, (0, 1, 2, 3)),
     CameraKind("FULL_OPENCV", 6, 12, 2, _RADIAL, (0, 1, 2, 3, 4, 5, 6, 7)),
-    CameraKind("FOV", 7, 5),
+    CameraKind("FOV", 7, 5, 2, "fov", (0,)),
     CameraKind("SIMPLE_RADIAL_FISHEYE", 8, 4, 1, _FISHEYE, (0,)),
     CameraKind("RADIAL_FISHEYE", 9, 5, 1, _FISHEYE, (0, 1)),
-    CameraKind("THIN_PRISM_FISHEYE", 10, 12),
-    CameraKind("RAD_TAN_THIN_PRISM_FISHEYE", 11, 16),
-    CameraKind("SIMPLE_DIVISION", 12, 4, 1),
-    CameraKind("DIVISION", 13, 5),
+    CameraKind("THIN_PRISM_FISHEYE", 10, 12, 2, "thin_prism_fisheye", _ALL[:8]),
+    CameraKind(
+        "RAD_TAN_THIN_PRISM_FISHEYE", 11, 16, 2, "rad_tan_thin_prism_fisheye", _ALL
+    ),
+    CameraKind("SIMPLE_DIVISION", 12, 4, 1, "division", (0,)),
+    CameraKind("DIVISION", 13, 5, 2, "division", (0,)),
     CameraKind("SIMPLE_FISHEYE", 14, 3, 1, _FISHEYE),
     CameraKind("FISHEYE", 15, 4, 2, _FISHEYE),
-    CameraKind("EUCM", 16, 6),
-    CameraKind("EQUIRECTANGULAR", 17, 2),
+    CameraKind("EUCM", 16, 6, 2, "eucm", (0, 1)),
+    CameraKind("EQUIRECTANGULAR", 17, 2, 0, "equirectangular"),
 )
 KIND_OF_NUMBER = {kind.number: kind for kind in CAMERA_KINDS}
 KIND_OF_NAME = {kind.name: kind for kind in CAMERA_KINDS}
-_SUPPORTED = ", ".join(kind.name for kind in CAMERA_KINDS if kind.lens is not None)
+_SUPPORTED = ", ".join(kind.name for kind in CAMERA_KINDS)
 
 
 class ColmapCamera(NamedTuple):
@@ -109,7 +113,7 @@ NO_POINTS = ColmapPoints(
 
 
 def kind_of(where: str, key: int | str) -> CameraKind:
-    """Return the camera model of a number or name, supported or not."""
+    """Return the camera model of a number or name."""
     kind = KIND_OF_NUMBER.get(key) if isinstance(key, int) else KIND_OF_NAME.get(key)
     if kind is None:
         raise InputError(
@@ -123,18 +127,15 @@ def make_colmap_camera(
     where: str, kind: CameraKind, size: Sequence[int], params: Sequence[float]
 ) -> ColmapCamera:
     """Check the values of a camera and convert them to K and distortion."""
-    if kind.lens is None:
-        raise InputError(
-            f"{where}: camera model {kind.name} is not supported; undistort the images "
-            "with `colmap image_undistorter`, or estimate the cameras again with "
-            f"`gsjax sfm`; supported: {_SUPPORTED}"
-        )
     if not all(1 <= side <= MAX_SIDE for side in size):
         expected = f"an image size of 1 to {MAX_SIDE} px a side"
         raise unexpected(where, expected, f"{size[0]} × {size[1]}")
     if not all(abs(p) < MAX_COORDINATE for p in params):  # not even NaN
         remedy = "estimate the camera again"
         raise unexpected(where, "finite parameters", params, remedy)
+    if not kind.focals:  # a panorama has the size of the image as its parameters
+        K = panorama_intrinsics(*size)
+        return ColmapCamera(size[0], size[1], K, Distortion(kind.lens, ()))
     cx, cy = params[kind.focals : kind.focals + 2]
     K = intrinsic_matrix(where, (params[0], params[kind.focals - 1]), (cx, cy))
     return ColmapCamera(
@@ -146,7 +147,8 @@ def _distortion(kind: CameraKind, rest: Sequence[float]) -> Distortion | None:
     # A fisheye of zero coefficients is equidistant, not a pinhole.
     if not kind.lens or (kind.lens == _RADIAL and not any(rest)):
         return None
-    coefficients = [0.0] * max(4, len(rest))
+    least = 4 if kind.lens in (_RADIAL, _FISHEYE) else 0
+    coefficients = [0.0] * max(least, len(rest))
     for at, value in zip(kind.order, rest):
         coefficients[at] = value
     return Distortion(kind.lens, tuple(coefficients))

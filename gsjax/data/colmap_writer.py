@@ -29,7 +29,7 @@ def write_colmap(
 
     Raises:
       InputError: if a file exists and ``overwrite`` is not set, a file cannot be
-        written, or a name is one that COLMAP's files cannot hold.
+        written, or COLMAP's files cannot hold a name or a lens.
     """
     folder = Path(folder)
     cameras, numbers = _cameras(dataset.views)
@@ -52,18 +52,36 @@ def _cameras(views: Sequence[View]) -> tuple[bytes, list[int]]:
     return struct.pack("<Q", len(rows)) + b"".join(rows), numbers
 
 
+_KINDS = {
+    "fisheye": "OPENCV_FISHEYE",
+    "fov": "FOV",
+    "thin_prism_fisheye": "THIN_PRISM_FISHEYE",
+    "rad_tan_thin_prism_fisheye": "RAD_TAN_THIN_PRISM_FISHEYE",
+    "division": "DIVISION",
+    "eucm": "EUCM",
+    "equirectangular": "EQUIRECTANGULAR",
+}
+
+
 def _camera(view: View) -> bytes:
     """Return a record of cameras.bin without its id."""
     name, rest = "PINHOLE", ()
     if view.lens is not None:
         rest = view.lens.coefficients
-        if view.lens.model == "fisheye":
-            name = "OPENCV_FISHEYE"
-        else:
+        name = _KINDS.get(view.lens.model, "")
+        if view.lens.model == "opencv" and len(rest) <= 8:
             name = "OPENCV" if len(rest) == 4 else "FULL_OPENCV"
+        if not name:
+            raise InputError(
+                f"view {view.name!r}: COLMAP has no camera model for the lens "
+                f"{view.lens.model} with {len(rest)} coefficients; undistort the "
+                "photographs"
+            )
     kind = KIND_OF_NAME[name]
     K = view.K
     params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], *rest)
+    if not kind.focals:
+        params = (float(view.width), float(view.height))
     params += (0.0,) * (kind.size - len(params))
     head = struct.pack("<iQQ", kind.number, view.width, view.height)
     return head + struct.pack(f"<{kind.size}d", *params)

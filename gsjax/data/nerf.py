@@ -10,26 +10,21 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from gsjax.cameras.distortion import Distortion
 from gsjax.data import image_files
 from gsjax.data.image_header import image_size
 from gsjax.data.transforms_fields import Frame, read_frames, shown, warn_of_scaled
+from gsjax.data.transforms_lens import intrinsics_of_frame, lens_of_frame
 from gsjax.data.types import (
     Dataset,
     Reader,
     ReadOptions,
     View,
-    intrinsic_matrix,
     unexpected,
 )
 from gsjax.errors import InputError
 from gsjax.io.common import warn
 from gsjax.io.point_cloud import read_point_cloud
 
-_PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-_FISHEYE = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
-# In the order of nerfstudio's distortion_params.
-_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _IN_PIXELS = ("fl_x", "fl_y", "cx", "cy")
 _UNUSED = "unused"
 _SPLITS = {"transforms_train": "train", "transforms_test": "test"}
@@ -158,10 +153,8 @@ def _spelt(name: str) -> str:
 def _view(
     frame: Frame, name: str, file: Path, viewmat: np.ndarray, size: tuple[int, int]
 ) -> View:
-    lens = _distortion(frame)
-    model = "fisheye" if lens is not None and lens.model == "fisheye" else "pinhole"
-    fx, fy, cx, cy = frame.intrinsics(*size, model)
-    K = intrinsic_matrix(frame.where, (fx, fy), (cx, cy))
+    lens = lens_of_frame(frame)
+    K = intrinsics_of_frame(frame, size, lens)
     return View(name, file, viewmat, K, *size, lens)
 
 
@@ -222,43 +215,6 @@ def _warn_of_dynamic_masks(views: list[View]) -> None:
             f"first: {there[0].name}; to use them, invert them (black is excluded) and "
             "name them in the list by mask_path"
         )
-
-
-def _distortion(frame: Frame) -> Distortion | None:
-    model, supported = frame.model(), (*_PERSPECTIVE, *_FISHEYE)
-    if model not in supported:
-        raise InputError(
-            f"{frame.where}: camera_model {shown(model)} is not supported; undistort "
-            f"the photographs to a pinhole first; supported: {', '.join(supported)}"
-        )
-    k1, k2, k3, k4, p1, p2 = _coefficients(frame)
-    if model in _FISHEYE:
-        if p1 or p2:
-            what = f"{frame.where}: a fisheye has no p1, p2, got {p1}, {p2}"
-            raise InputError(f"{what}; undistort the photographs first")
-        return Distortion("fisheye", (k1, k2, k3, k4))
-    if not any((k1, k2, k3, k4, p1, p2)):
-        return None
-    # nerfstudio and instant-ngp read no rational denominator either.
-    higher = {key: frame.number(key) for key in ("k5", "k6")} | {"k4": k4}
-    if any(higher.values()):
-        raise InputError(
-            f"{frame.where}: {', '.join(k for k, v in higher.items() if v)} of a "
-            "perspective lens is not supported; undistort the photographs first"
-        )
-    return Distortion("opencv", (k1, k2, p1, p2, k3))
-
-
-def _coefficients(frame: Frame) -> list[float]:
-    """Return k1 k2 k3 k4 p1 p2; missing ones are 0."""
-    given = frame.sources[0].get("distortion_params")
-    if given is None:
-        return [frame.number(key) or 0.0 for key in _COEFFICIENTS]
-    if not isinstance(given, list) or len(given) != len(_COEFFICIENTS):
-        expected = f"the numbers {' '.join(_COEFFICIENTS)}"
-        raise frame.unexpected("distortion_params", expected, given)
-    named = Frame(frame.where, (dict(zip(_COEFFICIENTS, given)), {}))
-    return [named.number(key) or 0.0 for key in _COEFFICIENTS]
 
 
 def _points(frame: Frame, folder: Path) -> tuple[np.ndarray, np.ndarray]:

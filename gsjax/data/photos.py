@@ -1,4 +1,4 @@
-"""Loading of photographs: undistorted, scaled pixels and the camera that fits them.
+"""Loading of photographs: scaled pixels and the camera that fits them.
 
 OpenCV decodes and is imported on first use. EXIF orientation is ignored, as in COLMAP:
 a camera refers to the pixels as stored.
@@ -14,7 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gsjax.cameras.distortion import Distortion, undistortion_maps
+from gsjax.cameras.distortion import (
+    Distortion,
+    imaged_pixels,
+    undistortion_maps,
+)
 from gsjax.data.decode import decode, warn_of_damage
 from gsjax.data.image_header import image_size
 from gsjax.data.types import Photo, View, unexpected
@@ -35,26 +39,30 @@ _BATCH = 8  # photographs per thread between reports
 Filter = Callable[[np.ndarray], np.ndarray]
 
 
-def load_photo(view: View, max_size: int | None = None) -> Photo:
-    """Read, undistort and scale a photograph, and apply its mask.
+def load_photo(
+    view: View, max_size: int | None = None, undistort: bool = False
+) -> Photo:
+    """Read and scale a photograph, and apply its mask.
 
     Samples of 16 bits are rounded to 8, grey becomes RGB, and an opaque alpha channel
-    is dropped. The ideal pinhole keeps focal lengths and principal point. A pixel is
-    invalid if any masked pixel, or any outside of the photograph, contributes to it.
-    Warns of damage that the decoder could repair.
+    is dropped. A pixel is invalid if any masked pixel contributes to it, or if it is
+    beyond the image of the lens. Warns of damage that the decoder could repair.
 
     Args:
       view: the view to load.
       max_size: longest side in px; larger photographs are averaged down. None keeps the
         size.
+      undistort: resample to an ideal pinhole of the same focal lengths and principal
+        point. Pixels that come from outside of the photograph are invalid.
 
     Raises:
       InputError: if the file cannot be read, is not an image, is truncated or too
         large, does not have the camera's aspect ratio or is over 64 times as wide, if
-        undistortion leaves nothing of it, or if max_size is below 1.
+        its lens folds within the image or leaves nothing of it, or if max_size is below
+        1.
     """
     with warn_of_damage(_files([view])):
-        return _load(view, max_size)
+        return _load(view, max_size, undistort)
 
 
 def _files(views: Sequence[View]) -> list[Path]:
@@ -62,7 +70,7 @@ def _files(views: Sequence[View]) -> list[Path]:
     return [path for path in both if path is not None]
 
 
-def _load(view: View, max_size: int | None) -> Photo:
+def _load(view: View, max_size: int | None, undistort: bool) -> Photo:
     if max_size is not None and max_size < 1:
         remedy = "pass None to keep the size"
         raise unexpected("max_size", "at least 1 px", max_size, remedy)
@@ -72,9 +80,14 @@ def _load(view: View, max_size: int | None) -> Photo:
     height, width = pixels.shape[:2]
     K = scaled_intrinsics(view.K, *_ratio(view, width, height))
     invalid = None if view.mask is None else _masked(view.mask, width, height)
-    if view.lens is not None:
+    lens = view.lens
+    if lens is not None and not undistort:
+        beyond = _beyond(view.image, lens, K, width, height)
+        invalid = beyond if invalid is None else invalid | beyond
+    elif lens is not None:
         loaded = (pixels, alpha, invalid)
-        pixels, alpha, invalid = _undistorted(view.image, view.lens, K, *loaded)
+        pixels, alpha, invalid = _undistorted(view.image, lens, K, *loaded)
+        lens = None
     if max_size is not None and max(width, height) > max_size:
         size = size_within(width, height, max_size)
         shrink = partial(opencv().resize, dsize=size, interpolation=opencv().INTER_AREA)
@@ -83,13 +96,15 @@ def _load(view: View, max_size: int | None) -> Photo:
             invalid = shrink(invalid.astype(np.float32)) > 0
         K = scaled_intrinsics(K, size[0] / width, size[1] / height)
     valid = None if invalid is None or not invalid.any() else ~invalid
-    return Photo(pixels, alpha, valid, K)
+    return Photo(pixels, alpha, valid, K, lens)
 
 
 def load_photos(
     views: Sequence[View],
     max_size: int | None = None,
     progress: Callable[[int, int], None] | None = None,
+    *,
+    undistort: bool = False,
 ) -> list[Photo]:
     """Return `load_photo` of each view, in order, using all cores.
 
@@ -97,6 +112,7 @@ def load_photos(
       views: the views to load.
       max_size: longest side in px, or None.
       progress: called with (number done, total) for each photograph.
+      undistort: as in `load_photo`.
 
     Raises:
       InputError: as `load_photo`, for the first photograph that fails.
@@ -107,9 +123,8 @@ def load_photos(
         for start in range(0, len(views), _BATCH * workers):
             batch = views[start : start + _BATCH * workers]
             with warn_of_damage(_files(batch)):
-                photos += map_concurrently(
-                    pool, lambda view: _load(view, max_size), batch
-                )
+                load = partial(_load, max_size=max_size, undistort=undistort)
+                photos += map_concurrently(pool, load, batch)
             if progress is not None:
                 for done in range(start, len(photos)):
                     progress(done + 1, len(views))
@@ -219,9 +234,9 @@ _maps_lock = threading.Lock()
 _maps_of: OrderedDict[tuple, Future] = OrderedDict()
 
 
-def _maps(lens: Distortion, K: np.ndarray, width: int, height: int):
-    """Return `undistortion_maps`, computed once for all threads that need them."""
-    key = (lens, tuple(K.ravel().tolist()), width, height)
+def _maps(compute: Callable, lens: Distortion, K: np.ndarray, width: int, height: int):
+    """Return what a function computes, once for all threads that need it."""
+    key = (compute, lens, tuple(K.ravel().tolist()), width, height)
     with _maps_lock:
         found = _maps_of.get(key)
         made = found if found is not None else Future()
@@ -231,13 +246,29 @@ def _maps(lens: Distortion, K: np.ndarray, width: int, height: int):
             _maps_of.popitem(last=False)
     if found is None:
         try:
-            made.set_result(undistortion_maps(lens, K, width, height))
+            made.set_result(compute(lens, K, width, height))
         except BaseException as error:
             made.set_exception(error)
             with _maps_lock:
                 if _maps_of.get(key) is made:
                     del _maps_of[key]
     return made.result()
+
+
+def _beyond(
+    path: Path, lens: Distortion, K: np.ndarray, width: int, height: int
+) -> np.ndarray:
+    """Return [H, W] bool, True for pixels that no direction is imaged to."""
+    beyond = ~_maps(imaged_pixels, lens, K, width, height)
+    middle = beyond[height // 2], beyond[:, width // 2]
+    if all(line[0] | line[-1] for line in middle) or beyond.mean() > 1 - _MIN_VALID:
+        values = ", ".join(f"{value:g}" for value in lens.coefficients)
+        raise InputError(
+            f"{path}: the lens ({lens.model}, {values}) folds within the image: "
+            f"{int(beyond.sum()):,} of {beyond.size:,} pixels show no direction; "
+            "estimate the camera again"
+        )
+    return beyond
 
 
 def _undistorted(
@@ -252,7 +283,7 @@ def _undistorted(
     if max(width, height) > _MAX_REMAP:
         expected = f"at most {_MAX_REMAP} px a side to undistort"
         raise unexpected(path, expected, f"{width} × {height}", "make it smaller")
-    map_x, map_y, seen = _maps(lens, K, width, height)
+    map_x, map_y, seen = _maps(undistortion_maps, lens, K, width, height)
     if seen.mean() < _MIN_VALID:
         values = ", ".join(f"{value:g}" for value in lens.coefficients)
         raise InputError(
@@ -269,7 +300,17 @@ def _undistorted(
     return pixels, alpha, touched | ~seen
 
 
-def undistorted_view(view: View, photo: Photo) -> View:
-    """Return the view of a loaded photograph: its K and size, without distortion."""
+def undistort_photo(name: str, photo: Photo) -> Photo:
+    """Return a loaded photograph of the view ``name`` as an ideal pinhole shows it."""
+    if photo.lens is None:
+        return photo
+    invalid = None if photo.valid is None else ~photo.valid
+    loaded = (photo.pixels, photo.alpha, invalid)
+    pixels, alpha, invalid = _undistorted(Path(name), photo.lens, photo.K, *loaded)
+    return Photo(pixels, alpha, ~invalid if invalid.any() else None, photo.K)
+
+
+def loaded_view(view: View, photo: Photo) -> View:
+    """Return the view of a loaded photograph: its K, size and lens."""
     height, width = photo.pixels.shape[:2]
-    return replace(view, K=photo.K, width=width, height=height, lens=None)
+    return replace(view, K=photo.K, width=width, height=height, lens=photo.lens)

@@ -10,31 +10,24 @@ import re
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gsjax.cameras.camera import Camera, make_camera
+from gsjax.cameras.distortion import single_lens_fields
 from gsjax.data.extent import near_plane
 from gsjax.data.rebase import far_origin, shifted
 from gsjax.data.transforms_fields import (
     Frame,
     no_size,
     read_frames,
-    shown,
     warn_of_scaled,
 )
+from gsjax.data.transforms_lens import intrinsics_of_frame, lens_keys, lens_of_frame
 from gsjax.data.types import inverted, unexpected
 from gsjax.errors import InputError
-from gsjax.io.common import warn
 
-# `camera_model` of the file → lens of `make_camera`; distortion is not rendered.
-_MODELS = {
-    **dict.fromkeys(("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"), "pinhole"),
-    **dict.fromkeys(("RADIAL", "SIMPLE_RADIAL"), "pinhole"),
-    "ORTHOGRAPHIC": "orthographic",
-}
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _MAX_NAME_BYTES = 180
 
 
@@ -53,7 +46,7 @@ def load_transforms(
     Intrinsics are read from the frame or, for all frames, from the top level: fl_x,
     fl_y, cx, cy, w, h in px, or camera_angle_x and camera_angle_y in radians, or x_fov
     and y_fov in degrees. A single one holds for both axes; cx and cy default to the
-    image centre. Lens distortion is ignored, with a warning.
+    image centre.
 
     Args:
       path: the JSON file.
@@ -98,52 +91,38 @@ def _load(
     near = near_plane(centres)
     entries: list[CameraEntry] = []
     used: dict[str, int] = {}
-    distorted = set()
     for index, (frame, (viewmat, _)) in enumerate(zip(frames, poses)):
-        distorted.update(_distortion(frame))
         camera = _camera(frame, shifted(viewmat, origin), size, near)
         entries.append(CameraEntry(_unique_name(frame, index, used), camera))
     factors = enumerate(factor for _, factor in poses)
     warn_of_scaled(path, [(index, factor) for index, factor in factors if factor != 1])
-    if distorted:
-        keys = ", ".join(sorted(distorted))
-        warn(f"{path}: lens distortion ({keys}) is ignored and not rendered")
     return entries, origin
 
 
 def _camera(
     frame: Frame, viewmat: np.ndarray, size: tuple[int, int] | None, near: float
 ) -> Camera:
-    name = frame.model()
-    model = _MODELS.get(name)
-    if model is None:
-        raise InputError(
-            f"{frame.where}: camera_model {shown(name)} cannot be rendered; supported: "
-            f"{', '.join(_MODELS)}; undistort the images to a pinhole first"
-        )
+    orthographic = frame.model() == "ORTHOGRAPHIC"
+    lens = None if orthographic else lens_of_frame(frame)
     found = frame.size() or size
     if found is None:
         raise no_size(frame.where)
     width, height = found
-    fx, fy, cx, cy = frame.intrinsics(width, height, model)
+    if orthographic:
+        fx, fy, cx, cy = frame.intrinsics(width, height, "orthographic")
+        K = np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        fields: dict[str, Any] = {"lens": "orthographic"}
+    else:
+        K = intrinsics_of_frame(frame, (width, height), lens)
+        fields = single_lens_fields(lens)
     out_width, out_height = (width, height) if size is None else size
-    sx, sy = out_width / width, out_height / height
-    K = np.asarray([[sx * fx, 0, sx * cx], [0, sy * fy, sy * cy], [0, 0, 1]])
+    K = K * [[out_width / width], [out_height / height], [1]]
     try:
         with np.errstate(over="ignore"):
             pixels = {"width": int(out_width), "height": int(out_height)}
-            return make_camera(viewmat=viewmat, K=K, **pixels, near=near, lens=model)
+            return make_camera(viewmat=viewmat, K=K, **pixels, near=near, **fields)
     except InputError as error:
         raise InputError(f"{frame.where}: {error}") from error
-
-
-def _distortion(frame: Frame) -> list[str]:
-    """Return the keys of nonzero distortion coefficients."""
-    found = [key for key in _DISTORTION if frame.number(key)]
-    coefficients = frame.get("distortion_params")  # nerfstudio, per frame
-    if isinstance(coefficients, list) and any(coefficients):
-        found.append("distortion_params")
-    return found
 
 
 def _unique_name(frame: Frame, index: int, used: dict[str, int]) -> str:
@@ -174,14 +153,14 @@ def transforms_json(
       ply_file_path: name of a point cloud beside the file, for nerfstudio.
 
     Raises:
-      InputError: if a camera is a batch.
+      InputError: if a camera is a batch, or its lens is not one of the format.
     """
     frames = [_frame_of(entry) for entry in entries]
     shared = {
         key: value
         for key, value in (frames[0].items() if frames else ())
         if key not in ("file_path", "transform_matrix")
-        and all(frame[key] == value for frame in frames)
+        and all(frame.get(key) == value for frame in frames)
     }
     frames = [{k: v for k, v in f.items() if k not in shared} for f in frames]
     if ply_file_path is not None:
@@ -199,7 +178,7 @@ def _frame_of(entry: CameraEntry) -> dict:
     matrix[:3, 1:3] *= -1  # OpenCV axes to OpenGL axes
     K = np.asarray(camera.K, np.float64)
     return {
-        "camera_model": camera.lens.name.upper(),
+        **lens_keys(camera),
         "w": camera.width,
         "h": camera.height,
         "fl_x": K[0, 0],

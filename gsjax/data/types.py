@@ -65,11 +65,13 @@ class View:
       K: [3, 3] intrinsics in px of an image of ``width`` × ``height``. If the file has
         another size (``images_4/``), K is scaled on load.
       width, height: image size in px that ``K`` refers to.
-      lens: distortion of the lens; None for an ideal pinhole.
+      lens: lens of the photograph; None for an ideal pinhole.
       mask: file of a grey image of the same size, 0 where a pixel is excluded; or None.
       split: "train" or "test" if the dataset says so, else None.
       near: near plane: depth below which nothing is drawn, in world units.
       time: time of the exposure in any unit, for scene models that move.
+      twist: [6] motion during the exposure of a rolling shutter, see
+        `gsjax.cameras.shutter`; None if it is unknown or there is none.
     """
 
     name: str
@@ -83,6 +85,7 @@ class View:
     split: str | None = None
     near: float = NEAR
     time: float = 0.0
+    twist: np.ndarray | None = None
 
     @property
     def centre(self) -> np.ndarray:
@@ -139,20 +142,22 @@ class Reader(NamedTuple):
 
 
 class Photo(NamedTuple):
-    """An undistorted and scaled photograph with its camera.
+    """A scaled photograph with its camera.
 
     Attributes:
       pixels: [H, W, 3] uint8 RGB.
       alpha: [H, W] uint8 opacity, or None if every pixel is opaque.
       valid: [H, W] bool, False where masked or outside of the undistorted image; None
         if all pixels are valid.
-      K: [3, 3] float64 intrinsics of an ideal pinhole of this size.
+      K: [3, 3] float64 intrinsics of this size, px.
+      lens: lens of the pixels; None for an ideal pinhole.
     """
 
     pixels: np.ndarray
     alpha: np.ndarray | None
     valid: np.ndarray | None
     K: np.ndarray
+    lens: Distortion | None = None
 
     def require(self, name: str) -> None:
         """Raise `InputError`, for view ``name``, if an array is not as above."""

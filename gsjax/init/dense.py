@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.data.extent import finite_points, has_points, scene_extent
+from gsjax.data.photos import undistort_photo
 from gsjax.data.types import Dataset, Photo
 from gsjax.errors import InputError
 from gsjax.init.gaussians import points_in_ball
@@ -98,6 +99,8 @@ def find_points(
             f"photos: expected {len(dataset.views)}, one for each view, got "
             f"{len(photos)}"
         )
+    pairs = zip(dataset.views, photos)
+    photos = [undistort_photo(view.name, photo) for view, photo in pairs]
     rng, settings = np.random.default_rng(seed), settings or SweepSettings()
     overlap = _ViewOverlap(dataset, photos, rng, settings.longest_side)
     pairing = _choose_pairs(overlap, settings)

@@ -46,12 +46,13 @@ def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
     gaussians = run_folder.load_scene(splat, split.dataset.origin)
     dataset = subset(split.dataset, chosen)
     before = subset(given.dataset, chosen).views
-    photos = load_photos(before, settings.config.max_size)
+    config = settings.config
+    photos = load_photos(before, config.max_size, undistort=config.undistort)
     photos = refine_photos(photos, before, dataset.views)
     if not any(map(has_valid_pixels, photos)):
         fault = f"all {len(photos)} {which} views are fully masked"
         raise InputError(f"{folder}: {fault}; hold out others (--test-images)")
-    return write_evaluation(files, settings.config, gaussians, dataset, photos, which)
+    return write_evaluation(files, config, gaussians, dataset, photos, which)
 
 
 def evaluate_views(
@@ -60,7 +61,12 @@ def evaluate_views(
     """Evaluate all views of ``dataset`` with the render settings of a run."""
     background = run_folder.background_color(config)
     return evaluate(
-        gaussians, dataset.views, photos, config=config.raster, background=background
+        gaussians,
+        dataset.views,
+        photos,
+        config=config.raster,
+        background=background,
+        shutter=config.shutter,
     )
 
 

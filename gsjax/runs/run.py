@@ -193,7 +193,9 @@ def _load_photos_and_state(session: Session) -> tuple[list[Photo], TrainState]:
     )
     state = session.resume_point.state
     check_memory(session.dataset, config, state)
-    photos = load_photos(session.dataset.views, config.max_size)
+    photos = load_photos(
+        session.dataset.views, config.max_size, undistort=config.undistort
+    )
     return photos, state or first_state(session, photos)
 
 

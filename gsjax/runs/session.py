@@ -91,16 +91,20 @@ class Session:
     def cameras(self, state: TrainState) -> Dataset:
         """Return all views with the cameras refined so far."""
         dataset, refinement = self.split.dataset, state.refinement
-        if refinement.turns is None and refinement.intrinsics is None:
+        parts = refinement.turns, refinement.intrinsics, refinement.twists
+        if all(part is None for part in parts):
             return dataset
         extent = extent_of(self.dataset)
-        return refine_dataset(dataset, self.split.train, refinement, extent)
+        trained = self.split.train
+        return refine_dataset(dataset, trained, refinement, extent, self.config)
 
     def held_out(self, cameras: Dataset) -> tuple[Dataset, list[Photo]]:
         """Return the held-out views with the given cameras, and their photographs."""
         given, dataset = self.split.views("test"), subset(cameras, self.split.test)
         if self._held_out is None:
-            self._held_out = load_photos(given, self.config.max_size)
+            self._held_out = load_photos(
+                given, self.config.max_size, undistort=self.config.undistort
+            )
         return dataset, refine_photos(self._held_out, given, dataset.views)
 
     def log_held_out(self, state: TrainState, summary: Summary, seconds: float) -> None:

@@ -12,6 +12,13 @@ from typing import Protocol
 import numpy as np
 
 from gsjax.cameras.camera import make_camera
+from gsjax.cameras.distortion import (
+    Distortion,
+    distortion_of,
+    project_points,
+    single_lens_fields,
+)
+from gsjax.cameras.lenses import panorama_intrinsics
 from gsjax.data import camera_paths
 from gsjax.data.image_files import natural_order, short_names
 from gsjax.data.photos import size_within, stored_size
@@ -49,12 +56,16 @@ CAMERA_PATHS: dict[str, CameraPath] = {
 
 
 def view_entries(
-    views: Sequence[View], *, max_size: int | None = None
+    views: Sequence[View], *, max_size: int | None = None, undistort: bool = False
 ) -> list[CameraEntry]:
     """Return the cameras of views, at the size of their photographs.
 
     Their names are those of the photographs, relative to the folder that all share.
-    ``max_size`` is the longest side in px, as in training; None for no limit.
+
+    Args:
+      views: the views.
+      max_size: longest side in px, as in training; None for no limit.
+      undistort: return ideal pinholes in place of the lenses of the photographs.
 
     Raises:
       InputError: if the size of a photograph cannot be read.
@@ -65,7 +76,12 @@ def view_entries(
     if len({name.casefold() for name in flat}) < len(flat):
         flat = [f"{index:05d}_{name}" for index, name in enumerate(flat)]
     scaled = [_at_photo_size(view, max_size) for view in views]
-    return [_entry(n, view.viewmat, view, view.near) for n, view in zip(flat, scaled)]
+    if undistort:
+        scaled = [replace(view, lens=None) for view in scaled]
+    return [
+        _entry(n, view.viewmat, view, view.near, view.lens)
+        for n, view in zip(flat, scaled)
+    ]
 
 
 def path_entries(
@@ -155,19 +171,56 @@ def _frames(
 
 
 def _entry(
-    name: str, viewmat: np.ndarray, lens: View | camera_paths.Intrinsics, near: float
+    name: str,
+    viewmat: np.ndarray,
+    intrinsics: View | camera_paths.Intrinsics,
+    near: float,
+    lens: Distortion | None = None,
 ) -> CameraEntry:
-    camera = make_camera(
-        viewmat=viewmat, K=lens.K, width=lens.width, height=lens.height, near=near
-    )
+    fields = single_lens_fields(lens)
+    size = {"width": intrinsics.width, "height": intrinsics.height}
+    camera = make_camera(viewmat=viewmat, K=intrinsics.K, **size, near=near, **fields)
     return CameraEntry(name, camera)
 
 
+def through_lens(entry: CameraEntry, lens: str) -> CameraEntry:
+    """Return the camera with another lens at the same pose.
+
+    Args:
+      entry: a camera with its name.
+      lens: "equirectangular", the whole sphere on an image twice as wide as it is high;
+        or "fisheye", equidistant with 180° across the shorter side of the image.
+    """
+    camera = entry.camera
+    width, height = camera.width, camera.height
+    if lens == "equirectangular":
+        width, K, coefficients = (
+            2 * height,
+            panorama_intrinsics(2 * height, height),
+            None,
+        )
+    else:
+        focal = min(width, height) / np.pi
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        coefficients = np.zeros(4)
+    changed = make_camera(
+        viewmat=camera.viewmat,
+        K=K,
+        width=width,
+        height=height,
+        near=camera.near,
+        far=camera.far,
+        lens=lens,
+        coefficients=coefficients,
+    )
+    return entry._replace(camera=changed)
+
+
 def _at_photo_size(view: View, max_size: int | None) -> View:
-    """Return the view, without distortion, at the size that `load_photo` returns."""
+    """Return the view at the size that `load_photo` returns."""
     width, height = size_within(*stored_size(view), max_size)
     K = view.K * ([width / view.width], [height / view.height], [1])
-    return replace(view, K=K, width=width, height=height, lens=None)
+    return replace(view, K=K, width=width, height=height)
 
 
 def _median_depth(dataset: Dataset) -> float | None:
@@ -191,11 +244,10 @@ def depth_limits(
     for _, camera in entries:
         viewmat = np.asarray(camera.viewmat)
         local = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-        local = local[local[:, 2] > float(camera.near)]
-        # Not jitted: the number of points differs between cameras.
-        u, v = map(np.asarray, camera.project(tuple(local.T)))
-        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        seen.append(local[inside, 2])
+        lens, K = distortion_of(camera), np.asarray(camera.K, np.float64)
+        pixels, depth, valid = project_points(lens, K, local)
+        inside = (pixels >= 0) & (pixels < (camera.width, camera.height))
+        seen.append(depth[inside.all(-1) & valid & (depth > float(camera.near))])
     depths = np.concatenate(seen)
     if not len(depths):
         return 0.0, 0.0

@@ -13,6 +13,12 @@ from gsjax.runtime.machine import usable_cores
 from gsjax.sfm.engine import Progress, colmap, count_rows, run_cancellable
 
 MAX_FEATURES = 8192
+# Those that structure from motion can estimate without a prior calibration.
+CAMERA_MODELS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
+    *("FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE"),
+    *("THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION"),
+)
 _FEW_FEATURES = 100
 _MAX_GUIDED_PAIRS, _MAX_GUIDED_PAIRS_PER_IMAGE = 60, 5
 # COLMAP starts with 30. 15 are still not chance: one in 4000 random matches lies within
@@ -62,6 +68,7 @@ def extract_features(
     masks: Path | None,
     records: Sequence[ImageRecord],
     progress: Progress,
+    camera_model: str = "SIMPLE_RADIAL",
 ) -> None:
     """Write the cameras and SIFT features (CPU) of all images to the database.
 
@@ -71,6 +78,7 @@ def extract_features(
     pycolmap = colmap()
     pycolmap.Database.open(database).close()  # creates it
     reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = camera_model
     for key in dict.fromkeys(record.camera for record in records):
         names = [record.file for record in records if record.camera == key]
         mode = pycolmap.CameraMode.SINGLE
@@ -110,7 +118,10 @@ def _set_focal_lengths(database: Path, records: Sequence[ImageRecord]) -> None:
             if record.focal is None:
                 continue
             camera = opened.read_camera(image.camera_id)
-            camera.params = [record.focal, record.width / 2, record.height / 2, 0.0]
+            params = list(camera.params)
+            for index in camera.focal_length_idxs():
+                params[index] = record.focal
+            camera.params = params
             camera.has_prior_focal_length = True
             opened.update_camera(camera)
 

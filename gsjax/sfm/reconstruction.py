@@ -16,6 +16,7 @@ from gsjax.errors import InputError, SfmError
 from gsjax.runtime.files import write_json
 from gsjax.sfm.engine import Progress, colmap, quiet_and_seeded
 from gsjax.sfm.mapping import (
+    CAMERA_MODELS,
     extract_features,
     map_incrementally,
     match_features,
@@ -44,6 +45,7 @@ class SfmSettings:
         photos, else "sequential" (also for video).
       camera: which photos share their intrinsics: "single" for all; "per-image" for
         none; "auto" for those of equal size, camera and focal length (EXIF).
+      camera_model: COLMAP's camera model that is estimated, of `CAMERA_MODELS`.
       max_size: longer side in px that photos are scaled down to, for the features and
         in the dataset; 0 for no limit.
       frames: number of frames to take from a video.
@@ -54,6 +56,7 @@ class SfmSettings:
 
     matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
     camera: Literal["auto", "single", "per-image"] = "auto"
+    camera_model: str = "SIMPLE_RADIAL"
     max_size: int = 1600
     frames: int = 100
     masks: Path | None = None
@@ -160,7 +163,7 @@ def run_sfm(
         if matcher == "auto":
             few = source.is_dir() and len(photos) <= EXHAUSTIVE_UP_TO
             matcher = "exhaustive" if few else "sequential"
-        models = _solve(photos, matcher, job)
+        models = _solve(photos, settings.camera_model, matcher, job)
         masks = None if settings.masks is None else str(settings.masks)
         resolved = {**asdict(settings), "matcher": matcher, "masks": masks}
         report = SfmReport(
@@ -184,6 +187,11 @@ def run_sfm(
 def _check(source: Path, settings: SfmSettings) -> None:
     if not source.exists():
         raise InputError(f"{source}: no such folder of photos or video; check the path")
+    if settings.camera_model not in CAMERA_MODELS:
+        raise InputError(
+            f"camera_model: expected one of {', '.join(CAMERA_MODELS)}, got "
+            f"{settings.camera_model!r}"
+        )
     if settings.max_size and settings.max_size < 64:
         raise InputError(
             f"max_size: expected 0 or at least 64 px, got {settings.max_size}"
@@ -258,7 +266,9 @@ def _advice(matcher: str) -> str:
     )
 
 
-def _solve(photos: list[PreparedPhoto], matcher: str, job: _Job) -> list[Any]:
+def _solve(
+    photos: list[PreparedPhoto], camera_model: str, matcher: str, job: _Job
+) -> list[Any]:
     """Return the reconstructed models, largest first.
 
     Raises:
@@ -269,7 +279,9 @@ def _solve(photos: list[PreparedPhoto], matcher: str, job: _Job) -> list[Any]:
     records = [photo.record for photo in photos]
     with job.timed("features"):
         job.progress(f"features of {count} images")
-        extract_features(work.database, work.photos, masks, records, job.progress)
+        extract_features(
+            work.database, work.photos, masks, records, job.progress, camera_model
+        )
     with job.timed("matching"):
         job.progress(f"matching, {matcher}")
         match_features(work.database, count, matcher, job.seed, job.progress)

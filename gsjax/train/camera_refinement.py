@@ -1,4 +1,4 @@
-"""Corrections of camera poses, intrinsics and exposures, optimised with the scene.
+"""Corrections of cameras and exposures, optimised with the scene.
 
 Axis legend: V views, B views of a step, H W image.
 """
@@ -13,6 +13,7 @@ from gsjax.math.rotations import quaternion_to_matrix
 from gsjax.train.config import TrainConfig
 
 Array = jax.Array
+_COEFFICIENTS = 12  # the largest number of any lens that is optimised
 
 
 @jax.tree_util.register_dataclass
@@ -26,12 +27,18 @@ class CameraRefinement:
       intrinsics: [4] log factors of both focal lengths, and shift of the principal
         point in focal lengths; shared by all views. Focal lengths are the unit because
         images of several sizes are padded to one.
+      distortion: [12] added to the coefficients of the lens, as many as it has; shared
+        by all views.
+      twists: [V, 6] added to the motion during the exposure; the translations are in
+        scene extents.
       exposures: [V, 3, 4] affine map of the colours, minus the identity.
     """
 
     turns: Array | None = None
     shifts: Array | None = None
     intrinsics: Array | None = None
+    distortion: Array | None = None
+    twists: Array | None = None
     exposures: Array | None = None
 
 
@@ -43,6 +50,8 @@ def init_refinement(config: TrainConfig, views: int) -> CameraRefinement:
         turns=jnp.zeros((views, 3)) if poses else None,
         shifts=jnp.zeros((views, 3)) if poses else None,
         intrinsics=jnp.zeros(4) if intrinsics else None,
+        distortion=jnp.zeros(_COEFFICIENTS) if intrinsics else None,
+        twists=jnp.zeros((views, 6)) if config.refine_shutter else None,
         exposures=jnp.zeros((views, 3, 4)) if config.exposure else None,
     )
 
@@ -67,7 +76,13 @@ def refine_camera(
         focal = jnp.stack([K[:, 0, 0], K[:, 1, 1]], -1)
         K = K.at[:, 0, 0].multiply(factor[0]).at[:, 1, 1].multiply(factor[1])
         K = K.at[:, :2, 2].add(focal * refinement.intrinsics[2:])
-    return replace(camera, viewmat=viewmat, K=K)
+    c, twist = camera.coefficients, camera.twist
+    if refinement.distortion is not None and c is not None:
+        c = c + refinement.distortion[: c.shape[-1]]
+    if refinement.twists is not None and twist is not None:
+        scale = jnp.asarray([1.0, 1, 1, extent, extent, extent], twist.dtype)
+        twist = twist + scale * refinement.twists[index]
+    return replace(camera, viewmat=viewmat, K=K, coefficients=c, twist=twist)
 
 
 def apply_exposure(

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.cameras.camera import Camera
+from gsjax.cameras.distortion import distortion_of, project_points
 from gsjax.densify.schedule import EditSchedule
 from gsjax.errors import CapacityError
 from gsjax.gaussians import Gaussians, capacity_bucket, grow
@@ -105,9 +106,9 @@ def expected_pairs(spheres: Spheres, camera: Camera, config: RasterConfig) -> fl
     viewmat, K = np.asarray(camera.viewmat, float), np.asarray(camera.K, float)
     means, variances, opacities = spheres
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    drawn = (points[:, 2] > camera.near) & (points[:, 2] < camera.far)
-    points, z = points[drawn], points[drawn, 2]
-    centre = (points @ K.T)[:, :2] / z[:, None]
+    centre, depth, drawn = project_points(distortion_of(camera), K, points)
+    drawn &= (depth > camera.near) & (depth < camera.far)
+    centre, z = centre[drawn], depth[drawn]
     variance = variances[drawn] * K[0, 0] * K[1, 1] / z**2
     reach = 2 * np.log(np.maximum(opacities[drawn] / config.alpha_min, 1))
     radius = np.sqrt(reach * (variance + config.dilation))[:, None]

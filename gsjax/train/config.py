@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
+from gsjax.cameras.shutter import SHUTTERS
 from gsjax.densify.adaptive import AdaptiveSettings, adaptive
 from gsjax.densify.mcmc import McmcSettings, mcmc
 from gsjax.densify.schedule import EditSchedule
@@ -15,6 +16,7 @@ from gsjax.train.optimiser import Rates
 
 STRATEGIES = ("adaptive", "mcmc")
 _CHOICES = {
+    "shutter": tuple(SHUTTERS),
     "strategy": STRATEGIES,
     "background": ("auto", "black", "white", "random"),
     "initial": ("auto", "points", "dense", "random"),
@@ -72,9 +74,18 @@ class TrainConfig:
       dense_count: maximum number of matched points.
       max_initial: maximum number of initial points; a random subset is kept.
       rates: learning rates of the Gaussians.
-      refine_poses, refine_intrinsics: optimise small corrections of the cameras.
+      undistort: resample the photographs to ideal pinholes when they are loaded, in
+        place of rendering through their lenses.
+      shutter: name of the shutter of all cameras, see `gsjax.cameras.shutter`.
+      refine_poses: optimise small corrections of the poses.
+      refine_intrinsics: optimise focal length, principal point and distortion, which
+        all views share. Pinholes get OpenCV's k1 k2 p1 p2.
+      refine_shutter: optimise the motion of each camera during the exposure of a
+        rolling ``shutter``.
       exposure: optimise an affine correction of the colours of each photograph.
       pose_rate, intrinsics_rate, exposure_rate: learning rates of these corrections.
+        That of distortion is 10 × ``intrinsics_rate``, and of the shutter 10 ×
+        ``pose_rate``.
       skip_masked: skip tiles in which all pixels are masked; equal up to rounding.
       prune_invisible: after the last step, remove the Gaussians that no training view
         shows; the views stay bit-equal. (Metrics of the last step count them.)
@@ -106,8 +117,11 @@ class TrainConfig:
     dense_count: int = 100_000
     max_initial: int = 1_000_000
     rates: Rates = field(default_factory=Rates)
+    undistort: bool = False
+    shutter: str = "global"
     refine_poses: bool = False
     refine_intrinsics: bool = False
+    refine_shutter: bool = False
     exposure: bool = False
     pose_rate: float = 1e-5
     intrinsics_rate: float = 1e-5
@@ -122,7 +136,8 @@ class TrainConfig:
         convert_fields(self)
         require_ranges(self, _CHOICES)
         if self.raster is _RASTER or self.raster is _ACCURATE:
-            default = _ACCURATE if self.refine_poses else _RASTER
+            precise = self.refine_poses or self.refine_shutter
+            default = _ACCURATE if precise else _RASTER
             object.__setattr__(self, "raster", default)
         rates = _as_floats(self.rates)
         object.__setattr__(self, "rates", rates)
@@ -139,6 +154,7 @@ class TrainConfig:
             "pose_rate", "intrinsics_rate", "exposure_rate", "dense_count",
             "every_eval", "every_checkpoint",
         )  # fmt: skip
+        rolling = not self.refine_shutter or SHUTTERS[self.shutter].rolling
         opacity, scale = 0 < settings.initial_opacity < 1, settings.initial_scale > 0
         checks = {
             "steps": f"[1, {2**31 - 1})",
@@ -146,6 +162,7 @@ class TrainConfig:
             "max_size": "[8, inf)",
             "levels": (levels, "increasing starts from 0 and divisors ≥ 1"),
             "sh_degree": "[0, 4]",
+            "refine_shutter": (rolling, "False for a global shutter"),
             "ssim_weight": "[0, 1]",
             "rates' means": (means, "two positive numbers, or equal ones"),
             "rates' cooling": (0 < rates.cooling <= 1, "cooling in (0, 1]"),

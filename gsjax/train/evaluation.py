@@ -11,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.cameras.camera import make_camera
+from gsjax.cameras.distortion import lens_fields
 from gsjax.data.types import Photo, View
 from gsjax.gaussians import Gaussians
 from gsjax.raster.exact import render_exact
 from gsjax.raster.types import RasterConfig
 from gsjax.runtime.devices import replicate
+from gsjax.train.frames import with_shutter_of
 from gsjax.train.metrics import psnr, ssim
 
 LPIPS_NOTE = "unavailable: its weights are not part of gsjax"
@@ -69,6 +71,7 @@ def evaluate(
     *,
     config: RasterConfig | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
+    shutter: str = "global",
 ) -> Iterator[ViewResult]:
     """Render each view at the size of its photograph and compare them.
 
@@ -81,6 +84,7 @@ def evaluate(
       photos: V photographs, in the order of the views.
       config: render settings.
       background: [3] RGB behind the scene and behind transparent photographs.
+      shutter: name of the shutter of all cameras.
 
     Yields:
       The result of each view, as soon as it is computed.
@@ -101,12 +105,20 @@ def evaluate(
         photo.require(view.name)
     sizes = {photo.pixels.shape[:2] for photo in photos}
     height, width = np.max([(1, 1), *sizes], axis=0)
-    for view, photo in zip(views, photos, strict=True):
+    if not photos:
+        return
+    cameras = make_camera(
+        viewmat=np.stack([view.viewmat for view in views]),
+        K=np.stack([photo.K for photo in photos]),
+        width=int(width),
+        height=int(height),
+        near=np.asarray([view.near for view in views]),
+        **lens_fields([photo.lens for photo in photos]),
+    )
+    cameras = with_shutter_of(views, shutter, cameras)
+    for index, (view, photo) in enumerate(zip(views, photos, strict=True)):
         rows, cols = photo.pixels.shape[:2]
-        camera = make_camera(
-            viewmat=view.viewmat, K=photo.K, width=int(width), height=int(height),
-            near=view.near,
-        )  # fmt: skip
+        camera = jax.tree.map(lambda a, i=index: a[i], cameras)
         size = jnp.asarray([cols, rows]) if len(sizes) > 1 else None
         camera = camera.replace(visible_size=size)
         result = render_exact(gaussians, camera, config, jnp.asarray(behind))

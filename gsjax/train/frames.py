@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gsjax.cameras.camera import Camera, make_camera
+from gsjax.cameras.camera import Camera, make_camera, with_shutter
+from gsjax.cameras.distortion import lens_fields
+from gsjax.cameras.shutter import SHUTTERS
 from gsjax.data.types import Photo, View
 from gsjax.io.images import opencv
 from gsjax.math.numerics import to_device
@@ -69,11 +71,25 @@ class Batch(NamedTuple):
 
 
 def make_frames(
-    views: Sequence[View], photos: Sequence[Photo], divisor: int = 1
+    views: Sequence[View],
+    photos: Sequence[Photo],
+    divisor: int = 1,
+    *,
+    shutter: str = "global",
+    distorting: bool = False,
 ) -> Frames:
     """Return photographs, downscaled by ``divisor``, padded to one size.
 
     Padding is on the right and bottom, and is not valid.
+
+    Args:
+      views, photos: V each.
+      divisor: factor by which both sides shrink.
+      shutter: name of the shutter of all cameras.
+      distorting: give pinholes a distortion of 0, to be optimised.
+
+    Raises:
+      InputError: if the photographs have lenses of different kinds.
     """
     small = [_downscale(photo, divisor) for photo in photos]
     size = np.asarray([p.pixels.shape[1::-1] for p in small], np.int32)
@@ -92,7 +108,9 @@ def make_frames(
         width=width,
         height=height,
         near=np.asarray([view.near for view in views]),
+        **lens_fields([photo.lens for photo in small], distorting),
     )
+    camera = with_shutter_of(views, shutter, camera)
     fields: Any = {
         "pixels": pixels,
         "valid": None if valid.all() else valid,
@@ -100,6 +118,14 @@ def make_frames(
         "time": np.asarray([view.time for view in views], np.float32),
     }
     return to_device(Frames(camera=camera, **fields))
+
+
+def with_shutter_of(views: Sequence[View], shutter: str, camera: Camera) -> Camera:
+    """Return a batch of the cameras of views with a shutter and their motions."""
+    if not SHUTTERS[shutter].rolling:
+        return camera
+    twists = [np.zeros(6) if v.twist is None else v.twist for v in views]
+    return with_shutter(camera, shutter, twist=np.stack(twists))
 
 
 def _downscale(photo: Photo, divisor: int) -> Photo:
@@ -117,13 +143,14 @@ def _downscale(photo: Photo, divisor: int) -> Photo:
         valid = area(valid.astype(np.uint8) * 255) == 255
     scale = np.diag([size[0] / width, size[1] / height, 1.0])
     if photo.alpha is None:
-        return Photo(area(photo.pixels), None, valid, scale @ photo.K)
+        return Photo(area(photo.pixels), None, valid, scale @ photo.K, photo.lens)
     # Premultiplied: the colour of transparent pixels is undefined.
     weight = photo.alpha.astype(np.float32)[..., None]
     alpha = area(weight)
     colors = area(photo.pixels * weight) / np.where(alpha > 0, alpha, 1)[..., None]
     pixels = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
-    return Photo(pixels, np.rint(alpha).astype(np.uint8), valid, scale @ photo.K)
+    alpha = np.rint(alpha).astype(np.uint8)
+    return Photo(pixels, alpha, valid, scale @ photo.K, photo.lens)
 
 
 def views_of_step(seed: int, step: int, batch: int, views: int) -> np.ndarray:

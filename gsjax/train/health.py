@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gsjax.cameras.distortion import project_points
 from gsjax.data.extent import require_points
 from gsjax.data.types import Dataset, Photo
 from gsjax.errors import DivergedError, InputError
@@ -104,11 +105,10 @@ def check_in_view(dataset: Dataset, means: np.ndarray, source: str) -> None:
       InputError: if none is; ``source`` is the subject of the message.
     """
     for view in dataset.views:
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            x, y, z = view.viewmat[:3, :3] @ means.T + view.viewmat[:3, 3:]
-            u, v, _ = view.K @ np.stack([x / z, y / z, np.ones_like(z)])
-        inside = (z > view.near) & (u >= 0) & (u <= view.width)
-        if np.any(inside & (v >= 0) & (v <= view.height)):
+        points = means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        pixels, depth, seen = project_points(view.lens, view.K, points)
+        inside = (pixels >= 0) & (pixels <= (view.width, view.height))
+        if np.any(seen & (depth > view.near) & inside.all(-1)):
             return
     raise InputError(
         f"{source}: expected a scene in the coordinates of {dataset.source}, got none "
@@ -121,8 +121,9 @@ def _depths(dataset: Dataset, points: np.ndarray) -> tuple[int, int, float]:
     """Return over all views: points in front, points beyond near, largest depth."""
     before, drawn, farthest = 0, 0, 0.0
     for view in dataset.views:
-        depth = points @ view.viewmat[2, :3] + view.viewmat[2, 3]
-        depth = depth[depth > 0]  # removes NaN
+        local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        _, depth, seen = project_points(view.lens, view.K, local)
+        depth = depth[seen]  # removes NaN
         before += len(depth)
         drawn += int((depth > view.near).sum())
         farthest = max(farthest, depth.max(initial=0))

@@ -195,7 +195,13 @@ class _Run:
             finer = config.divisor(step) != divisor
             if frames is None or finer:
                 divisor = config.divisor(step)
-                frames = make_frames(self.dataset.views, self.photos, divisor)
+                frames = make_frames(
+                    self.dataset.views,
+                    self.photos,
+                    divisor,
+                    shutter=config.shutter,
+                    distorting=config.refine_intrinsics,
+                )
                 frames = self.compiler.place(frames)
             try:
                 if finer:

@@ -129,7 +129,8 @@ def check_memory(
     else:
         count, slots = int(np.sum(state.gaussians.active)), state.gaussians.capacity
     sizes = trained_sizes(dataset, config)
-    # Undistortion leaves pixels without content, which are excluded as if masked.
+    # Undistortion leaves pixels without content, which are excluded as if masked; so
+    # are those outside the circle of a fisheye.
     masked = any(v.mask is not None or v.lens is not None for v in dataset.views)
     now = run_estimate(sizes, config, count, slots, begins=state is None, masked=masked)
     most = max(config.max_gaussians, count)

@@ -125,6 +125,8 @@ def make_setup(
         "turns": config.pose_rate,
         "shifts": config.pose_rate,
         "intrinsics": config.intrinsics_rate,
+        "distortion": 10 * config.intrinsics_rate,
+        "twists": 10 * config.pose_rate,
         "exposures": config.exposure_rate,
     }
     rates |= {f"model.{name}": rate for name, rate in model.rates.items()}

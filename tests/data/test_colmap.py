@@ -28,7 +28,7 @@ from captures import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsjax.cameras.distortion import Distortion, distort
+from gsjax.cameras.distortion import Distortion, project_points
 from gsjax.data import colmap_binary, colmap_text
 from gsjax.data.colmap import find_colmap, load_colmap, read_colmap
 from gsjax.data.colmap_model import CAMERA_KINDS, viewmat_of
@@ -282,7 +282,9 @@ def test_missing_files(tmp_path):
 PARAMETERS = {
     **{"k": 0.03, "k1": 0.04, "k2": -0.02, "k3": 0.01, "k4": 0.005, "k5": 0.02},
     **{"k6": 0.001, "p1": 0.002, "p2": -0.003, "cx": 310.0, "cy": 245.5},
-    **{"f": 500.0, "fx": 500.0, "fy": 510.0},
+    **{"f": 500.0, "fx": 500.0, "fy": 510.0, "k0": 0.01, "omega": 0.4},
+    **{"sx1": 0.002, "sy1": -0.001, "p0": 0.002, "s0": 0.001, "s1": -0.002},
+    **{"s2": 0.003, "s3": 0.001, "alpha": 0.55, "beta": 1.1},
 }
 
 
@@ -291,14 +293,14 @@ PARAMETERS = {
 def test_camera_models_project_as_those_of_pycolmap(
     pycolmap, tmp_path, kind, distorted
 ):
-    """With zero coefficients all but a fisheye are pinholes."""
+    """With zero coefficients OpenCV's perspective lenses are pinholes."""
     number = pycolmap.CameraModelId.__members__.get(kind.name)
     if number is None:
         pytest.skip("unknown to this pycolmap")
     assert int(number) == kind.number
     camera = pycolmap.Camera.create_from_model_id(1, number, 500.0, 640, 480)
     assert len(camera.params) == kind.size
-    if distorted and kind.lens is not None:
+    if distorted and kind.focals:
         names = camera.params_info.split(", ")
         camera.params = [PARAMETERS[name] for name in names]
     model = pycolmap.Reconstruction()
@@ -307,20 +309,15 @@ def test_camera_models_project_as_those_of_pycolmap(
     model.write_text(tmp_path)
     for reader, form in ((colmap_binary, "bin"), (colmap_text, "txt")):
         path = tmp_path / f"cameras.{form}"
-        if kind.lens is None:
-            expected = rf"cameras.{form}: .*{kind.name} is not supported; undistort"
-            rejects(expected, reader.read_cameras, path)
-            continue
         ours = reader.read_cameras(path)[1]
-        found = x, y = np.random.default_rng(0).uniform(-0.6, 0.6, (2, 50))
-        zero = not distorted and kind.lens != "fisheye"
+        x, y = np.random.default_rng(0).uniform(-0.6, 0.6, (2, 50))
+        zero = not distorted and kind.lens == "opencv"
         assert (ours.lens is None) == ("PINHOLE" in kind.name or zero)
-        if ours.lens is not None:
-            assert ours.lens.model == kind.lens
-            found = distort(ours.lens, x, y)
-        pixels = np.stack([*found, np.ones(50)]).T @ ours.K.T
-        expected = camera.img_from_cam(np.stack([x, y, np.ones(50)], -1))
-        np.testing.assert_allclose(pixels[:, :2], expected, atol=1e-9)
+        assert ours.lens is None or ours.lens.model == kind.lens
+        points = np.stack([x, y, np.ones(50)], -1)
+        pixels, _, seen = project_points(ours.lens, ours.K, points)
+        assert seen.all()
+        np.testing.assert_allclose(pixels, camera.img_from_cam(points), atol=1e-9)
 
 
 @pytest.mark.parametrize("at", [(0, 0, 0), (5e5, -4.1e6, 120)])

@@ -14,7 +14,7 @@ from captures import exif_turn, png_chunk, rejects, save_photo, warned
 from gsjax.cameras.distortion import Distortion, distort
 from gsjax.data.decode import warn_of_damage
 from gsjax.data.image_header import check_image, image_size
-from gsjax.data.photos import load_photo, load_photos, undistorted_view
+from gsjax.data.photos import load_photo, load_photos, loaded_view, undistort_photo
 from gsjax.data.types import Photo, View
 from gsjax.errors import InputError
 from gsjax.sfm.photos import read_upright
@@ -31,7 +31,8 @@ def view_of(path: Path, size=(32, 24), K=K, **more) -> View:
 
 def load(folder: Path, pixels, name="a.png", max_size=None, **more) -> Photo:
     """Write pixels and load them as a photograph."""
-    return load_photo(view_of(save_photo(folder / name, pixels), **more), max_size)
+    view = view_of(save_photo(folder / name, pixels), **more)
+    return load_photo(view, max_size, undistort=True)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff", ".bmp", ".webp", ".jpg"])
@@ -275,10 +276,33 @@ def test_undistortion_of_smaller_copies(tmp_path):
     np.testing.assert_array_equal(half.pixels, same.pixels)
     np.testing.assert_array_equal(half.valid, same.valid)
     view = view_of(tmp_path / "a.png", **WIDE, lens=lens)
-    photo = load_photo(view, 60)
-    ideal = undistorted_view(view, photo)
+    photo = load_photo(view, 60, undistort=True)
+    ideal = loaded_view(view, photo)
     assert (ideal.width, ideal.height, ideal.lens) == (60, 45, None)
     np.testing.assert_array_equal(ideal.K, photo.K)
+
+
+def test_lenses_are_kept(tmp_path):
+    """Pixels stay as they are; those outside a fisheye's circle are invalid."""
+    path = save_photo(tmp_path / "a.png", NOISE)
+    photo = load_photo(view_of(path, lens=LENSES["barrel"]), 16)
+    same = load_photo(view_of(path), 16)
+    np.testing.assert_array_equal(photo.pixels, same.pixels)
+    assert (photo.lens, photo.valid) == (LENSES["barrel"], None)
+    undistorted = undistort_photo("a", load_photo(view_of(path, lens=photo.lens)))
+    wanted = load_photo(view_of(path, lens=photo.lens), undistort=True)
+    np.testing.assert_array_equal(undistorted.pixels, wanted.pixels)
+    np.testing.assert_array_equal(undistorted.valid, wanted.valid)
+    # θ (1 − 0.1 θ²) grows up to θ = 1.826, to 1.217.
+    narrow = Distortion("fisheye", (-0.1, 0.0, 0.0, 0.0))
+    K = np.array([[14.0, 0, 16], [0, 14, 12], [0, 0, 1]])
+    photo = load_photo(view_of(path, K=K, lens=narrow))
+    x, y = pixel_centres((24, 32))
+    assert photo.valid is not None
+    np.testing.assert_array_equal(photo.valid, np.hypot(x - 16, y - 12) < 1.217 * 14)
+    folded = Distortion("fisheye", (-1.0, 0.0, 0.0, 0.0))
+    folds = r"a\.png: the lens \(fisheye, -1, .* folds within the image: .* estimate"
+    rejects(folds, load_photo, view_of(path, K=K, lens=folded))
 
 
 def test_masks(tmp_path):
@@ -307,7 +331,8 @@ def test_mask_through_a_lens(tmp_path):
     image = WHITE.copy()
     image[60:80, 150:170] = 0
     path = save_photo(tmp_path / "a.png", image)
-    photo = load_photo(view_of(path, **WIDE, lens=LENSES["pincushion"], mask=path))
+    view = view_of(path, **WIDE, lens=LENSES["pincushion"], mask=path)
+    photo = load_photo(view, undistort=True)
     assert photo.valid is not None
     assert (photo.pixels[photo.valid] == 200).all()  # nothing of the hole leaks
     dark = (photo.pixels[..., 0] == 0).sum()
@@ -325,10 +350,12 @@ def test_many_photographs_keep_their_order(tmp_path):
         path = save_photo(tmp_path / f"{index}.png", pixels)
         views.append(view_of(path, lens=lenses[index % 3]))
     calls = []
-    photos = load_photos(views, 16, progress=lambda done, of: calls.append((done, of)))
+    photos = load_photos(
+        views, 16, lambda done, of: calls.append((done, of)), undistort=True
+    )
     assert [int(photo.pixels[6, 8, 0]) for photo in photos] == [*range(0, 240, 20)]
     for index, view in enumerate(views):
-        alone = load_photo(view, 16)
+        alone = load_photo(view, 16, undistort=True)
         np.testing.assert_array_equal(photos[index].pixels, alone.pixels)
         np.testing.assert_array_equal(photos[index].valid, alone.valid)
     assert calls == [(n, 12) for n in range(1, 13)]

@@ -19,10 +19,12 @@ from captures import (
     write_transforms,
 )
 
-from gsjax.cameras.distortion import Distortion
+import gsjax
+from gsjax.cameras.distortion import Distortion, distortion_of
+from gsjax.cameras.lenses import panorama_intrinsics
 from gsjax.data.dataset import load_dataset
 from gsjax.data.photos import load_photo
-from gsjax.data.transforms import load_transforms
+from gsjax.data.transforms import CameraEntry, load_transforms, transforms_json
 from gsjax.io.point_cloud import read_point_cloud
 
 ANGLE = {"camera_angle_x": 0.6911112070083618}
@@ -142,7 +144,7 @@ def test_frames_override_the_top_level(tmp_path):
     frames = frames_of(dataset_of_views(5))
     frames = [given | change for given, change in zip(frames, changes)]
     path = write_transforms(tmp_path, frames, **PIXELS)
-    views, entries = poses_of(path), warned("distortion", load_transforms, path)
+    views, entries = poses_of(path), load_transforms(path)
     wanted = [(40, 42, 15.5), (100, 100, 1.5), (40, 99, 15.5), (16, 16, 15.5)]
     wanted.append(wanted[0])
     for view, (_, camera), expected in zip(views, entries, wanted, strict=True):
@@ -152,15 +154,35 @@ def test_frames_override_the_top_level(tmp_path):
     assert (views[1].width, views[1].height) == (64, 16)
     lens = Distortion("opencv", (0.1, 0.2, 0.01, 0.02, 0.3))
     assert [view.lens for view in views] == [None] * 4 + [lens]
+    assert [distortion_of(camera) for _, camera in entries[:4]] == [None] * 4
+    np.testing.assert_allclose(entries[4].camera.coefficients, lens.coefficients)
 
 
-def test_distortion_gives_one_warning(tmp_path):
-    frames = [frame(k2=0.1), frame(), frame(distortion_params=[0, 0.2])]
-    path = write_transforms(tmp_path, frames, p1=-1e-4, k1=0, **PIXELS)
-    expected = r"distortion \(distortion_params, k2, p1\) is ignored"
-    with pytest.warns(UserWarning, match=expected) as caught:
-        load_transforms(path)
-    assert len(caught) == 1
+@pytest.mark.parametrize(
+    ("lens", "coefficients"),
+    [
+        ("opencv", (0.1, 0.2, 0.01, 0.02, 0.3)),
+        ("fisheye", (0.1, 0.02, 0.01, 0.003)),
+        ("equirectangular", None),
+    ],
+)
+def test_lenses_are_written_and_read(tmp_path, lens, coefficients):
+    K = np.array([[40.0, 0, 23], [0, 41, 13], [0, 0, 1]])
+    if coefficients is None:
+        K = panorama_intrinsics(48, 24)
+    camera = gsjax.make_camera(
+        viewmat=np.eye(4),
+        K=K,
+        width=48,
+        height=24,
+        lens=lens,
+        coefficients=coefficients,
+    )
+    path = tmp_path / "transforms.json"
+    path.write_text(transforms_json([CameraEntry("a", camera)]))
+    [(_, found)] = load_transforms(path)
+    assert distortion_of(found) == distortion_of(camera)
+    np.testing.assert_allclose(found.K, K, rtol=1e-12)
 
 
 def test_names_are_unique_and_safe(tmp_path):
@@ -241,13 +263,11 @@ REFUSED = {
     "cameras": [
         ({"w": None, "h": None}, "no image size.*--size WxH"),
         ({**NO_FOCAL, "camera_model": "ORTHOGRAPHIC", **ANGLE}, "length, fl_x, got n"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model .* supported: OPENCV, PIN"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model .* cannot be rendered"),
-        ({"camera_model": ["OPENCV"]}, "camera_model .* cannot be rendered"),
-        ({"is_fisheye": True}, "camera_model .* cannot be rendered"),
+        ({"camera_model": "FISHEYE624"}, "camera_model .* supported: PINHOLE, SIM"),
+        ({"camera_model": ["OPENCV"]}, "camera_model .* is not supported"),
     ],
     "datasets": [
-        ({"camera_model": "EQUIRECTANGULAR"}, "'EQUIRECTANGULAR' is not supported"),
+        ({"camera_model": "ORTHOPHOTO"}, "'ORTHOPHOTO' is not supported"),
         ({"k1": 0.1, "k4": 0.1}, "k4 of a perspective lens"),
         ({"k1": 0.1, "k6": 0.1}, "k6 of a perspective lens"),
         ({"is_fisheye": True, "p1": 0.1}, "a fisheye has no p1, p2"),
