@@ -106,8 +106,8 @@ def expected_pairs(spheres: Spheres, camera: Camera, config: RasterConfig) -> fl
     viewmat, K = np.asarray(camera.viewmat, float), np.asarray(camera.K, float)
     means, variances, opacities = spheres
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    centre, depth, drawn = project_points(distortion_of(camera), K, points)
-    drawn &= (depth > camera.near) & (depth < camera.far)
+    centre, depth, imaged = project_points(distortion_of(camera), K, points)
+    drawn = imaged & (depth > camera.near) & (depth < camera.far)
     centre, z = centre[drawn], depth[drawn]
     variance = variances[drawn] * K[0, 0] * K[1, 1] / z**2
     reach = 2 * np.log(np.maximum(opacities[drawn] / config.alpha_min, 1))
