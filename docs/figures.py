@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import gsjax
+from gsjax.cameras.lenses import panorama_intrinsics
 from gsjax.math.sh import rgb_to_dc
 from gsjax.plots import figures
 from gsjax.plots.contact_sheets import depth_colors
@@ -55,6 +56,42 @@ def order() -> None:
         view = gsjax.render_exact(pair, camera, background=np.ones(3))
         pictures.append(np.asarray(view.rgb))
     write("order.webp", np.concatenate(pictures, axis=1))
+
+
+def lenses() -> None:
+    """Draw the knot through five lenses, from one place."""
+    scene = torus_knot_scene(count=20_000, frames=48, width=360, height=270)
+    base, behind = scene.cameras[4], np.asarray(scene.background)
+    wide = [[115.0, 0, 180], [0, 115.0, 135], [0, 0, 1]]
+    rows = [
+        ("pinhole", base.K, None),
+        ("opencv, k1 = −0.6", base.K, (-0.6, 0.25, 0.0, 0.0)),
+        ("fisheye, 180°", wide, (0.0, 0.0, 0.0, 0.0)),
+        ("orthographic", np.asarray(base.K) / [[6.0], [6.0], [1.0]], None),
+        ("equirectangular", panorama_intrinsics(720, 270), None),
+    ]
+    figure = figures.new_figure((1480, 860))
+    for index, (title, K, coefficients) in enumerate(rows):
+        K = np.array(K, np.float64)
+        if title == "orthographic":
+            K[:2, 2] = 180, 135
+        camera = gsjax.make_camera(
+            viewmat=base.viewmat,
+            K=K,
+            width=720 if index == 4 else 360,
+            height=270,
+            lens=title.split(",")[0],
+            coefficients=coefficients,
+        )
+        config = gsjax.RasterConfig(projection="unscented")
+        view = gsjax.render_exact(scene.gaussians, camera, config, behind)
+        left, top = 0.01 + 0.33 * (index % 3), 0.53 - 0.49 * (index // 3)
+        width = 0.64 if index == 4 else 0.31
+        axes = figure.add_axes((left, top, width, 0.42))
+        axes.imshow(np.clip(np.asarray(view.rgb), 0, 1))
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(title, fontsize=17, color=INK, loc="left")
+    write("lenses.webp", figures.figure_pixels(figure) / 255)
 
 
 _TILE = 16
@@ -157,5 +194,6 @@ def _lengths(footprint, picture: np.ndarray) -> np.ndarray:
 if __name__ == "__main__":
     gsjax.use_all_cores()
     knot()
+    lenses()
     order()
     pipeline()

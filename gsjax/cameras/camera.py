@@ -136,7 +136,8 @@ def make_camera(
 
     Raises:
       InputError: on wrong shapes or sizes, an empty batch, an unknown lens, a wrong
-        number of coefficients, non-finite values, a focal length that is not positive,
+        number of coefficients, coefficients outside the range of the lens, non-finite
+        values, a focal length that is not positive,
         skew, a rotation part that scales or shears by more than 1 % or mirrors, or a
         last row other than 0 0 0 1 (of K: 0 0 1). Only shapes of tracers are checked.
     """
@@ -186,7 +187,40 @@ def _coefficients(lens: Lens, values, batch: tuple[int, ...]):
             f"coefficients: expected {' or '.join(map(str, lens.counts))} for the "
             f"{lens.name} lens, got {max(count, 0)}"
         )
-    return None if values is None else _broadcast(values, (*batch, count))
+    if values is None:
+        return None
+    if not isinstance(values, Tracer):
+        _check_coefficients(lens, np.asarray(values))
+    return _broadcast(values, (*batch, count))
+
+
+def _check_coefficients(lens: Lens, values: np.ndarray) -> None:
+    """Check concrete coefficients [..., M]."""
+    if not np.isfinite(values).all():
+        raise InputError(
+            f"coefficients: expected finite values for the {lens.name} lens, got "
+            f"{values}; calibrate the camera again, or use the pinhole lens"
+        )
+    if lens.name == "eucm":
+        alpha, beta = values[..., 0], values[..., 1]
+        if not ((alpha >= 0) & (alpha <= 1) & (beta > 0)).all():
+            raise InputError(
+                f"coefficients: expected alpha within 0 and 1 and beta above 0 for the "
+                f"eucm lens, got {values}; check their order"
+            )
+    if lens.name == "fov" and not (np.abs(values) < np.pi).all():
+        raise InputError(
+            f"coefficients: expected an angle below π for the fov lens, got {values}; "
+            "convert degrees to radians"
+        )
+    if lens.name in ("ftheta", "ftheta_inverse"):
+        slope, end = values[..., 1], values[..., 9]
+        if not ((slope > 0) & (end > 0)).all():
+            raise InputError(
+                f"coefficients: expected a polynomial that rises from 0 and a largest "
+                f"angle above 0 for the {lens.name} lens, got {slope} and {end}; give "
+                "them as k0 … k5, c, d, e and the largest angle"
+            )
 
 
 def with_shutter(

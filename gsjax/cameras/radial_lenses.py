@@ -144,8 +144,11 @@ def _linearise(
     limit = _edge(model, c, edge_radius(K, size))
     x, y, z = point
     if not model.wide:
+        # Infinite if no direction is imaged so far out: 0 · ∞ in a derivative is NaN.
+        bounded = limit < jnp.inf
+        limit = jnp.where(bounded, limit, 1)
         square = x * x + y * y
-        out = square > limit * limit * z * z
+        out = bounded & (square > limit * limit * z * z)
         scale = jnp.where(out, limit * z / jnp.sqrt(jnp.where(out, square, 1)), 1)
         return x * scale, y * scale, z
     limit = jnp.minimum(limit, np.pi)

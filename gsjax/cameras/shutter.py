@@ -18,12 +18,13 @@ from jax import lax
 
 from gsjax.cameras.lens import sine_ratio
 from gsjax.errors import InputError
+from gsjax.math.numerics import materialize
 
 Array = Any
 Camera = Any  # `gsjax.cameras.camera.Camera`, which imports this module
 Point = tuple[Array, ...]  # x, y, z
 
-_NEWTON_STEPS = 4  # without derivative, before two that are differentiated
+_NEWTON_STEPS = 2  # without derivative, before two that are differentiated
 _TIMES = (-0.5, 1.5)  # what lies farther outside the image is not followed
 
 
@@ -86,11 +87,13 @@ class Exposure(NamedTuple):
       viewmat: [4, 4] world → camera; a rolling shutter has rows of entries of the
         shape of the components.
       velocity: change of ``point`` over the exposure, or None.
+      time: the time at which each point is exposed, or None.
     """
 
     point: Point
     viewmat: Array
     velocity: Point | None = None
+    time: Array | None = None
 
 
 def entry(viewmat: Array, i: int, j: int) -> Array:
@@ -123,19 +126,73 @@ def expose(camera: Camera, point: Point) -> Exposure:
     """
     if not camera.shutter.rolling or camera.twist is None:
         return Exposure(transform_point(camera.viewmat, point), camera.viewmat)
-    fixed, still = lax.stop_gradient((camera, point))
-    t = jnp.full_like(still[0], 0.5)
-    t = lax.fori_loop(0, _NEWTON_STEPS, lambda _, t: _step(fixed, still, t), t)
+    motion, path = lax.stop_gradient((camera, _path_of(camera, point)))
+    t = jnp.full_like(path.start[0], 0.5)
+    t = lax.fori_loop(0, _NEWTON_STEPS, lambda _, t: _step(motion, path, t), t)
     t = lax.stop_gradient(t)
     # Differentiated: see `gsjax.cameras.solvers`.
-    t = _step(camera, point, _step(camera, point, t))
-    seen, velocity = _moving(camera, point, t)
-    return Exposure(seen, _viewmat(camera, t), velocity)
+    path = _path_of(camera, point)
+    path = _Path(*(_once(part) for part in path))
+    (t,) = _once((_step(camera, path, t),))
+    (t,) = _once((_step(camera, path, t),))
+    seen, velocity = _moving(camera, path, t)
+    return Exposure(_once(seen), _viewmat(camera, t), _once(velocity), t)
 
 
-def _step(camera: Camera, point: Point, t: Array) -> Array:
+def _once(values):
+    return materialize(values, values[0] == values[0])
+
+
+def exposed_at(camera: Camera, point: Point, time: Array) -> Point:
+    """Return world points in camera coordinates at a time of the exposure."""
+    return _moving(camera, _path_of(camera, point), time)[0]
+
+
+class _Path(NamedTuple):
+    """Camera coordinates of points while the camera turns.
+
+    By Rodrigues, at time t: start + A turn + B back + t τ, with A = sin(t θ) / θ,
+    B = (1 − cos(t θ)) / θ² and θ = |ω|.
+    """
+
+    start: Point
+    turn: Point
+    back: Point
+
+
+def _turns(twist: Array, columns) -> tuple[list[Array], list[Array]]:
+    """Return ω × v and ω × (ω × v) of vectors v = (x, y, z)."""
+    once = _cross(twist, columns)
+    return once, _cross(twist, once)
+
+
+def _cross(a, b) -> list[Array]:
+    return [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]
+
+
+def _path_of(camera: Camera, point: Point) -> _Path:
+    view = camera.viewmat
+    turned = [sum(view[i, j] * point[j] for j in range(3)) for i in range(3)]
+    once, twice = _turns(camera.twist, turned)
+    start = tuple(p + view[i, 3] for i, p in enumerate(turned))
+    return _Path(start, tuple(once), tuple(twice))  # pyright: ignore
+
+
+def _angles(camera: Camera, t: Array) -> tuple[Array, Array, Array]:
+    """Return A, its derivative by t, and B of `_Path`; smooth at θ = 0."""
+    square = sum(camera.twist[i] * camera.twist[i] for i in range(3))
+    half = sine_ratio(0.25 * t * t * square)
+    b = 0.5 * t * t * half * half
+    return t * sine_ratio(t * t * square), 1 - square * b, b
+
+
+def _step(camera: Camera, path: _Path, t: Array) -> Array:
     """Return ``t`` after a Newton step towards the time of exposure."""
-    seen, velocity = _moving(camera, point, t)
+    seen, velocity = _moving(camera, path, t)
     good = camera.lens.depth(seen) > 0.5 * camera.near
     seen = tuple(jnp.where(good, p, e) for p, e in zip(seen, (0, 0, 1)))
     velocity = tuple(jnp.where(good, v, 0) for v in velocity)
@@ -151,43 +208,29 @@ def _step(camera: Camera, point: Point, t: Array) -> Array:
     return jnp.where(t > low, jnp.where(t < high, t, high), low)
 
 
-def _moving(camera: Camera, point: Point, t: Array) -> tuple[Point, Point]:
+def _moving(camera: Camera, path: _Path, t: Array) -> tuple[Point, Point]:
     """Return camera coordinates at time ``t``, and their change by it."""
-    view, twist = camera.viewmat, camera.twist
-    turned = [sum(view[i, j] * point[j] for j in range(3)) for i in range(3)]
-
-    def at(t: Array):
-        rotated = _rotate([t * twist[i] for i in range(3)], turned)
-        shift = [view[i, 3] + t * twist[3 + i] for i in range(3)]
-        return tuple(r + s for r, s in zip(rotated, shift))
-
-    return jax.jvp(at, (t,), (jnp.ones_like(t),))
+    a, slope, b = _angles(camera, t)
+    shift = [camera.twist[3 + i] for i in range(3)]
+    rows = list(zip(path.start, path.turn, path.back, shift))
+    return (
+        tuple(p + a * q + b * r + t * s for p, q, r, s in rows),
+        tuple(slope * q + a * r + s for _, q, r, s in rows),
+    )
 
 
 def _viewmat(camera: Camera, t: Array):
     """Return the entries of the view matrix at times ``t``, as rows of components."""
     view, twist = camera.viewmat, camera.twist
-    turn = [t * twist[i] for i in range(3)]
-    columns = [_rotate(turn, [view[i, j] for i in range(3)]) for j in range(3)]
-    columns.append([view[i, 3] + t * twist[3 + i] for i in range(3)])
-    return tuple(tuple(column[i] for column in columns) for i in range(3))
-
-
-def _rotate(w, v) -> list[Array]:
-    """Rotate v by the rotation vector w (Rodrigues), smoothly at w = 0."""
-
-    def cross(a, b):
-        return [
-            a[1] * b[2] - a[2] * b[1],
-            a[2] * b[0] - a[0] * b[2],
-            a[0] * b[1] - a[1] * b[0],
-        ]
-
-    square = sum(p * p for p in w)
-    once = cross(w, v)
-    twice = cross(w, once)
-    sine, half = sine_ratio(square), sine_ratio(0.25 * square)
-    return [p + sine * q + 0.5 * half * half * r for p, q, r in zip(v, once, twice)]
+    a, _, b = _angles(camera, t)
+    once, twice = _turns(twist, [view[i, :3] for i in range(3)])
+    return tuple(
+        (
+            *(view[i, j] + a * once[i][j] + b * twice[i][j] for j in range(3)),
+            view[i, 3] + t * twist[3 + i],
+        )
+        for i in range(3)
+    )
 
 
 def image_rows(camera: Camera, exposure: Exposure, jacobian):

@@ -220,7 +220,8 @@ def lidar_lens(rows: int, columns: int) -> Lens:
     A pixel is a beam: column and row of the tables at the pixel's centre, with
     K = [[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]]. The coefficients are those of
     `lidar_coefficients`. The lidar's forward, left and up are the camera's z, −x and
-    −y.
+    −y. A Gaussian is drawn in all rows with the offset of the row nearest to its mean,
+    so where rows differ, it is displaced in them by the difference of their offsets.
     """
 
     def split(c: Array) -> tuple[Array, Array, Array]:

@@ -101,14 +101,16 @@ class RenderCommand(HeavyCommand):
         from gsjax.runs.folder import SplitDataset
         from gsjax.runs.trajectories import CAMERA_PATHS, path_entries, view_entries
 
-        max_size, undistort = None, False
+        max_size, undistort, shutter = None, False, "global"
         if self.cameras is None:
             settings = run_folder.load_settings(self.scene)
+            files = run_folder.run_files(self.scene)
             split = run_folder.with_refined_cameras(
-                run_folder.load_split(settings), run_folder.run_files(self.scene)
+                run_folder.load_split(settings), files
             )
-            max_size = settings.config.max_size
-            undistort = settings.config.undistort
+            max_size, shutter = settings.config.max_size, settings.config.shutter
+            # Refined cameras are those of the pictures that were trained on.
+            undistort = settings.config.undistort and not files.cameras.exists()
         elif self.cameras.is_dir():
             dataset = load_dataset(self.cameras, poses_only=True)
             test = [i for i, view in enumerate(dataset.views) if view.split == "test"]
@@ -121,7 +123,10 @@ class RenderCommand(HeavyCommand):
             entries = path_entries(dataset, follow, frames=frames, max_size=max_size)
         else:
             entries = view_entries(
-                split.views(path), max_size=max_size, undistort=undistort
+                split.views(path),
+                max_size=max_size,
+                undistort=undistort,
+                shutter=shutter,
             )
         if not entries:
             raise UsageError(f"--path {path}: there are no {path} views; pass another")

@@ -26,8 +26,10 @@ class SfmCommand(Command):
     """Which photographs share intrinsics. auto: those of the same size, camera and
     focal length (EXIF)."""
     camera_model: str = "SIMPLE_RADIAL"
-    """Camera model of COLMAP that is estimated, such as OPENCV or OPENCV_FISHEYE. The
-    photographs of the dataset are undistorted by it."""
+    """Camera model of COLMAP that is estimated, such as OPENCV or OPENCV_FISHEYE."""
+    undistort: bool = False
+    """Resample the photographs to ideal pinholes, which loses some of their border. By
+    default they keep their pixels, and gsjax train renders through their lens."""
     max_size: Annotated[int, arg(metavar="PX"), integer(0)] = 1600
     """Longest side in px, to which larger photographs are scaled down, for features and
     in the dataset; 0 for no limit."""
@@ -60,6 +62,7 @@ class SfmCommand(Command):
             frames=self.frames or SfmSettings.frames,
             masks=self.masks,
             seed=self.seed,
+            undistort=self.undistort,
         )
         report = run_sfm(
             self.source, self.out, settings, overwrite=self.overwrite, progress=note

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from gsjax.cameras.camera import Camera
+from gsjax.cameras.lens import copies
 from gsjax.errors import CapacityError
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.raster.argument_checks import check_types, requires_concrete_values
@@ -91,7 +92,9 @@ def exact_config(
     fitted = _fit(count_demand(gaussians, camera, config, max_capacity), max_capacity)
     return config.replace(
         pair_capacity=fitted["pair_capacity"],
-        visible_capacity=min(fitted["visible_capacity"], gaussians.capacity),
+        visible_capacity=min(
+            fitted["visible_capacity"], copies(camera.lens) * gaussians.capacity
+        ),
     )
 
 
@@ -127,7 +130,7 @@ def _check_memory(gaussians: Gaussians, camera: Camera, config: RasterConfig) ->
     """Reject a render that would not fit, before any allocation."""
     cameras = camera.viewmat.shape[0] if camera.batched else 1
     estimate = render_estimate(
-        gaussians.capacity,
+        copies(camera.lens) * gaussians.capacity,
         gaussians.params.sh.shape[-2],
         (camera.width, camera.height),
         config,

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from gsjax.cameras.camera import Camera
+from gsjax.cameras.lens import copies
 from gsjax.errors import InputError
 from gsjax.math.numerics import safe_divide
 from gsjax.raster.argument_checks import check_real
@@ -61,7 +62,7 @@ def render_camera(
     seen = binning.radii(lax.stop_gradient(out.footprint), *camera.visible)
     size = camera.width, camera.height
     sums, demand, overflowed = render_tiles(out, size, config, inputs.mask)
-    most = copies(camera) * gaussians.capacity
+    most = copies(camera.lens) * gaussians.capacity
     room = min(config.visible_capacity or most, most)
     radii = radii.at[order]
     return (
@@ -73,11 +74,6 @@ def render_camera(
 
 
 _TURNS = (0, -1, 1)
-
-
-def copies(camera: Camera) -> int:
-    """Return how often a Gaussian may appear in one image."""
-    return 1 if camera.lens.period is None else len(_TURNS)
 
 
 def _turn(order: Array, slots: int) -> Array:

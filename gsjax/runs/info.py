@@ -50,6 +50,8 @@ def describe_run(folder: Path) -> dict[str, Any]:
         "seed": config.seed,
         "max_size": config.max_size,
         "background": config.background,
+        "shutter": config.shutter,
+        "undistort": config.undistort,
         "evaluation": _evaluation(files.eval),
     }
 
@@ -77,6 +79,8 @@ def run_text(path: str, facts: dict[str, Any]) -> str:
         "steps": f"{facts['steps_done']:,} of {facts['steps']:,}",
         "training": f"{facts['seconds']:.0f} s",
     }
+    if facts["shutter"] != "global":
+        rows["shutter"] = facts["shutter"].replace("_", " ")
     quality = facts["evaluation"]
     if quality is not None:
         views = f"{quality['views']} {_VIEWS[quality['which']]} views"

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from gsjax.cameras.camera import make_camera
+from gsjax.cameras.camera import make_camera, with_shutter
 from gsjax.cameras.distortion import (
     Distortion,
     distortion_of,
@@ -19,6 +19,7 @@ from gsjax.cameras.distortion import (
     single_lens_fields,
 )
 from gsjax.cameras.lenses import panorama_intrinsics
+from gsjax.cameras.shutter import SHUTTERS
 from gsjax.data import camera_paths
 from gsjax.data.image_files import natural_order, short_names
 from gsjax.data.photos import size_within, stored_size
@@ -56,7 +57,11 @@ CAMERA_PATHS: dict[str, CameraPath] = {
 
 
 def view_entries(
-    views: Sequence[View], *, max_size: int | None = None, undistort: bool = False
+    views: Sequence[View],
+    *,
+    max_size: int | None = None,
+    undistort: bool = False,
+    shutter: str = "global",
 ) -> list[CameraEntry]:
     """Return the cameras of views, at the size of their photographs.
 
@@ -66,6 +71,7 @@ def view_entries(
       views: the views.
       max_size: longest side in px, as in training; None for no limit.
       undistort: return ideal pinholes in place of the lenses of the photographs.
+      shutter: name of the shutter; a rolling one moves by the twists of the views.
 
     Raises:
       InputError: if the size of a photograph cannot be read.
@@ -78,9 +84,16 @@ def view_entries(
     scaled = [_at_photo_size(view, max_size) for view in views]
     if undistort:
         scaled = [replace(view, lens=None) for view in scaled]
-    return [
+    entries = [
         _entry(n, view.viewmat, view, view.near, view.lens)
         for n, view in zip(flat, scaled)
+    ]
+    if not SHUTTERS[shutter].rolling:
+        return entries
+    twists = [np.zeros(6) if view.twist is None else view.twist for view in scaled]
+    return [
+        entry._replace(camera=with_shutter(entry.camera, shutter, twist=twist))
+        for entry, twist in zip(entries, twists)
     ]
 
 
@@ -91,9 +104,10 @@ def path_entries(
     frames: int = 120,
     max_size: int | None = None,
 ) -> list[CameraEntry]:
-    """Return the cameras of a path through all views, with median intrinsics.
+    """Return the cameras of a path through all views: pinholes of median intrinsics.
 
-    The views are visited in natural order of their names: IMG_2 before IMG_10.
+    The views are visited in natural order of their names: IMG_2 before IMG_10. Where
+    they are panoramas, the pinholes are 90° wide.
 
     Args:
       dataset, path: at least one view, and a path of `CAMERA_PATHS` or another.
@@ -112,12 +126,22 @@ def path_entries(
         note(f"warning: {seen}; --path interpolate or spiral stay near the cameras")
     poses = path(viewmats, frames, depth=depth)
     scaled = [_at_photo_size(view, max_size) for view in dataset.views]
-    intrinsics = camera_paths.median_intrinsics(scaled)
+    intrinsics = _ideal_intrinsics(scaled)
     near = min(view.near for view in views)
     return [
         _entry(f"frame_{n:04d}", pose, intrinsics, near)
         for n, pose in enumerate(poses, 1)
     ]
+
+
+def _ideal_intrinsics(views: Sequence[View]) -> camera_paths.Intrinsics:
+    """Return intrinsics of pinholes that show about as much as the views."""
+    found = camera_paths.median_intrinsics(views)
+    if all(v.lens is None or v.lens.lens.period is None for v in views):
+        return found
+    w, h = found.width, found.height
+    K = np.array([[w / 2, 0, w / 2], [0, w / 2, h / 2], [0, 0, 1]])
+    return found._replace(K=K)
 
 
 def render_movie(

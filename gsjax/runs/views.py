@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.cameras.camera import Camera
+from gsjax.cameras.lens import copies
 from gsjax.data.transforms import CameraEntry
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, capacity_bucket
@@ -126,7 +127,8 @@ def render_cameras(
             config = config.replace(pair_capacity=capacity)
         if index == 0:
             size, bases = (camera.width, camera.height), gaussians.params.sh.shape[1]
-            need = render_estimate(gaussians.capacity, bases, size, config).total
+            slots = copies(camera.lens) * gaussians.capacity
+            need = render_estimate(slots, bases, size, config).total
             free = available()
             of_free = "" if free is None else f" of {size_text(free)} available"
             note(f"memory: about {size_text(need)} per view{of_free}")

@@ -1,7 +1,8 @@
-"""Write a reconstruction as a dataset: undistorted photographs, masks, COLMAP model.
+"""Write a reconstruction as a dataset: photographs, masks, COLMAP model.
 
-Photographs and masks are resampled once, from the working files through one map (cubic;
-masks: nearest pixel), and encoded once.
+Photographs keep their pixels and lenses, and are encoded once. If they are undistorted,
+they and their masks are resampled once, from the working files through one map (cubic;
+masks: nearest pixel).
 """
 
 import shutil
@@ -34,14 +35,19 @@ class _UndistortionMap(NamedTuple):
 
 
 def write_dataset(
-    model: Any, photos: list[PreparedPhoto], work: WorkFolder, dataset: Path
+    model: Any,
+    photos: list[PreparedPhoto],
+    work: WorkFolder,
+    dataset: Path,
+    undistort: bool = False,
 ) -> None:
     """Write ``images/``, ``masks/`` and ``sparse/0/`` of the registered images.
 
     Args:
       model: pycolmap's reconstruction of the working files; changed in place to that of
-        the undistorted images.
+        the images of the dataset.
       dataset: the folder, which exists.
+      undistort: resample the photographs to ideal pinholes.
     """
     by_file = {photo.record.file: photo for photo in photos}
     for folder in ("images", "sparse/0"):
@@ -50,12 +56,15 @@ def write_dataset(
     # Camera by camera: the map of one takes as much memory as a few photographs.
     for key, of_camera in groupby(images, key=lambda image: image.camera_id):
         camera = model.cameras[key]
-        undistortion = _undistortion_map(camera)
+        undistortion = _undistortion_map(camera) if undistort else None
         for image in of_camera:
             photo = by_file[image.name]
             _write_pixels(photo, undistortion, work, dataset)
-            _undistort_features(image, camera, undistortion.pinhole)
+            if undistortion is not None:
+                _undistort_features(image, camera, undistortion.pinhole)
             image.name = photo.name
+        if undistortion is None:
+            continue
         pinhole = undistortion.pinhole
         camera.model = pinhole.model
         camera.width, camera.height = pinhole.width, pinhole.height
@@ -81,19 +90,25 @@ def _undistortion_map(camera: Any) -> _UndistortionMap:
 
 def _write_pixels(
     photo: PreparedPhoto,
-    undistortion: _UndistortionMap,
+    undistortion: _UndistortionMap | None,
     work: WorkFolder,
     dataset: Path,
 ) -> None:
     cv2 = opencv()
-    maps, border = (undistortion.x, undistortion.y), cv2.BORDER_REPLICATE
+
+    def resampled(pixels: np.ndarray, kind: int) -> np.ndarray:
+        if undistortion is None:
+            return pixels
+        maps, border = (undistortion.x, undistortion.y), cv2.BORDER_REPLICATE
+        return cv2.remap(pixels, *maps, kind, borderMode=border)
+
     pixels = _read_working_file(work.photos / photo.record.file)
-    pixels = cv2.remap(pixels, *maps, cv2.INTER_CUBIC, borderMode=border)
+    pixels = resampled(pixels, cv2.INTER_CUBIC)
     write_file(dataset / "images" / photo.name, _encode(pixels, photo.name))
     if photo.mask:
         make_folder(dataset / "masks")
         mask = _read_working_file(work.mask(photo.record.file), grey=True)
-        mask = cv2.remap(mask, *maps, cv2.INTER_NEAREST, borderMode=border)
+        mask = resampled(mask, cv2.INTER_NEAREST)
         write_file(dataset / "masks" / f"{photo.name}.png", encode_png(mask))
 
 

@@ -1,7 +1,7 @@
 """Structure from motion: from photographs or a video to a dataset with cameras.
 
 SIFT features, matching and incremental mapping by COLMAP (Schönberger and Frahm,
-"Structure-from-Motion Revisited", CVPR 2016) through pycolmap, then undistortion.
+"Structure-from-Motion Revisited", CVPR 2016) through pycolmap.
 """
 
 import time
@@ -52,6 +52,8 @@ class SfmSettings:
       masks: folder of masks; black pixels, and those where a photo is less than half
         opaque, are excluded. The mask of IMG.jpg is IMG.png, IMG.jpg or IMG.jpg.png.
       seed: seed of COLMAP's random numbers.
+      undistort: whether to resample the photos to ideal pinholes; otherwise they keep
+        their pixels and lenses.
     """
 
     matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
@@ -61,6 +63,7 @@ class SfmSettings:
     frames: int = 100
     masks: Path | None = None
     seed: int = 0
+    undistort: bool = False
 
 
 @dataclass(frozen=True)
@@ -129,10 +132,10 @@ def run_sfm(
 ) -> SfmReport:
     """Find the cameras of photographs and write a dataset to train on.
 
-    ``output`` gets ``images/`` (upright, undistorted), ``masks/`` (for photographs that
-    have one or are partly transparent), ``sparse/0/`` (COLMAP's binary model with
-    PINHOLE cameras) and ``sfm.json``. They appear at the end, all or none; other files
-    in the folder are kept.
+    ``output`` gets ``images/`` (upright), ``masks/`` (for photographs that have one or
+    are partly transparent), ``sparse/0/`` (COLMAP's binary model, with the lenses that
+    were found, or PINHOLE cameras of undistorted photographs) and ``sfm.json``. They
+    appear at the end, all or none; other files in the folder are kept.
 
     Args:
       source: a folder of photographs, or a video.
@@ -175,9 +178,10 @@ def run_sfm(
         )
         dataset = stage / "dataset"
         dataset.mkdir()
-        with job.timed("undistortion"):
-            progress(f"undistorting {len(report.registered)} images")
-            write_dataset(models[0], photos, job.work, dataset)
+        with job.timed("dataset"):
+            verb = "undistorting" if settings.undistort else "writing"
+            progress(f"{verb} {len(report.registered)} images")
+            write_dataset(models[0], photos, job.work, dataset, settings.undistort)
         facts = {**asdict(report), "pycolmap": colmap().__version__}
         write_json(dataset / "sfm.json", facts, indent=2)
         install_dataset(dataset, output, stage)

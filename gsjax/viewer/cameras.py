@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsjax.cameras.lens import range_depth
 from gsjax.data import camera_paths
 from gsjax.data.types import Photo, View
 from gsjax.gaussians import Gaussians
@@ -80,6 +81,8 @@ def frusta_of(views: Sequence[View], photos: Sequence[Photo] = ()) -> list[Frust
     for index in np.unique(few.astype(int)):
         view = views[index]
         fov = 2 * np.arctan(view.height / (2 * view.K[1, 1]))
+        if view.lens is not None and view.lens.lens.depth is range_depth:
+            fov = min(fov, 0.5 * np.pi)  # the pyramid of a wide lens would be flat
         pixels = images.shrink(photos[index].pixels, THUMBNAIL) if len(photos) else None
         aspect = view.width / view.height
         out.append(Frustum(view.name, view.viewmat, float(fov), aspect, pixels))

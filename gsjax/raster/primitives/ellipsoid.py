@@ -14,7 +14,13 @@ from jax import lax
 
 from gsjax.cameras.camera import LENS_RANGE, NEAREST, Camera, camera_centre
 from gsjax.cameras.lenses import everywhere, z_depth
-from gsjax.cameras.shutter import Exposure, centre, expose, image_rows
+from gsjax.cameras.shutter import (
+    Exposure,
+    centre,
+    expose,
+    exposed_at,
+    image_rows,
+)
 from gsjax.math import sh as sh_lib
 from gsjax.math.numerics import (
     exp_log_scale,
@@ -24,7 +30,7 @@ from gsjax.math.numerics import (
     safe_normalize,
 )
 from gsjax.raster.lists.occlusion_culling import is_wide
-from gsjax.raster.primitives.ewa import covariance_factor, dilated, ewa_jacobian
+from gsjax.raster.primitives.ewa import covariance_factor, dilated, ewa_jacobian, once
 from gsjax.raster.primitives.unscented import unscented_image
 from gsjax.raster.size_buckets import run_at_bucket
 from gsjax.raster.types import (
@@ -94,7 +100,8 @@ def bounds(
     if depth.dtype == jnp.float32:
         # Rounded once, so that a Gaussian behind another one is not before it.
         with jax.enable_x64(True):
-            depth = lax.convert_element_type(_wide_depth(means, camera), jnp.float32)
+            depth = _wide_depth(means, camera, exposure.time)
+            depth = lax.convert_element_type(depth, jnp.float32)
     live = active & in_depth_range(camera, depth) & jnp.isfinite(logits)
     live &= usable(camera)
     for value in (*means, *log_scales):
@@ -163,15 +170,24 @@ def order_depth(means: Array, camera: Camera) -> Array:
     return _wide_depth(means.T, camera)
 
 
-def _wide_depth(means, camera: Camera) -> Array:
-    """Depth [K] in float64 of components; within `jax.enable_x64(True)`."""
+def _wide_depth(means, camera: Camera, time: Array | None = None) -> Array:
+    """Depth [K] in float64 of components; within `jax.enable_x64(True)`.
+
+    Args:
+      means: components [K] in world coordinates.
+      camera: a single camera.
+      time: [K] from `expose`, or None.
+    """
 
     def wide(value: Array) -> Array:
         return lax.convert_element_type(value, jnp.float64)
 
     if camera.shutter.rolling:
         exact = jax.tree.map(wide, camera)
-        return camera.lens.depth(expose(exact, tuple(wide(m) for m in means)).point)
+        means = tuple(wide(m) for m in means)
+        if time is None:
+            return camera.lens.depth(expose(exact, means).point)
+        return camera.lens.depth(exposed_at(exact, means, wide(time)))
 
     def coordinate(i: int) -> Array:
         row = camera.viewmat[i]
@@ -377,7 +393,7 @@ def _project_components(
     # The mean of a dead rank is the origin, which may lie anywhere: move it to z = 1.
     x, y, z = jnp.where(live, x, 0), jnp.where(live, y, 0), jnp.where(live, z, 1)
     x, y, z = materialize((x, y, z), live)
-    u, v = camera.project((x, y, z))
+    u, v = once(camera, camera.project((x, y, z)))
     exposure = exposure._replace(point=(x, y, z))
     m1, m2 = covariance_factor(camera, exposure, quat, scales)
     if config.projection == "unscented":

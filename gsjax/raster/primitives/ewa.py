@@ -11,16 +11,19 @@ import jax.numpy as jnp
 from jax import lax
 
 from gsjax.cameras.camera import Camera
+from gsjax.cameras.lenses import ORTHOGRAPHIC, PINHOLE
 from gsjax.cameras.shutter import Exposure, image_rows
 from gsjax.math import rotations
+from gsjax.math.numerics import materialize
 
 # Longest σ in px that is drawn; squares of squares then fit float32.
 _LONGEST = 1e9
+_CHEAP = (PINHOLE, ORTHOGRAPHIC)
 
 
 def ewa_jacobian(camera: Camera, point):
     """Return the rows (du/d·, dv/d·) of the lens Jacobian at a camera point."""
-    at = camera.linearise(point)
+    at = once(camera, camera.linearise(point))
     one, zero = jnp.ones_like(at[0]), jnp.zeros_like(at[0])
     columns = [
         jax.jvp(
@@ -30,7 +33,18 @@ def ewa_jacobian(camera: Camera, point):
         )[1]
         for j in range(3)
     ]
-    return tuple(zip(*columns))
+    u, v = zip(*columns)
+    return once(camera, u), once(camera, v)
+
+
+def once(camera: Camera, values):
+    """Return ``values``; on CPUs, XLA then computes those of a costly lens only once.
+
+    See `gsjax.math.numerics.materialize`. Nothing is done for a lens that is cheap.
+    """
+    if camera.lens in _CHEAP and not camera.shutter.rolling:
+        return values
+    return materialize(tuple(values), values[0] == values[0])
 
 
 def covariance_factor(camera: Camera, exposure: Exposure, quat, scales):
@@ -46,7 +60,10 @@ def covariance_factor(camera: Camera, exposure: Exposure, quat, scales):
     per_square = 1 / sum(q * q for q in quat)
     scales = tuple(s * per_square for s in scales)
     rows = []
-    for in_world in image_rows(camera, exposure, ewa_jacobian(camera, exposure.point)):
+    jacobian = ewa_jacobian(camera, exposure.point)
+    for in_world in image_rows(camera, exposure, jacobian):
+        if exposure.velocity is not None:
+            in_world = once(camera, in_world)
         rows.append(
             tuple(
                 sum(in_world[i] * rotation[i][j] for i in range(3)) * scales[j]
