@@ -52,6 +52,8 @@ if typing.TYPE_CHECKING:  # the same names as in `_PUBLIC`
     from gsjax.runtime.devices import use_all_cores as use_all_cores
     from gsjax.train.config import TrainConfig as TrainConfig
     from gsjax.train.config import preset as preset
+    from gsjax.train.depth_loss import depth_loss as depth_loss
+    from gsjax.train.depth_loss import depth_term as depth_term
     from gsjax.train.evaluation import evaluate as evaluate
     from gsjax.train.evaluation import summarise as summarise
     from gsjax.train.loop import Hooks as Hooks
@@ -88,6 +90,7 @@ _PUBLIC = {
     "raster.types": "RasterConfig Render",
     "runtime.devices": "use_all_cores",
     "train.config": "TrainConfig preset",
+    "train.depth_loss": "depth_loss depth_term",
     "train.evaluation": "evaluate summarise",
     "train.loop": "Hooks fit subset",
     "train.losses": "LossTerm",
