@@ -33,6 +33,9 @@ from gsjax.cameras.lens import (
     z_depth,
 )
 
+# Perspective lenses end at 89.994°, so that powers of the radius stay finite.
+_FARTHEST = 1e4
+
 
 class Model(NamedTuple):
     """A distortion of the plane of directions.
@@ -109,6 +112,8 @@ def _valid(model: Model, K: Array, c: Array, point: Point) -> Array:
     del K
     x, y, z = point
     fold = fold_radius(model, c)
+    if not model.wide:
+        fold = jnp.minimum(fold, _FARTHEST)
     a, b = _base(model, point)
     # The axis behind a wide lens has no direction on the image.
     good = (z > 0) | (model.wide & (x * x + y * y > 0))
@@ -125,7 +130,7 @@ def _valid(model: Model, K: Array, c: Array, point: Point) -> Array:
 def _unproject(model: Model, K: Array, c: Array, pixel: Pixel) -> Point:
     target = from_pixel(K, pixel)
     far = root(target[0] * target[0] + target[1] * target[1])
-    high = jnp.minimum(fold_radius(model, c), np.pi if model.wide else 1e4)
+    high = jnp.minimum(fold_radius(model, c), np.pi if model.wide else _FARTHEST)
     r = solvers.invert_rising(model.radius, c, lax.stop_gradient(far), high)
     scale = lax.stop_gradient(jnp.where(far > 0, r / jnp.where(far > 0, far, 1), 1))
     start = target[0] * scale, target[1] * scale

@@ -15,7 +15,6 @@ from gsjax.cameras.lens import (
     Point,
     edge_radius,
     from_pixel,
-    linearise_in_place,
     range_depth,
     root,
     to_pixel,
@@ -48,8 +47,14 @@ def _limit_latitude(
 ) -> Point:
     """Keep ``point`` one row from the poles, where the Jacobian has no bound."""
     del c, size
+    return _off_the_poles(1 / K[1, 1], point)
+
+
+def _off_the_poles(margin: Array, point: Point) -> Point:
+    """Keep ``point`` at an angle of ``margin`` or half a radian from the poles."""
     x, y, z = point
-    limit = lax.stop_gradient(jnp.tan(0.5 * np.pi - jnp.minimum(1 / K[1, 1], 0.5)))
+    margin = jnp.minimum(margin, 0.5)
+    limit = lax.stop_gradient(jnp.tan(0.5 * np.pi - margin))
     square = x * x + z * z
     steep = (square > 0) & (y * y > limit * limit * square)
     far = jnp.where(steep, range_depth(point), 1)
@@ -210,7 +215,19 @@ def _lidar_period(split: Callable, K: Array, c: Array) -> Array:
     """Return the columns of one turn, by the mean step of the table."""
     _, azimuths, _ = split(c)
     step = jnp.abs(azimuths[-1] - azimuths[0]) / (azimuths.shape[0] - 1)
-    return K[0, 0] * 2 * np.pi / jnp.where(step > 0, step, 1)
+    # A camera that is not drawn must not spoil derivatives: 0 · ∞ is NaN.
+    focal = jnp.where(jnp.abs(K[0, 0]) < 1e15, K[0, 0], 1)
+    return focal * 2 * np.pi / jnp.where(step > 1e-6, step, 1)
+
+
+def _lidar_linearise(
+    split: Callable, K: Array, c: Array, size: tuple[Length, Length], point: Point
+) -> Point:
+    """Keep ``point`` the mean step between rows from the poles."""
+    del K, size
+    elevations, _, _ = split(c)
+    step = jnp.abs(elevations[-1] - elevations[0]) / (elevations.shape[0] - 1)
+    return _off_the_poles(jnp.where(step > 0, step, 0.5), point)
 
 
 @cache
@@ -234,6 +251,6 @@ def lidar_lens(rows: int, columns: int) -> Lens:
         unproject=partial(_lidar_unproject, split),
         valid=_off_the_centre,
         depth=range_depth,
-        linearise=linearise_in_place,
+        linearise=partial(_lidar_linearise, split),
         period=partial(_lidar_period, split),
     )

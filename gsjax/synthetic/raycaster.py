@@ -19,6 +19,7 @@ from gsjax.errors import InputError
 from gsjax.io import images
 from gsjax.runtime.files import make_folder, reject_existing, write_file
 from gsjax.synthetic import albedo
+from gsjax.synthetic.optics import PINHOLE, Optics, exposures, local_rays
 from gsjax.synthetic.shapes import Solid, box, disc, dot, sphere, torus
 
 BACKGROUND = (0.0, 0.0, 0.0)
@@ -53,7 +54,14 @@ class DemoDatasetSettings(NamedTuple):
 
 
 def cast(
-    viewmat, K, width: int, height: int, samples: int = 3, *, background=BACKGROUND
+    viewmat,
+    K,
+    width: int,
+    height: int,
+    samples: int = 3,
+    *,
+    background=BACKGROUND,
+    optics: Optics = PINHOLE,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a photograph of the still life and its depth.
 
@@ -63,17 +71,19 @@ def cast(
       width, height: image size, px.
       samples: a pixel is the mean of samples × samples rays on a regular grid.
       background: RGB in [0, 1] of pixels without a surface.
+      optics: lens and shutter.
 
     Returns:
       rgb [H, W, 3] float32 in [0, 1], and depth [H, W] float64: camera z at the
-      centre of each pixel, 0 for background.
+      centre of each pixel, at its time of exposure; 0 for background.
 
     Raises:
-      InputError: if ``samples`` is below 1.
+      InputError: if ``samples`` is below 1, or the optics are not valid.
     """
-    rgb = _image(viewmat, K, (width, height), samples, background)
+    size = width, height
+    rgb = _image(viewmat, K, size, samples, background, optics)
     u, v = (a.ravel() + 0.5 for a in np.meshgrid(np.arange(width), np.arange(height)))
-    depth, _ = _first_hits(*_rays(viewmat, K, u, v))
+    depth, _, _ = _hits(viewmat, K, size, (u, v), optics)
     return rgb, np.where(np.isfinite(depth), depth, 0).reshape(height, width)
 
 
@@ -90,12 +100,11 @@ def surface_points(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     while len(points) < count:
         share = -(-count // len(viewmats))
         for viewmat in viewmats:
-            origin, directions = _rays(viewmat, K, *rng.uniform(size=(2, share)))
-            t, which = _first_hits(origin, directions)
+            pixels = rng.uniform(size=(2, share))
+            t, which, places = _hits(viewmat, K, (1, 1), pixels)
             hit = np.isfinite(t)
-            places = origin[:, None] + t[hit] * directions[:, hit]
-            points = np.concatenate([points, places.T])
-            shaded = images.to_8_bit(_shade(places, which[hit]).T)
+            points = np.concatenate([points, places[:, hit].T])
+            shaded = images.to_8_bit(_shade(places[:, hit], which[hit]).T)
             colors = np.concatenate([colors, shaded])
     chosen = rng.permutation(len(points))[:count]
     points = points[chosen] + rng.normal(0, 0.004, (count, 3))
@@ -151,7 +160,8 @@ def write_demo_dataset(
     make_folder(folder / "images")
     entries = []
     for name, photo, viewmat in zip(names, photos, viewmats):
-        rgb = _image(viewmat, K, size, settings.samples, settings.background)
+        samples, background = settings.samples, settings.background
+        rgb = _image(viewmat, K, size, samples, background, PINHOLE)
         write_file(photo, images.encode_png(images.to_8_bit(rgb)))
         camera = make_camera(viewmat=viewmat, K=K, width=size[0], height=size[1])
         entries.append(CameraEntry(name, camera))
@@ -185,7 +195,9 @@ def solids() -> tuple[Solid, ...]:
     return tuple(Solid(s, np.asarray(p, float), axes, c) for s, p, axes, c in rows)
 
 
-def _image(viewmat, K, size: tuple[int, int], samples: int, background):
+def _image(
+    viewmat, K, size: tuple[int, int], samples: int, background, optics: Optics
+) -> np.ndarray:
     """Return an image [H, W, 3] float32, the mean over samples² rays a pixel."""
     if samples < 1:
         raise InputError(f"samples: expected at least 1 ray a pixel, got {samples}")
@@ -196,26 +208,35 @@ def _image(viewmat, K, size: tuple[int, int], samples: int, background):
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         v = (np.arange(top * samples, bottom * samples) + 0.5) / samples
-        grid = (a.ravel() for a in np.meshgrid(u, v))
+        grid = [a.ravel() for a in np.meshgrid(u, v)]
         # float32 takes half the time and is exact to 1e-6 of the scene.
-        origin, directions = (a.astype(np.float32) for a in _rays(viewmat, K, *grid))
-        rgb = np.tile(np.asarray(background, np.float32)[:, None], directions.shape[1])
-        t, which = _first_hits(origin, directions)
+        t, which, places = _hits(viewmat, K, size, grid, optics, np.float32)
+        rgb = np.tile(np.asarray(background, np.float32)[:, None], len(t))
         hit = np.flatnonzero(np.isfinite(t))
-        points = origin[:, None] + t[hit] * directions.take(hit, axis=1)
-        rgb[:, hit] = _shade(points, which[hit])
+        rgb[:, hit] = _shade(places.take(hit, axis=1), which[hit])
         rgb = rgb.reshape(3, bottom - top, samples, width, samples).mean(axis=(2, 4))
         image[top:bottom] = np.moveaxis(rgb, 0, -1)
     return image
 
 
-def _rays(viewmat, K, u: np.ndarray, v: np.ndarray):
-    """Return origin [3] and directions [3, R] of pixels (u, v); t of a hit is depth."""
-    viewmat, K = np.asarray(viewmat, np.float64), np.asarray(K, np.float64)
-    x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
-    rotation = viewmat[:3, :3]
-    directions = rotation.T @ np.stack([x, y, np.ones_like(x)])
-    return -rotation.T @ viewmat[:3, 3], directions
+def _hits(
+    viewmat, K, size: tuple[int, int], pixels, optics=PINHOLE, dtype: type = np.float64
+):
+    """Return depth [R], solid [R] and place [3, R] of what pixels (u, v) show.
+
+    The depth is camera z, and infinite, with an arbitrary place, for background.
+    """
+    local = local_rays(optics, K, *pixels)
+    t, which = np.empty(local.shape[1], dtype), np.empty(local.shape[1], int)
+    places = np.empty(local.shape, dtype)
+    for pose, rays in exposures(optics, viewmat, size, *pixels):
+        rotation = pose[:3, :3]
+        origin = (-rotation.T @ pose[:3, 3]).astype(dtype)
+        directions = (rotation.T @ local[:, rays]).astype(dtype)
+        t[rays], which[rays] = found = _first_hits(origin, directions)
+        finite = np.where(np.isfinite(found[0]), found[0], 0)
+        places[:, rays] = origin[:, None] + finite * directions
+    return t, which, places
 
 
 def _first_hits(origin: np.ndarray, directions: np.ndarray):

@@ -8,6 +8,7 @@ from conftest import camera_of
 
 import gsjax
 from gsjax import InputError
+from gsjax.cameras.camera import with_shutter
 
 EYE, K = np.eye(4), np.array([[50.0, 0, 8], [0, 50, 8], [0, 0, 1]])
 
@@ -16,6 +17,36 @@ def put(matrix, place, value):
     matrix = matrix.copy()
     matrix[place] = value
     return matrix
+
+
+def lens(name, *coefficients):
+    """Return arguments of a lens; a list is its coefficients as they are."""
+    values = [c for c in coefficients if not isinstance(c, list)]
+    values = values or next(iter(coefficients), None)
+    return {"lens": name, "coefficients": values}
+
+
+TWIST = np.array([0.02, -0.05, 0.03, 0.04, 0.1, -0.03])
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"shutter": "sideways", "twist": TWIST}, "shutter: .*top_to_bottom"),
+        ({"shutter": 3, "twist": TWIST}, "shutter"),
+        ({"shutter": "global", "twist": TWIST}, "neither .*global"),
+        ({"shutter": "top_to_bottom"}, "expected one of twist and viewmat_end"),
+        ({"twist": TWIST, "viewmat_end": EYE}, "expected one of"),
+        ({"twist": TWIST[:5]}, "twist: expected shape"),
+        ({"twist": TWIST * np.nan}, "twist: expected finite"),
+        ({"viewmat_end": np.eye(3)}, "viewmat_end: expected shape"),
+        ({"viewmat_end": 2 * EYE}, "viewmat"),
+    ],
+)
+def test_shutters_are_checked(changes, named):
+    camera = gsjax.make_camera(viewmat=EYE, K=K, width=16, height=16)
+    with pytest.raises(InputError, match=named):
+        with_shutter(camera, **{"shutter": "top_to_bottom"} | changes)
 
 
 @pytest.mark.parametrize(
@@ -28,7 +59,18 @@ def put(matrix, place, value):
         ({"height": None}, "image size"),
         ({"lens": 3}, "lens"),
         ({"lens": "unknown"}, "lens"),
-        ({"coefficients": [1.0]}, "coefficients"),
+        ({"coefficients": [1.0]}, "coefficients: expected 0 for the pinhole lens"),
+        (lens("opencv"), "coefficients: expected 4 or 5 or 8 or 12"),
+        (lens("opencv", 0.1, 0.2, 0.3), "opencv lens, got 3"),
+        (lens("opencv", [[0.1] * 4] * 3), r"coefficients: expected shape \[M\]"),
+        (lens("fisheye", 0.1, np.nan, 0, 0), "finite .*fisheye.*calibrate"),
+        (lens("division", np.inf), "coefficients: expected finite"),
+        (lens("equirectangular", 1.0), "coefficients: expected 0"),
+        (lens("eucm", 1.1, 0.6), "alpha .*order"),
+        (lens("eucm", 0.6, -1.0), "beta above 0"),
+        (lens("fov", 45.0), "fov.*radians"),
+        (lens("ftheta", *[0.0] * 10), "rises .*largest angle"),
+        (lens("ftheta_inverse", 0, 1, *[0.0] * 7, -1), "largest angle above 0"),
         ({"viewmat": 1j * EYE}, "viewmat"),
         ({"K": K + 0j}, "K"),
         ({"viewmat": np.eye(3)}, "viewmat"),

@@ -149,3 +149,20 @@ def test_tables(name, index, report):
         found = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
         wanted = table["ray_dir"]
     np.testing.assert_allclose(found[known], wanted[known], atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("lens", "c"), [(lenses.DIVISION, [-1.0]), (lenses.FOV, [2.0])]
+)
+def test_a_bounded_image_has_finite_derivatives(lens, c):
+    """The image of a half space may be smaller than the picture."""
+    K, size = np.array([[10.0, 0, 16], [0, 10, 16], [0, 0, 1]]), (32, 32)
+
+    def moved(c, point):
+        return sum(lens.linearise(K, c, size, tuple(point)))
+
+    at = jnp.array(c), jnp.array([0.5, -0.3, 1.2])
+    value, slopes = jax.value_and_grad(moved, (0, 1))(*at)
+    np.testing.assert_allclose(value, at[1].sum(), rtol=1e-12)
+    np.testing.assert_allclose(slopes[0], [0.0])
+    np.testing.assert_allclose(slopes[1], np.ones(3))

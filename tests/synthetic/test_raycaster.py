@@ -1,12 +1,17 @@
 """Ray-cast photographs against geometry computed without the ray caster."""
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import gsjax
+from gsjax.cameras.camera import with_shutter
+from gsjax.cameras.distortion import Distortion, project_points
+from gsjax.cameras.shutter import exposed_at
 from gsjax.data.photos import load_photo
 from gsjax.synthetic import raycaster
+from gsjax.synthetic.optics import Optics, exposures, local_rays
 from gsjax.synthetic.raycaster import DemoDatasetSettings
 from gsjax.synthetic.shapes import box, disc, sphere, torus
 
@@ -75,6 +80,61 @@ def test_samples_are_the_pixels_of_larger_photographs():
     np.testing.assert_array_equal(photograph(1, samples=1)[0], full)
     with pytest.raises(gsjax.InputError, match="at least 1"):
         photograph(0, samples=0)
+
+
+LENSES = {
+    "opencv": (-0.25, 0.06, 0.001, -0.001),
+    "fisheye": (0.05, -0.01, 0.002, 0.001),
+}
+TWIST = np.array([0.05, -0.04, 0.03, 0.1, -0.05, 0.02])
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_rays_through_lenses_match_the_renderer(lens):
+    _, K = raycaster.demo_cameras(8, *SIZE)
+    u, v = (a.ravel() for a in np.meshgrid(*(np.linspace(0, n, 9) for n in SIZE)))
+    rays = local_rays(Optics(lens, LENSES[lens]), K, u, v)
+    pixels, _, seen = project_points(Distortion(lens, LENSES[lens]), K, rays.T)
+    assert seen.all()
+    np.testing.assert_allclose(pixels, np.stack([u, v], -1), atol=1e-6)
+
+
+@pytest.mark.parametrize("shutter", ["top_to_bottom", "right_to_left"])
+def test_rolling_photograph_is_made_of_still_ones(shutter):
+    width, height = size = 8, 6
+    viewmats, K = raycaster.demo_cameras(8, *size)
+    optics = Optics("opencv", LENSES["opencv"], shutter, TWIST)
+    still = optics._replace(shutter="global")
+    rgb, depth = raycaster.cast(viewmats[2], K, *size, 1, optics=optics)
+    u, v = (a.ravel() + 0.5 for a in np.meshgrid(*map(np.arange, size)))
+    camera = gsjax.make_camera(viewmat=viewmats[2], K=K, width=width, height=height)
+    camera = with_shutter(camera, shutter, twist=TWIST)
+    times = set()
+    for pose, rays in exposures(optics, viewmats[2], size, u, v):
+        expected, far = raycaster.cast(pose, K, *size, 1, optics=still)
+        lines = rgb.reshape(-1, 3)[rays], expected.reshape(-1, 3)[rays]
+        np.testing.assert_allclose(*lines, atol=1e-5)
+        np.testing.assert_allclose(depth.ravel()[rays], far.ravel()[rays], rtol=1e-9)
+        of_row, of_column = v[rays] / height, 1 - u[rays] / width
+        time = (of_row if shutter == "top_to_bottom" else of_column)[0]
+        point = (0.3, -0.2, 0.5)
+        seen = exposed_at(camera, point, jnp.float32(time))
+        np.testing.assert_allclose(seen, pose[:3] @ (*point, 1), atol=1e-5)
+        times.add(time)
+    assert len(times) == (height if shutter == "top_to_bottom" else width)
+
+
+def test_optics_that_cannot_be_cast_are_rejected():
+    viewmats, K = raycaster.demo_cameras(8, *SIZE)
+    cases = {
+        "lens": Optics("orthographic"),
+        "shutter": Optics(shutter="top_to_bottom"),
+        "fold": Optics("opencv", (-3.0, 0, 0, 0)),
+        "180": Optics("fisheye", (-0.9, 0, 0, 0)),
+    }
+    for match, optics in cases.items():
+        with pytest.raises(gsjax.InputError, match=match):
+            raycaster.cast(viewmats[0], K, *SIZE, 1, optics=optics)
 
 
 def test_points_lie_on_visible_surfaces():

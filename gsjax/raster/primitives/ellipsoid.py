@@ -49,6 +49,9 @@ from gsjax.raster.types import (
 from gsjax.raster.vmap_branching import any_in_batch
 
 
+_FASTEST = 1e4  # rad of rotation in an exposure; squares then fit float32
+
+
 def usable(camera: Camera) -> Array:
     """Return whether a camera can draw; under jit a bad one cannot be rejected."""
     low, high = LENS_RANGE
@@ -58,6 +61,8 @@ def usable(camera: Camera) -> Array:
     for extra in (camera.coefficients, camera.twist):
         if extra is not None:
             good &= jnp.all(jnp.isfinite(extra))
+    if camera.twist is not None:
+        good &= jnp.all(jnp.abs(camera.twist[:3]) < _FASTEST)
     return good & jnp.all((focal > low) & (focal < high) & (centre < high))
 
 
