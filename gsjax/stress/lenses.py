@@ -35,7 +35,7 @@ BEAMS = lenses.lidar_coefficients(
 )
 _OPENCV = (-0.12, 0.03, 0.004, -0.006, 0.01, 0.02, -0.01, 0.003)
 # Compiling takes longest by far, and running milliseconds.
-_QUICK = {
+QUICK = {
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
 }
@@ -172,7 +172,7 @@ def _blend(camera: Camera, config: RasterConfig, bounds, out) -> Array:
 
 
 @scenes.with_numpy
-@partial(jax.jit, static_argnames="config", compiler_options=_QUICK)
+@partial(jax.jit, static_argnames="config", compiler_options=QUICK)
 def view(gaussians: Gaussians, camera: Camera, config: RasterConfig = OPEN) -> View:
     """Return the picture of degree-0 Gaussians in `SLOTS` slots, and its gradients."""
     p = gaussians.params

@@ -153,7 +153,6 @@ def pose_at(viewmat, t):
 
 GRADIENTS = {
     "opencv": ("opencv", 30.0, UNSCENTED, "global", None),
-    "fisheye": ("fisheye", 12.0, OPEN, "left_to_right", 0 * TWIST),
     "equirectangular": ("equirectangular", 1.0, OPEN, "global", None),
 }
 NAMES = ("K", "viewmat", "coefficients", "twist")
