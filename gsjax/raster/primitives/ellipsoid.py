@@ -48,7 +48,6 @@ from gsjax.raster.types import (
 )
 from gsjax.raster.vmap_branching import any_in_batch
 
-
 _FASTEST = 1e4  # rad of rotation in an exposure; squares then fit float32
 
 
