@@ -201,26 +201,9 @@ def _check_coefficients(lens: Lens, values: np.ndarray) -> None:
             f"coefficients: expected finite values for the {lens.name} lens, got "
             f"{values}; calibrate the camera again, or use the pinhole lens"
         )
-    if lens.name == "eucm":
-        alpha, beta = values[..., 0], values[..., 1]
-        if not ((alpha >= 0) & (alpha <= 1) & (beta > 0)).all():
-            raise InputError(
-                f"coefficients: expected alpha within 0 and 1 and beta above 0 for the "
-                f"eucm lens, got {values}; check their order"
-            )
-    if lens.name == "fov" and not (np.abs(values) < np.pi).all():
-        raise InputError(
-            f"coefficients: expected an angle below π for the fov lens, got {values}; "
-            "convert degrees to radians"
-        )
-    if lens.name in ("ftheta", "ftheta_inverse"):
-        slope, end = values[..., 1], values[..., 9]
-        if not ((slope > 0) & (end > 0)).all():
-            raise InputError(
-                f"coefficients: expected a polynomial that rises from 0 and a largest "
-                f"angle above 0 for the {lens.name} lens, got {slope} and {end}; give "
-                "them as k0 … k5, c, d, e and the largest angle"
-            )
+    fault = None if lens.fault is None else lens.fault(values)
+    if fault is not None:
+        raise InputError(f"coefficients: {lens.name} lens: {fault}")
 
 
 def with_shutter(

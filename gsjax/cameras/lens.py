@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gsjax.math.numerics import materialize
 
@@ -37,6 +38,8 @@ class Lens(NamedTuple):
         Jacobian is evaluated. It limits the Jacobian far outside the image.
       period: (K, c) → the width in px of one turn, for images that wrap around; None
         for others. Splats across the seam are drawn on both sides.
+      fault: concrete coefficients [..., M] → what is wrong with them and what to do, or
+        None; the values are finite. None if the lens accepts all.
     """
 
     name: str
@@ -47,6 +50,7 @@ class Lens(NamedTuple):
     depth: Callable[[Point], Array]
     linearise: Callable[[Array, Array, tuple[Length, Length], Point], Point]
     period: Callable[[Array, Array], Array] | None = None
+    fault: Callable[[np.ndarray], str | None] | None = None
 
 
 def copies(lens: Lens) -> int:
@@ -148,15 +152,15 @@ def angle_ratio(point: Point) -> Array:
     few = polynomial(_ATAN, jnp.where(near, square, 0) / (ahead * ahead)) / ahead
     rho = jnp.sqrt(jnp.where(off, square, 1))
     far = jnp.arctan2(rho, jnp.where(off, point[2], 0)) / rho
-    return once(jnp.where(near, few, far))
+    return materialize((jnp.where(near, few, far),))[0]
 
 
 @angle_ratio.defjvp
 def _angle_ratio_jvp(points, tangents):
     """Reuse the ratio s: ds = (z / r² − s) / ρ² · (x dx + y dy) − dz / r².
 
-    Automatic derivatives evaluate the arctangent several times; twice the time of a
-    gradient.
+    XLA's CPU backend (jax 0.10.2) otherwise evaluates the arctangent for each use of a
+    derivative.
     """
     ((x, y, z),), ((dx, dy, dz),) = points, tangents
     ratio = angle_ratio((x, y, z))
@@ -166,8 +170,8 @@ def _angle_ratio_jvp(points, tangents):
     far = square + z * z
     inverse = 1 / jnp.where(near | off, far, 1)
     bend = (z * inverse - ratio) / jnp.where(off, square, 1)
-    bend = once(jnp.where(near, 2 * few, jnp.where(off, bend, 0)))
-    fall = once(jnp.where(near | off, inverse, 0))
+    bend = jnp.where(near, 2 * few, jnp.where(off, bend, 0))
+    bend, fall = materialize((bend, jnp.where(near | off, inverse, 0)))
     return ratio, bend * (x * dx + y * dy) - fall * dz
 
 
@@ -177,11 +181,6 @@ def _beside_axis(point: Point):
     square = x * x + y * y
     near = (z > 0) & (square < _SMALL * z * z)
     return square, near, jnp.where(near, z, 1), ~near & (square > 0)
-
-
-def once(value: Array) -> Array:
-    """Return ``value``, which XLA then computes once; see `materialize`."""
-    return materialize((value,), value == value)[0]
 
 
 def sine_ratio(square: Array) -> Array:

@@ -166,8 +166,8 @@ def _linearise(
     return x * scale, y * scale, jnp.where(out, far * jnp.cos(limit), z)
 
 
-def radial_lens(name: str, counts: tuple[int, ...], model: Model) -> Lens:
-    """Return the lens of a distortion model."""
+def radial_lens(name: str, counts: tuple[int, ...], model: Model, fault=None) -> Lens:
+    """Return the lens of a distortion model; ``fault`` as in `Lens`."""
     return Lens(
         name=name,
         counts=counts,
@@ -176,6 +176,7 @@ def radial_lens(name: str, counts: tuple[int, ...], model: Model) -> Lens:
         valid=partial(_valid, model),
         depth=range_depth if model.wide else z_depth,
         linearise=partial(_linearise, model),
+        fault=fault,
     )
 
 
@@ -270,6 +271,12 @@ def _tan_ratio(x: Array) -> Array:
     return sine_ratio(x * x) / jnp.cos(x)
 
 
+def _fov_fault(c: np.ndarray) -> str | None:
+    if (np.abs(c) < np.pi).all():
+        return None
+    return f"expected an angle below π, got {c}; convert degrees to radians"
+
+
 def _fov_plane(c: Array, a: Array, b: Array) -> Pixel:
     scale = _fov_scale(c, a * a + b * b)
     return a * scale, b * scale
@@ -338,6 +345,16 @@ def _ftheta_inverse_plane(c: Array, a: Array, b: Array) -> Pixel:
     return _affine(c, 1 / polynomial([c[i] for i in range(1, 6)], pixels), a, b)
 
 
+def _ftheta_fault(c: np.ndarray) -> str | None:
+    slope, end = c[..., 1], c[..., 9]
+    if ((slope > 0) & (end > 0)).all():
+        return None
+    return (
+        f"expected a slope k1 and a largest angle above 0, got {slope} and {end}; give "
+        "k0 … k5, c, d, e and the largest angle, in this order"
+    )
+
+
 def _largest_angle(c: Array) -> Array:
     return c[9]
 
@@ -362,6 +379,7 @@ FOV = radial_lens(
     "fov",
     (1,),
     Model(False, _fov_plane, lambda c, r: r * _fov_scale(c, r * r)),
+    _fov_fault,
 )
 DIVISION = radial_lens(
     "division",
@@ -369,10 +387,14 @@ DIVISION = radial_lens(
     Model(False, _division_plane, _division_radius, limit=_division_limit),
 )
 FTHETA = radial_lens(
-    "ftheta", (10,), Model(True, _ftheta_plane, _ftheta_radius, limit=_largest_angle)
+    "ftheta",
+    (10,),
+    Model(True, _ftheta_plane, _ftheta_radius, limit=_largest_angle),
+    _ftheta_fault,
 )
 FTHETA_INVERSE = radial_lens(
     "ftheta_inverse",
     (10,),
     Model(True, _ftheta_inverse_plane, _ftheta_inverse_radius, limit=_largest_angle),
+    _ftheta_fault,
 )

@@ -132,15 +132,11 @@ def expose(camera: Camera, point: Point) -> Exposure:
     t = lax.stop_gradient(t)
     # Differentiated: see `gsjax.cameras.solvers`.
     path = _path_of(camera, point)
-    path = _Path(*(_once(part) for part in path))
-    (t,) = _once((_step(camera, path, t),))
-    (t,) = _once((_step(camera, path, t),))
+    path = _Path(*(materialize(part) for part in path))
+    (t,) = materialize((_step(camera, path, t),))
+    (t,) = materialize((_step(camera, path, t),))
     seen, velocity = _moving(camera, path, t)
-    return Exposure(_once(seen), _viewmat(camera, t), _once(velocity), t)
-
-
-def _once(values):
-    return materialize(values, values[0] == values[0])
+    return Exposure(materialize(seen), _viewmat(camera, t), materialize(velocity), t)
 
 
 def exposed_at(camera: Camera, point: Point, time: Array) -> Point:

@@ -136,6 +136,13 @@ def _eucm_linearise(
     return x * turn, y * turn, jnp.where(out, ahead * norm, z)
 
 
+def _eucm_fault(c: np.ndarray) -> str | None:
+    alpha, beta = c[..., 0], c[..., 1]
+    if ((alpha >= 0) & (alpha <= 1) & (beta > 0)).all():
+        return None
+    return f"expected alpha in [0, 1] and beta above 0, got {c}; check their order"
+
+
 EUCM = Lens(
     name="eucm",
     counts=(2,),
@@ -144,6 +151,7 @@ EUCM = Lens(
     valid=_eucm_valid,
     depth=range_depth,
     linearise=_eucm_linearise,
+    fault=_eucm_fault,
 )
 
 

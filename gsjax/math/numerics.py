@@ -89,15 +89,20 @@ def materialize_mask(mask: Array) -> Array:
     return one / jnp.where(mask, one, np.float32(np.inf)) > 0
 
 
-def materialize(values: tuple[Array, ...], mask: Array) -> tuple[Array, ...]:
+def materialize(
+    values: tuple[Array, ...], mask: Array | None = None
+) -> tuple[Array, ...]:
     """Return ``values``, computed only once on CPUs; see `materialize_mask`.
 
     Args:
       values: equally shaped arrays.
-      mask: which elements are used; the others may come out halved.
+      mask: which elements are used; the others may come out halved. By default those
+        that are not NaN in the first array.
     """
     if not on_cpu():
         return values
+    if mask is None:
+        mask = values[0] == values[0]
     one = jnp.where(mask, 1, 2).astype(values[0].dtype)
     return tuple(value / one for value in values)
 

@@ -32,6 +32,7 @@ from gsjax.plots.contact_sheets import depth_colors
 from gsjax.runs.scene_source import SceneSource
 from gsjax.runs.views import prepare_render, render_cameras
 from gsjax.runtime.console import note, progress
+from gsjax.train.frames import twists_of
 
 _WIDEST_GAP = 120.0  # degrees of an orbit without a camera
 _SAMPLED = 4000  # points, or Gaussians, sampled for a range of depths
@@ -90,10 +91,9 @@ def view_entries(
     ]
     if not SHUTTERS[shutter].rolling:
         return entries
-    twists = [np.zeros(6) if view.twist is None else view.twist for view in scaled]
     return [
         entry._replace(camera=with_shutter(entry.camera, shutter, twist=twist))
-        for entry, twist in zip(entries, twists)
+        for entry, twist in zip(entries, twists_of(scaled))
     ]
 
 

@@ -68,7 +68,7 @@ SPECS = {
     "opencv 4": Spec("opencv", _OPENCV[:4], full_only=True),
     "opencv 5": Spec("opencv", _OPENCV[:5], full_only=True),
     "opencv 8": Spec("opencv", _OPENCV, full_only=True),
-    "opencv 12": Spec("opencv", (*_OPENCV, 0.002, -1e-3, 3e-3, 1e-3)),
+    "opencv 12": Spec("opencv", (*_OPENCV, 0.002, -1e-3, 3e-3, 1e-3), full_only=True),
     "fisheye": _FISHEYE,
     "thin_prism_fisheye": Spec(
         "thin_prism_fisheye",
@@ -90,7 +90,7 @@ SPECS = {
     "ftheta_inverse": Spec("ftheta_inverse", _INVERSE, 1.0, full_only=True),
     "equirectangular": Spec("equirectangular", full_only=True),
     "lidar": Spec("lidar", tuple(BEAMS), 1.0),
-    "unscented": Spec("equirectangular", config=UNSCENTED),
+    "unscented": Spec("equirectangular", config=UNSCENTED, full_only=True),
     "rolling": _FISHEYE._replace(shutter="top_to_bottom", full_only=False),
 }
 

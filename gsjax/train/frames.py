@@ -124,8 +124,12 @@ def with_shutter_of(views: Sequence[View], shutter: str, camera: Camera) -> Came
     """Return a batch of the cameras of views with a shutter and their motions."""
     if not SHUTTERS[shutter].rolling:
         return camera
-    twists = [np.zeros(6) if v.twist is None else v.twist for v in views]
-    return with_shutter(camera, shutter, twist=np.stack(twists))
+    return with_shutter(camera, shutter, twist=twists_of(views))
+
+
+def twists_of(views: Sequence[View]) -> np.ndarray:
+    """Return the motions of views [V, 6]; those without one stand still."""
+    return np.stack([np.zeros(6) if v.twist is None else v.twist for v in views])
 
 
 def _downscale(photo: Photo, divisor: int) -> Photo:

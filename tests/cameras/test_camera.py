@@ -69,7 +69,7 @@ def test_shutters_are_checked(changes, named):
         (lens("eucm", 1.1, 0.6), "alpha .*order"),
         (lens("eucm", 0.6, -1.0), "beta above 0"),
         (lens("fov", 45.0), "fov.*radians"),
-        (lens("ftheta", *[0.0] * 10), "rises .*largest angle"),
+        (lens("ftheta", *[0.0] * 10), "slope .*largest angle"),
         (lens("ftheta_inverse", 0, 1, *[0.0] * 7, -1), "largest angle above 0"),
         ({"viewmat": 1j * EYE}, "viewmat"),
         ({"K": K + 0j}, "K"),

@@ -10,6 +10,7 @@ import pytest
 from conftest import DATA
 
 from gsjax.cameras import lenses
+from gsjax.cameras.lens import angle_ratio
 from gsjax.cameras.lenses import Lens
 
 FILES = ("lenses", "lenses_colmap1", "lenses_colmap2", "lenses_colmap3")
@@ -166,3 +167,21 @@ def test_a_bounded_image_has_finite_derivatives(lens, c):
     np.testing.assert_allclose(value, at[1].sum(), rtol=1e-12)
     np.testing.assert_allclose(slopes[0], [0.0])
     np.testing.assert_allclose(slopes[1], np.ones(3))
+
+
+@pytest.mark.parametrize(
+    "point", [(0.3, 0.2, 1.0), (0.05, -0.03, 1.0), (0.02, 0.01, 0.5), (0.3, 0.2, -1.0)]
+)
+def test_the_rule_of_the_angle_is_that_of_automatic_derivatives(point):
+    def automatic(point):
+        rho = jnp.hypot(point[0], point[1])
+        return jnp.arctan2(rho, point[2]) / rho
+
+    def ruled(point):
+        return angle_ratio(tuple(point))
+
+    point = jnp.array(point)
+    for derivative in (jax.grad, jax.hessian, lambda f: jax.jacfwd(jax.hessian(f))):
+        wanted = derivative(automatic)(point)
+        error = jnp.abs(derivative(ruled)(point) - wanted).max()
+        assert error <= 1e-8 * jnp.abs(wanted).max()

@@ -44,7 +44,7 @@ def once(camera: Camera, values):
     """
     if camera.lens in _CHEAP and not camera.shutter.rolling:
         return values
-    return materialize(tuple(values), values[0] == values[0])
+    return materialize(tuple(values))
 
 
 def covariance_factor(camera: Camera, exposure: Exposure, quat, scales):
