@@ -25,6 +25,7 @@ Camera = Any  # `gsjax.cameras.camera.Camera`, which imports this module
 Point = tuple[Array, ...]  # x, y, z
 
 _NEWTON_STEPS = 2  # without derivative, before two that are differentiated
+_FASTEST = 0.9  # speed of an image that is followed; that of the shutter is 1
 _TIMES = (-0.5, 1.5)  # what lies farther outside the image is not followed
 
 
@@ -196,12 +197,18 @@ def _step(camera: Camera, path: _Path, t: Array) -> Array:
     width, height = camera.visible
     shutter = camera.shutter
     off = shutter.start + shutter.along_u * u / width + shutter.along_v * v / height - t
-    slope = shutter.along_u * du / width + shutter.along_v * dv / height - 1
-    # A slope of zero: the point moves along with the shutter.
-    good &= jnp.abs(slope) > 1e-3
-    t = t - jnp.where(good, off / jnp.where(good, slope, 1), 0)
+    speed = shutter.along_u * du / width + shutter.along_v * dv / height
     low, high = _TIMES
+    # A point that overtakes the shutter has no time of exposure, or several.
+    far = jnp.sign(off) * (high - low)
+    step = jnp.where(speed < _FASTEST, off / _ahead(speed), far)
+    t = t + jnp.where(good, step, 0)
     return jnp.where(t > low, jnp.where(t < high, t, high), low)
+
+
+def _ahead(speed: Array) -> Array:
+    """Return how much faster the shutter is than a point of the image, above 0."""
+    return 1 - jnp.where(speed < _FASTEST, speed, _FASTEST)
 
 
 def _moving(camera: Camera, path: _Path, t: Array) -> tuple[Point, Point]:
@@ -252,9 +259,7 @@ def image_rows(camera: Camera, exposure: Exposure, jacobian):
     width, height = camera.visible
     slopes = camera.shutter.along_u / width, camera.shutter.along_v / height
     speeds = [sum(j * v for j, v in zip(row, exposure.velocity)) for row in jacobian]
-    below = 1 - sum(s * v for s, v in zip(slopes, speeds))
-    small = jnp.abs(below) < 1e-3
-    below = jnp.where(small, jnp.where(below < 0, -1e-3, 1e-3), below)
+    below = _ahead(sum(s * v for s, v in zip(slopes, speeds)))
     by_time = [
         sum(s * row[j] for s, row in zip(slopes, rows)) / below for j in range(3)
     ]

@@ -1,9 +1,8 @@
-"""A dense float64 renderer in NumPy whose lenses are the published formulas.
+"""The published formulas of the lenses in NumPy, for the oracle of stress cases.
 
-It shares no code with the renderer. The Jacobian is a central difference, the fold is
-searched on a grid, and splats are blended at every pixel without bounds.
+No code is shared with the lenses of the renderer. The fold is searched on a grid.
 
-Axis legend: N Gaussians, P points.
+Axis legend: P points.
 """
 
 from collections.abc import Callable
@@ -11,9 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-_STEP = 1e-6
 _SAMPLES = 20001
-_C0 = 0.28209479177387814  # of the spherical harmonics
 
 
 class Plane(NamedTuple):
@@ -306,63 +303,3 @@ def functions(lens: str, K, c, size):
         step = abs(c[size[1]] - c[size[1] + size[0] - 1]) / (size[0] - 1)
         return *_lidar_lens(K, c, size), K[0, 0] * 2 * np.pi / step
     return *_plane_lens(lens, K, c, size), None
-
-
-def _rotations(quats):
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
-
-
-def _jacobian(project, limit, points, period):
-    at, columns = limit(points), []
-    for axis in np.eye(3):
-        step = _STEP * _length(at)[:, None] * axis
-        difference = project(at + step) - project(at - step)
-        if period:
-            difference[:, 0] -= period * np.round(difference[:, 0] / period)
-        columns.append(difference / (2 * _STEP * _length(at)[:, None]))
-    return np.stack(columns, -1)
-
-
-def picture(fields, camera, lens: str, dilation: float = 0.3) -> np.ndarray:
-    """Return the picture [H, W, 3] over black of a camera at the origin.
-
-    Args:
-      fields: of `gsjax.stress.scenes.gaussian_fields`, degree 0.
-      camera: its intrinsics, coefficients, depth range and size are used.
-      lens: name of the lens.
-      dilation: px² added to the variances.
-    """
-    fields = {name: np.asarray(a, np.float64) for name, a in fields.items()}
-    K, size = np.asarray(camera.K, np.float64), (camera.width, camera.height)
-    c = camera.coefficients
-    c = None if c is None else np.asarray(c, np.float64)
-    project, limit, period = functions(lens, K, c, size)
-    points = fields["means"]
-    perspective = lens in PLANES and not PLANES[lens].wide
-    depth = points[:, 2] if perspective else _length(points)
-    centres = project(points)
-    seen = np.isfinite(centres).all(-1) & (depth > float(camera.near))
-    order = np.argsort(np.where(seen, depth, np.inf), kind="stable")[: seen.sum()]
-    jacobian = _jacobian(project, limit, points[order], period)
-    turned = _rotations(fields["quats"][order])
-    half = jacobian @ turned * np.exp(fields["log_scales"][order])[:, None]
-    inverse = np.linalg.inv(half @ np.swapaxes(half, 1, 2) + dilation * np.eye(2))
-    opacity = 1 / (1 + np.exp(-fields["logit_opacities"][order]))
-    color = np.maximum(0.5 + _C0 * fields["sh"][order, 0], 0)
-    pixels = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in size)), -1)
-    image, left = np.zeros((*pixels.shape[:2], 3)), np.ones(pixels.shape[:2])
-    for i, slot in enumerate(order):
-        for turn in (0,) if period is None else (-1, 0, 1):
-            offset = pixels - centres[slot]
-            offset[..., 0] -= turn * (period or 0)
-            power = np.einsum("hwi,ij,hwj->hw", offset, inverse[i], offset)
-            alpha = opacity[i] * np.exp(-0.5 * power)
-            image += (left * alpha)[..., None] * color[i]
-            left *= 1 - alpha
-    return image

@@ -20,6 +20,10 @@ from gsjax.math import rotations
 from gsjax.raster.primitives.ewa import shortened
 from gsjax.raster.types import Array, RasterConfig
 
+# Sigma points within so many image sizes of the mean are used. A lens may image others
+# at 10⁵ px, where rounding of the point in float32 moves the splat in the image.
+_FARTHEST = 100
+
 
 def unscented_image(camera: Camera, config: RasterConfig, means, quat, scales):
     """Return the shift of the mean, the covariance factor, and where both hold.
@@ -33,7 +37,7 @@ def unscented_image(camera: Camera, config: RasterConfig, means, quat, scales):
 
     Returns:
       δ (u, v), [R] each; the rows m1, m2 of seven columns; and a mask, False where a
-      sigma point is not imaged.
+      sigma point is not imaged, or far outside the image.
     """
     alpha, beta, kappa = config.unscented
     step = alpha * (3 + kappa) ** 0.5
@@ -51,11 +55,13 @@ def unscented_image(camera: Camera, config: RasterConfig, means, quat, scales):
         good &= camera.lens.valid(camera.K, camera.coefficients, seen)
     good = jnp.all(good, axis=0)
     ahead = tuple(jnp.where(good, p, e) for p, e in zip(seen, (0, 0, 1)))
+    farthest = _FARTHEST * (camera.width + camera.height)
     m, shift = [], []
     for image, period in zip(camera.project(ahead), (period_of(camera), None)):
         offset = image[1:] - image[0]
         if period is not None:  # across the seam of the image
             offset = offset - period * jnp.round(offset / period)
+        good &= jnp.all(jnp.abs(offset) < farthest, axis=0)
         plus, minus = offset[:3], offset[3:]
         odd, even = (plus - minus) / (2 * step), (plus + minus) / (2 * step)
         delta = jnp.sum(even, axis=0) / step
