@@ -9,6 +9,7 @@ exposure, in 0 … 1, the rotation of the view matrix is exp(t ω) R and its tra
 T + t τ. That is the interpolation of world → camera poses by slerp and lerp.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from gsjax.cameras.lens import sine_ratio
+from gsjax.cameras.lens import polynomial, sine_ratio
 from gsjax.errors import InputError
 from gsjax.math.numerics import materialize
 
@@ -24,8 +25,11 @@ Array = Any
 Camera = Any  # `gsjax.cameras.camera.Camera`, which imports this module
 Point = tuple[Array, ...]  # x, y, z
 
-_NEWTON_STEPS = 2  # without derivative, before two that are differentiated
 _FASTEST = 0.9  # speed of an image that is followed; that of the shutter is 1
+# Of sin(√x) / √x and (1 − cos √x) / x; the rest is below 1e-17 up to x = 1.
+_SINE = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(10))
+_COSINE = tuple((-1.0) ** k / math.factorial(2 * k + 2) for k in range(10))
+_SMALL_TURN = 1 / 1.5**2  # squared, in rad: x is then at most 1
 _TIMES = (-0.5, 1.5)  # what lies farther outside the image is not followed
 
 
@@ -80,6 +84,24 @@ def find_shutter(shutter: str | Shutter) -> Shutter:
     )
 
 
+class Moment(NamedTuple):
+    """The turn of a camera at a time t of its exposure, by Rodrigues.
+
+    A vector v is turned to v + a ω × v + b ω × (ω × v), with θ = |ω|.
+
+    Attributes:
+      time: t.
+      a: sin(t θ) / θ.
+      slope: cos(t θ), the derivative of ``a``.
+      b: (1 − cos(t θ)) / θ², of derivative ``a``.
+    """
+
+    time: Array
+    a: Array
+    slope: Array
+    b: Array
+
+
 class Exposure(NamedTuple):
     """Points as a camera saw them.
 
@@ -88,13 +110,13 @@ class Exposure(NamedTuple):
       viewmat: [4, 4] world → camera; a rolling shutter has rows of entries of the
         shape of the components.
       velocity: change of ``point`` over the exposure, or None.
-      time: the time at which each point is exposed, or None.
+      moment: when each point is exposed, or None.
     """
 
     point: Point
     viewmat: Array
     velocity: Point | None = None
-    time: Array | None = None
+    moment: Moment | None = None
 
 
 def entry(viewmat: Array, i: int, j: int) -> Array:
@@ -127,30 +149,38 @@ def expose(camera: Camera, point: Point) -> Exposure:
     """
     if not camera.shutter.rolling or camera.twist is None:
         return Exposure(transform_point(camera.viewmat, point), camera.viewmat)
-    motion, path = lax.stop_gradient((camera, _path_of(camera, point)))
-    t = jnp.full_like(path.start[0], 0.5)
-    t = lax.fori_loop(0, _NEWTON_STEPS, lambda _, t: _step(motion, path, t), t)
-    t = lax.stop_gradient(t)
-    # Differentiated: see `gsjax.cameras.solvers`.
-    path = _path_of(camera, point)
-    path = _Path(*(materialize(part) for part in path))
-    (t,) = materialize((_step(camera, path, t),))
-    (t,) = materialize((_step(camera, path, t),))
-    seen, velocity = _moving(camera, path, t)
-    return Exposure(materialize(seen), _viewmat(camera, t), materialize(velocity), t)
+    path = _Path(*(materialize(part) for part in _path_of(camera, point)))
+    (t,) = materialize((_time(camera, path),))
+    moment = Moment(*materialize(moment_at(camera, t)))
+    seen, velocity = _moving(camera, path, moment)
+    view = _viewmat(camera, moment)
+    return Exposure(materialize(seen), view, materialize(velocity), moment)
 
 
-def exposed_at(camera: Camera, point: Point, time: Array) -> Point:
-    """Return world points in camera coordinates at a time of the exposure."""
-    return _moving(camera, _path_of(camera, point), time)[0]
+def moment_at(camera: Camera, time: Array) -> Moment:
+    """Return the turn of a single camera at a time, at most 1.5 or small turns."""
+    square = sum(camera.twist[i] * camera.twist[i] for i in range(3))
+    x = time * time * square
+    sine, cosine = lax.cond(square < _SMALL_TURN, _series, _closed, x)
+    return Moment(time, time * sine, 1 - x * cosine, time * time * cosine)
+
+
+def _series(x: Array) -> tuple[Array, Array]:
+    return polynomial(_SINE, x), polynomial(_COSINE, x)
+
+
+def _closed(x: Array) -> tuple[Array, Array]:
+    half = sine_ratio(0.25 * x)
+    return sine_ratio(x), 0.5 * half * half
+
+
+def exposed_at(camera: Camera, point: Point, moment: Moment) -> Point:
+    """Return world points in camera coordinates at a moment of the exposure."""
+    return _moving(camera, _path_of(camera, point), moment)[0]
 
 
 class _Path(NamedTuple):
-    """Camera coordinates of points while the camera turns.
-
-    By Rodrigues, at time t: start + A turn + B back + t τ, with A = sin(t θ) / θ,
-    B = (1 − cos(t θ)) / θ² and θ = |ω|.
-    """
+    """Camera coordinates of points: start + a turn + b back + t τ, see `Moment`."""
 
     start: Point
     turn: Point
@@ -179,31 +209,57 @@ def _path_of(camera: Camera, point: Point) -> _Path:
     return _Path(start, tuple(once), tuple(twice))  # pyright: ignore
 
 
-def _angles(camera: Camera, t: Array) -> tuple[Array, Array, Array]:
-    """Return A, its derivative by t, and B of `_Path`; smooth at θ = 0."""
-    square = sum(camera.twist[i] * camera.twist[i] for i in range(3))
-    half = sine_ratio(0.25 * t * t * square)
-    b = 0.5 * t * t * half * half
-    return t * sine_ratio(t * t * square), 1 - square * b, b
+@jax.custom_jvp
+def _time(camera: Camera, path: _Path) -> Array:
+    """Return when points are exposed, by Newton's method."""
+    low, high = _TIMES
+
+    def step(_, t: Array) -> Array:
+        wanted, speed, good = _exposed_later(camera, path, t)
+        off = wanted - t
+        # A point that overtakes the shutter has no time of exposure, or several.
+        far = jnp.sign(off) * (high - low)
+        change = jnp.where(speed < _FASTEST, off / _ahead(speed), far)
+        t = t + jnp.where(good, change, 0)
+        return jnp.where(t > low, jnp.where(t < high, t, high), low)
+
+    t = jnp.full_like(path.start[0], 0.5)
+    # Each step squares the error: three are enough for float32.
+    return lax.fori_loop(0, 4 if t.dtype == jnp.float64 else 3, step, t)
 
 
-def _step(camera: Camera, path: _Path, t: Array) -> Array:
-    """Return ``t`` after a Newton step towards the time of exposure."""
-    seen, velocity = _moving(camera, path, t)
+@_time.defjvp
+def _time_jvp(primals, tangents):
+    """Differentiate t = τ(t) implicitly: dt = dτ / (1 − dτ/dt), with τ of the image."""
+    camera, path = primals
+    t = _time(camera, path)
+
+    def wanted(camera: Camera, path: _Path):
+        time, *rest = _exposed_later(camera, path, t)
+        return time, rest
+
+    _, change, (speed, good) = jax.jvp(wanted, primals, tangents, has_aux=True)
+    low, high = _TIMES
+    good &= (speed < _FASTEST) & (t > low) & (t < high)
+    return t, jnp.where(good, change / _ahead(speed), 0)
+
+
+def _exposed_later(camera: Camera, path: _Path, t: Array):
+    """Return when the shutter is where points are seen at ``t``, its change, and where.
+
+    Returns:
+      the time, its derivative by ``t``, and a mask, False for points not before the
+      camera.
+    """
+    seen, velocity = _moving(camera, path, moment_at(camera, t))
     good = camera.lens.depth(seen) > 0.5 * camera.near
     seen = tuple(jnp.where(good, p, e) for p, e in zip(seen, (0, 0, 1)))
     velocity = tuple(jnp.where(good, v, 0) for v in velocity)
     (u, v), (du, dv) = jax.jvp(lambda *p: camera.project(p), seen, velocity)
     width, height = camera.visible
     shutter = camera.shutter
-    off = shutter.start + shutter.along_u * u / width + shutter.along_v * v / height - t
-    speed = shutter.along_u * du / width + shutter.along_v * dv / height
-    low, high = _TIMES
-    # A point that overtakes the shutter has no time of exposure, or several.
-    far = jnp.sign(off) * (high - low)
-    step = jnp.where(speed < _FASTEST, off / _ahead(speed), far)
-    t = t + jnp.where(good, step, 0)
-    return jnp.where(t > low, jnp.where(t < high, t, high), low)
+    time = shutter.start + shutter.along_u * u / width + shutter.along_v * v / height
+    return time, shutter.along_u * du / width + shutter.along_v * dv / height, good
 
 
 def _ahead(speed: Array) -> Array:
@@ -211,26 +267,24 @@ def _ahead(speed: Array) -> Array:
     return 1 - jnp.where(speed < _FASTEST, speed, _FASTEST)
 
 
-def _moving(camera: Camera, path: _Path, t: Array) -> tuple[Point, Point]:
-    """Return camera coordinates at time ``t``, and their change by it."""
-    a, slope, b = _angles(camera, t)
+def _moving(camera: Camera, path: _Path, at: Moment) -> tuple[Point, Point]:
+    """Return camera coordinates at a moment, and their change by the time."""
     shift = [camera.twist[3 + i] for i in range(3)]
     rows = list(zip(path.start, path.turn, path.back, shift))
     return (
-        tuple(p + a * q + b * r + t * s for p, q, r, s in rows),
-        tuple(slope * q + a * r + s for _, q, r, s in rows),
+        tuple(p + at.a * q + at.b * r + at.time * s for p, q, r, s in rows),
+        tuple(at.slope * q + at.a * r + s for _, q, r, s in rows),
     )
 
 
-def _viewmat(camera: Camera, t: Array):
-    """Return the entries of the view matrix at times ``t``, as rows of components."""
+def _viewmat(camera: Camera, at: Moment):
+    """Return the entries of the view matrix at a moment, as rows of components."""
     view, twist = camera.viewmat, camera.twist
-    a, _, b = _angles(camera, t)
     once, twice = _turns(twist, [view[i, :3] for i in range(3)])
     return tuple(
         (
-            *(view[i, j] + a * once[i][j] + b * twice[i][j] for j in range(3)),
-            view[i, 3] + t * twist[3 + i],
+            *(view[i, j] + at.a * once[i][j] + at.b * twice[i][j] for j in range(3)),
+            view[i, 3] + at.time * twist[3 + i],
         )
         for i in range(3)
     )
@@ -256,13 +310,14 @@ def image_rows(camera: Camera, exposure: Exposure, jacobian):
     ]
     if exposure.velocity is None:
         return rows
+    rows = [materialize(tuple(row)) for row in rows]
     width, height = camera.visible
     slopes = camera.shutter.along_u / width, camera.shutter.along_v / height
     speeds = [sum(j * v for j, v in zip(row, exposure.velocity)) for row in jacobian]
     below = _ahead(sum(s * v for s, v in zip(slopes, speeds)))
-    by_time = [
-        sum(s * row[j] for s, row in zip(slopes, rows)) / below for j in range(3)
-    ]
+    by_time = materialize(
+        tuple((slopes[0] * p + slopes[1] * q) / below for p, q in zip(*rows))
+    )
     return [
         [r + speed * t for r, t in zip(row, by_time)]
         for row, speed in zip(rows, speeds)

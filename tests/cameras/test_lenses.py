@@ -12,6 +12,7 @@ from conftest import DATA
 from gsjax.cameras import lenses
 from gsjax.cameras.lens import angle_ratio
 from gsjax.cameras.lenses import Lens
+from gsjax.stress.lenses import QUICK
 
 FILES = ("lenses", "lenses_colmap1", "lenses_colmap2", "lenses_colmap3")
 
@@ -96,7 +97,7 @@ def read(name: str, index: int):
     return table, case.lens, K, rest[list(case.order)] if case.order else None
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def evaluate(lens: Lens, K, c, points):
     """Return pixels, Jacobians [M, 2, 3] and validity of points [M, 3]."""
 
@@ -108,7 +109,7 @@ def evaluate(lens: Lens, K, c, points):
     return jax.vmap(one)(points), jax.vmap(jax.jacfwd(one))(points), valid
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def there_and_back(lens: Lens, K, c, pixels):
     ray = lens.unproject(K, c, tuple(pixels.T))
     return jnp.stack(ray, -1), jnp.stack(lens.project(K, c, ray), -1)

@@ -14,6 +14,7 @@ from gsjax.cameras.camera import with_shutter
 from gsjax.cameras.shutter import expose
 from gsjax.raster.primitives.ewa import covariance_factor, dilated
 from gsjax.raster.primitives.unscented import unscented_image
+from gsjax.stress.lenses import QUICK
 
 LENS_OF = {"pinhole": "pinhole", "opencv": "opencv"}
 
@@ -45,7 +46,7 @@ def factor_of(covariance_rows):
     return np.moveaxis(np.asarray(rows), -1, 0)
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=QUICK)
 def ewa(camera, means, quats, scales):
     exposure = expose(camera, tuple(means.T))
     rows = covariance_factor(camera, exposure, tuple(quats.T), tuple(scales.T))
@@ -79,7 +80,7 @@ def test_ewa(lens):
         np.testing.assert_allclose(np.sqrt(sharp / det)[sure], wanted, rtol=1e-8)
 
 
-@partial(jax.jit, static_argnums=1)
+@partial(jax.jit, static_argnums=1, compiler_options=QUICK)
 def unscented(camera, config, means, quats, scales):
     columns = (tuple(a.T) for a in (means, quats, scales))
     shift, rows, good = unscented_image(camera, config, *columns)
@@ -114,7 +115,7 @@ def test_unscented(lens, alpha, report):
     assert (off <= 0.05 * np.linalg.norm(truth, axis=(1, 2))).all()
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=QUICK)
 def exposed(camera, points):
     return jnp.stack(camera.project(expose(camera, tuple(points.T)).point), -1)
 
@@ -141,7 +142,7 @@ def test_rolling_shutter(lens, direction, report):
     np.testing.assert_allclose(np.asarray(still)[shown], wanted, atol=1e-9)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def of_lidar(lens, K, c, points, places):
     pixels = lens.project(K, c, tuple(points.T))
     ray = lens.unproject(K, c, tuple(places.T))

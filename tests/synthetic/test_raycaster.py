@@ -8,7 +8,7 @@ import pytest
 import gsjax
 from gsjax.cameras.camera import with_shutter
 from gsjax.cameras.distortion import Distortion, project_points
-from gsjax.cameras.shutter import exposed_at
+from gsjax.cameras.shutter import exposed_at, moment_at
 from gsjax.data.photos import load_photo
 from gsjax.synthetic import raycaster
 from gsjax.synthetic.optics import Optics, exposures, local_rays
@@ -118,7 +118,7 @@ def test_rolling_photograph_is_made_of_still_ones(shutter):
         of_row, of_column = v[rays] / height, 1 - u[rays] / width
         time = (of_row if shutter == "top_to_bottom" else of_column)[0]
         point = (0.3, -0.2, 0.5)
-        seen = exposed_at(camera, point, jnp.float32(time))
+        seen = exposed_at(camera, point, moment_at(camera, jnp.float32(time)))
         np.testing.assert_allclose(seen, pose[:3] @ (*point, 1), atol=1e-5)
         times.add(time)
     assert len(times) == (height if shutter == "top_to_bottom" else width)

@@ -16,6 +16,7 @@ from gsjax.cameras.camera import LENS_RANGE, NEAREST, Camera, camera_centre
 from gsjax.cameras.lenses import everywhere, z_depth
 from gsjax.cameras.shutter import (
     Exposure,
+    Moment,
     centre,
     expose,
     exposed_at,
@@ -104,7 +105,7 @@ def bounds(
     if depth.dtype == jnp.float32:
         # Rounded once, so that a Gaussian behind another one is not before it.
         with jax.enable_x64(True):
-            depth = _wide_depth(means, camera, exposure.time)
+            depth = _wide_depth(means, camera, exposure.moment)
             depth = lax.convert_element_type(depth, jnp.float32)
     live = active & in_depth_range(camera, depth) & jnp.isfinite(logits)
     live &= usable(camera)
@@ -146,7 +147,7 @@ def _gains(camera: Camera, exposure: Exposure) -> list[Array]:
     jacobian = ewa_jacobian(camera, exposure.point)
     if exposure.velocity is not None:
         rows = image_rows(camera, exposure, jacobian)
-        return [jnp.sum(jnp.square(jnp.stack(row)), axis=0) for row in rows]
+        return [a * a + b * b + c * c for a, b, c in rows]
     # A view matrix that scales, as one being optimised may, enlarges what it shows.
     rotation = camera.viewmat[:3, :3]
     gram = jnp.sum(rotation[:, None] * rotation[None], axis=-1)
@@ -174,13 +175,13 @@ def order_depth(means: Array, camera: Camera) -> Array:
     return _wide_depth(means.T, camera)
 
 
-def _wide_depth(means, camera: Camera, time: Array | None = None) -> Array:
+def _wide_depth(means, camera: Camera, moment: Moment | None = None) -> Array:
     """Depth [K] in float64 of components; within `jax.enable_x64(True)`.
 
     Args:
       means: components [K] in world coordinates.
       camera: a single camera.
-      time: [K] from `expose`, or None.
+      moment: from `expose`, or None.
     """
 
     def wide(value: Array) -> Array:
@@ -189,9 +190,10 @@ def _wide_depth(means, camera: Camera, time: Array | None = None) -> Array:
     if camera.shutter.rolling:
         exact = jax.tree.map(wide, camera)
         means = tuple(wide(m) for m in means)
-        if time is None:
+        if moment is None:
             return camera.lens.depth(expose(exact, means).point)
-        return camera.lens.depth(exposed_at(exact, means, wide(time)))
+        exactly = jax.tree.map(wide, moment)
+        return camera.lens.depth(exposed_at(exact, means, exactly))
 
     def coordinate(i: int) -> Array:
         row = camera.viewmat[i]

@@ -42,9 +42,12 @@ def once(camera: Camera, values):
 
     See `gsjax.math.numerics.materialize`. Nothing is done for a lens that is cheap.
     """
-    if camera.lens in _CHEAP and not camera.shutter.rolling:
-        return values
-    return materialize(tuple(values))
+    return values if is_cheap(camera) else materialize(tuple(values))
+
+
+def is_cheap(camera: Camera) -> bool:
+    """Return whether XLA may well image a point again for each use of its image."""
+    return camera.lens in _CHEAP and not camera.shutter.rolling
 
 
 def covariance_factor(camera: Camera, exposure: Exposure, quat, scales):

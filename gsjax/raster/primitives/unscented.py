@@ -15,9 +15,10 @@ import jax.numpy as jnp
 
 from gsjax.cameras.camera import Camera
 from gsjax.cameras.lenses import everywhere
-from gsjax.cameras.shutter import expose
+from gsjax.cameras.shutter import expose, transform_point
 from gsjax.math import rotations
-from gsjax.raster.primitives.ewa import shortened
+from gsjax.math.numerics import materialize
+from gsjax.raster.primitives.ewa import is_cheap, shortened
 from gsjax.raster.types import Array, RasterConfig
 
 # Sigma points within so many image sizes of the mean are used. A lens may image others
@@ -44,30 +45,67 @@ def unscented_image(camera: Camera, config: RasterConfig, means, quat, scales):
     rotation = rotations.rotation_rows(*quat)
     per_square = step / sum(q * q for q in quat)
     sigmas = [s * per_square for s in scales]
-    points = []
-    for mean, row in zip(means, rotation):
-        offsets = jnp.stack([r * s for r, s in zip(row, sigmas)])
-        points.append(jnp.concatenate([mean[None], mean + offsets, mean - offsets]))
-    exposure = expose(camera, tuple(points))  # pyright: ignore
-    seen = exposure.point
-    good = camera.lens.depth(seen) > 0.5 * camera.near
-    if camera.lens.valid is not everywhere:
-        good &= camera.lens.valid(camera.K, camera.coefficients, seen)
-    good = jnp.all(good, axis=0)
-    ahead = tuple(jnp.where(good, p, e) for p, e in zip(seen, (0, 0, 1)))
+    axes = [tuple(row[j] * sigmas[j] for row in rotation) for j in range(3)]
+    seen = _sigma_points(camera, means, axes)
+    good = _imaged(camera, seen)
+    ahead = [tuple(jnp.where(good, p, e) for p, e in zip(q, (0, 0, 1))) for q in seen]
+    images = zip(*(materialize(camera.project(point)) for point in ahead))
+    if len(seen) == 1:
+        images = [list(image) for (image,) in images]
     farthest = _FARTHEST * (camera.width + camera.height)
     m, shift = [], []
-    for image, period in zip(camera.project(ahead), (period_of(camera), None)):
-        offset = image[1:] - image[0]
+    for (middle, *others), period in zip(images, (period_of(camera), None)):
+        offsets = [place - middle for place in others]
         if period is not None:  # across the seam of the image
-            offset = offset - period * jnp.round(offset / period)
-        good &= jnp.all(jnp.abs(offset) < farthest, axis=0)
-        plus, minus = offset[:3], offset[3:]
-        odd, even = (plus - minus) / (2 * step), (plus + minus) / (2 * step)
-        delta = jnp.sum(even, axis=0) / step
+            offsets = [o - period * jnp.round(o / period) for o in offsets]
+        for offset in offsets:
+            good &= jnp.abs(offset) < farthest
+        pairs = list(zip(offsets[:3], offsets[3:]))
+        odd = [(plus - minus) / (2 * step) for plus, minus in pairs]
+        even = [(plus + minus) / (2 * step) for plus, minus in pairs]
+        delta = sum(even) / step
         m.append((*odd, *even, (beta - alpha * alpha) ** 0.5 * delta))
         shift.append(delta)
     return tuple(shift), shortened(*m), good
+
+
+def _sigma_points(camera: Camera, means, axes) -> list[tuple[Array, ...]]:
+    """Return the mean and the six sigma points in camera coordinates.
+
+    Args:
+      camera: a single camera.
+      means: (x, y, z), [R] each.
+      axes: three times (x, y, z), [R] each, from the mean to three of the points.
+
+    Returns:
+      seven points of a lens that is cheap; else, for a smaller program, one point of
+      components [7, R].
+    """
+    if is_cheap(camera):
+        turn = camera.viewmat.at[:, 3].set(0)
+        middle = materialize(transform_point(camera.viewmat, means))
+        axes = [materialize(transform_point(turn, axis)) for axis in axes]
+        signs = (1, -1)
+        return [middle] + [
+            tuple(p + sign * q for p, q in zip(middle, axis))
+            for sign in signs
+            for axis in axes
+        ]
+    points = []
+    for mean, *offsets in zip(means, *axes):
+        some = jnp.stack(offsets)
+        points.append(jnp.concatenate([mean[None], mean + some, mean - some]))
+    return [expose(camera, tuple(points)).point]  # pyright: ignore
+
+
+def _imaged(camera: Camera, points) -> Array:
+    """Return where all points of `_sigma_points` are imaged, [R]."""
+    good = jnp.asarray(True)
+    for point in points:
+        good &= camera.lens.depth(point) > 0.5 * camera.near
+        if camera.lens.valid is not everywhere:
+            good &= camera.lens.valid(camera.K, camera.coefficients, point)
+    return good if len(points) > 1 else jnp.all(good, axis=0)
 
 
 def period_of(camera: Camera) -> Array | None:
