@@ -83,9 +83,9 @@ class TrainConfig:
       refine_shutter: optimise the motion of each camera during the exposure of a
         rolling ``shutter``.
       exposure: optimise an affine correction of the colours of each photograph.
-      pose_rate, intrinsics_rate, exposure_rate: learning rates of these corrections.
-        That of distortion is 10 × ``intrinsics_rate``, and of the shutter 10 ×
-        ``pose_rate``.
+      pose_rate, intrinsics_rate, shutter_rate, exposure_rate: learning rates of these
+        corrections; that of distortion is 10 × ``intrinsics_rate``. Those of intrinsics
+        and shutter fall to a hundredth, log-linearly in the second half of the run.
       skip_masked: skip tiles in which all pixels are masked; equal up to rounding.
       prune_invisible: after the last step, remove the Gaussians that no training view
         shows; the views stay bit-equal. (Metrics of the last step count them.)
@@ -124,7 +124,8 @@ class TrainConfig:
     refine_shutter: bool = False
     exposure: bool = False
     pose_rate: float = 1e-5
-    intrinsics_rate: float = 1e-5
+    intrinsics_rate: float = 1e-3
+    shutter_rate: float = 1e-3
     exposure_rate: float = 1e-3
     skip_masked: bool = True
     prune_invisible: bool = True
@@ -151,8 +152,8 @@ class TrainConfig:
         cooling_from = 0 <= rates.cooling_from < 1
         positive_fields = "batch", "sh_every", "initial_count", "max_initial"
         non_negative_fields = (
-            "pose_rate", "intrinsics_rate", "exposure_rate", "dense_count",
-            "every_eval", "every_checkpoint",
+            "pose_rate", "intrinsics_rate", "shutter_rate", "exposure_rate",
+            "dense_count", "every_eval", "every_checkpoint",
         )  # fmt: skip
         rolling = not self.refine_shutter or SHUTTERS[self.shutter].rolling
         opacity, scale = 0 < settings.initial_opacity < 1, settings.initial_scale > 0

@@ -110,6 +110,11 @@ class Setup(NamedTuple):
     schedule: EditSchedule
 
 
+def _cooled(rate: float) -> Rate:
+    """Return a rate that falls to a hundredth, log-linearly in the second half."""
+    return lambda fraction: rate * 0.01 ** jnp.maximum(2 * fraction - 1, 0)
+
+
 def make_setup(
     config: TrainConfig,
     extent: float,
@@ -124,9 +129,9 @@ def make_setup(
     rates: dict[str, Rate] = {
         "turns": config.pose_rate,
         "shifts": config.pose_rate,
-        "intrinsics": config.intrinsics_rate,
-        "distortion": 10 * config.intrinsics_rate,
-        "twists": 10 * config.pose_rate,
+        "intrinsics": _cooled(config.intrinsics_rate),
+        "distortion": _cooled(10 * config.intrinsics_rate),
+        "twists": _cooled(config.shutter_rate),
         "exposures": config.exposure_rate,
     }
     rates |= {f"model.{name}": rate for name, rate in model.rates.items()}

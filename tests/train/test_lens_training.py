@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import pytest
 from training import EXTENT, HEIGHT, RASTER, VIEWS, WIDTH, dataset, true_gaussians
 
 import gsjax
@@ -15,10 +14,7 @@ from gsjax.train.config import TrainConfig
 from gsjax.train.evaluation import evaluate
 from gsjax.train.loop import fit
 
-LENSES = {
-    "opencv": (-0.25, 0.05, 0.0, 0.0),
-    "fisheye": (0.1, 0.0, 0.0, 0.0),
-}
+OPENCV = (-0.25, 0.05, 0.0, 0.0)
 TWIST = np.array([0.0, 0.06, 0.0, 0.0, 0.0, 0.0])
 SHUTTER = "top_to_bottom"
 CONFIG = TrainConfig(
@@ -29,14 +25,14 @@ CONFIG = TrainConfig(
     shutter=SHUTTER,
     refine_intrinsics=True,
     refine_shutter=True,
-    intrinsics_rate=1e-3,
-    pose_rate=2e-4,
+    intrinsics_rate=2e-3,
+    shutter_rate=4e-3,
     raster=RASTER.replace(alpha_min=1e-4),
 )
 
 
 @cache
-def seen_through(lens: str):
+def seen_through_a_lens():
     """Return the dataset and its photographs through a lens, while cameras turn."""
     cameras, images = [], []
     for view in dataset().views:
@@ -45,8 +41,8 @@ def seen_through(lens: str):
             K=view.K,
             width=WIDTH,
             height=HEIGHT,
-            lens=lens,
-            coefficients=LENSES[lens],
+            lens="opencv",
+            coefficients=OPENCV,
         )
         camera = with_shutter(still, SHUTTER, twist=TWIST)
         cameras.append(camera)
@@ -64,9 +60,8 @@ def psnr(found, photos, shutter=SHUTTER):
     return np.mean([view.psnr for view in views])
 
 
-@pytest.mark.parametrize("lens", LENSES)
-def test_evaluation_renders_through_lens_and_shutter(lens):
-    found, photos = seen_through(lens)
+def test_evaluation_renders_through_lens_and_shutter():
+    found, photos = seen_through_a_lens()
     right = psnr(found, photos)
     assert right > 45  # the rounding of photographs to 8 bits
     assert psnr(found, photos, "global") < right - 5
@@ -76,7 +71,7 @@ def test_evaluation_renders_through_lens_and_shutter(lens):
 
 def test_lens_and_shutter_are_recovered():
     """Part of the way, from a pinhole that stands still, in 60 steps."""
-    found, photos = seen_through("opencv")
+    found, photos = seen_through_a_lens()
     views = tuple(replace(view, lens=None, twist=None) for view in found.views)
     given = replace(found, views=views)
     blind = [photo._replace(lens=None) for photo in photos]
@@ -85,6 +80,7 @@ def test_lens_and_shutter_are_recovered():
     refinement = result.state.refinement
     refined = refine_dataset(given, list(range(VIEWS)), refinement, EXTENT, CONFIG)
     assert refined.views[0].lens.coefficients[0] < -0.05
-    assert all(view.twist[1] > 0.02 for view in refined.views)
+    turns = [view.twist[1] for view in refined.views]
+    assert min(turns) > 0.02, turns
     after = refine_photos(blind, given.views, refined.views)
     assert psnr(refined, after) > psnr(given, blind) + 3
