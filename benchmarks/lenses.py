@@ -73,6 +73,7 @@ def row(case: scenes.Case) -> dict:
     cotangent = jax.random.normal(jax.random.key(1), shape)
     functions = {}
     for name, (camera, config) in ways.items():
+        config = gsjax.exact_config(case.gaussians, camera, config)
         for task, program in (("picture", picture), ("gradient", gradient)):
             given = case.gaussians.params, case.gaussians, camera, cotangent
             call = partial(program, *given, config=config)

@@ -115,6 +115,18 @@ def test_unscented(lens, alpha, report):
     assert (off <= 0.05 * np.linalg.norm(truth, axis=(1, 2))).all()
 
 
+def test_a_sigma_point_beside_the_camera_does_not_count():
+    camera = gsjax.make_camera(
+        viewmat=np.eye(4), K=np.diag([40.0, 40, 1]), width=48, height=36
+    )
+    config = gsjax.RasterConfig(projection="unscented")
+    means = np.array([[0.5, 0.1, 1.0], [0.5, 0.1, 1.0]])
+    scales = np.array([[0.1, 0.1, 0.1], [0.1, 0.1, 0.57]])  # √3 × 0.57 = 0.99
+    quats = np.array([[1.0, 0, 0, 0]] * 2)
+    *_, good = unscented(camera, config, means, quats, scales)
+    assert good.tolist() == [True, False]
+
+
 @partial(jax.jit, compiler_options=QUICK)
 def exposed(camera, points):
     return jnp.stack(camera.project(expose(camera, tuple(points.T)).point), -1)

@@ -21,9 +21,10 @@ from gsjax.math.numerics import materialize
 from gsjax.raster.primitives.ewa import is_cheap, shortened
 from gsjax.raster.types import Array, RasterConfig
 
-# Sigma points within so many image sizes of the mean are used. A lens may image others
-# at 10⁵ px, where rounding of the point in float32 moves the splat in the image.
-_FARTHEST = 100
+# How far a sigma point may be from the mean, in width + height of the image. Farther
+# ones lie next to the plane of the camera, or where the polynomial of a lens is steep:
+# the transform would smear the splat over the whole image.
+_FARTHEST = 1
 
 
 def unscented_image(camera: Camera, config: RasterConfig, means, quat, scales):
