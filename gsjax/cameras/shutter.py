@@ -290,7 +290,7 @@ def _viewmat(camera: Camera, at: Moment):
     )
 
 
-def image_rows(camera: Camera, exposure: Exposure, jacobian):
+def image_rows(camera: Camera, exposure: Exposure, jacobian) -> Any:
     """Return the rows d(u, v) / d world of the image of a point, [3] each.
 
     Under a rolling shutter a moved point is exposed at another time:
@@ -301,7 +301,7 @@ def image_rows(camera: Camera, exposure: Exposure, jacobian):
       exposure: from `expose`.
       jacobian: rows (du/d·, dv/d·) of the lens at the point.
     """
-    rows = [
+    rows: Any = [
         [
             sum(row[i] * entry(exposure.viewmat, i, j) for i in range(3))
             for j in range(3)
