@@ -158,7 +158,7 @@ def expose(camera: Camera, point: Point) -> Exposure:
 
 
 def moment_at(camera: Camera, time: Array) -> Moment:
-    """Return the turn of a single camera at a time, at most 1.5 or small turns."""
+    """Return the turn of a single camera at a time, of magnitude 1.5 at most."""
     square = sum(camera.twist[i] * camera.twist[i] for i in range(3))
     x = time * time * square
     sine, cosine = lax.cond(square < _SMALL_TURN, _series, _closed, x)

@@ -34,7 +34,14 @@ from gsjax.train.models import (
     SlotParams,
     init_model,
 )
-from gsjax.train.optimiser import Rate, gaussian_rates, make_optimiser, scale_by_rate
+from gsjax.train.optimiser import (
+    Rate,
+    Rates,
+    cooling_factor,
+    gaussian_rates,
+    make_optimiser,
+    scale_by_rate,
+)
 
 Array = jax.Array
 Tree = TypeVar("Tree")
@@ -110,9 +117,12 @@ class Setup(NamedTuple):
     schedule: EditSchedule
 
 
+# Corrections of cameras slow down to a hundredth in the second half of a run.
+_CAMERA_RATES = Rates(cooling=0.01, cooling_from=0.5)
+
+
 def _cooled(rate: float) -> Rate:
-    """Return a rate that falls to a hundredth, log-linearly in the second half."""
-    return lambda fraction: rate * 0.01 ** jnp.maximum(2 * fraction - 1, 0)
+    return lambda fraction: rate * cooling_factor(_CAMERA_RATES, fraction)
 
 
 def make_setup(

@@ -224,3 +224,17 @@ def test_dataset_files_round_trip(tmp_path):
     with pytest.raises(gsjax.InputError, match="exists"):
         raycaster.write_demo_dataset(tmp_path / "set", settings)
     raycaster.write_demo_dataset(tmp_path / "set", settings, overwrite=True)
+
+
+@pytest.mark.parametrize("turn", [0.05, 0.6, 0.7, 3.0])  # a series up to 2 / 3
+def test_a_camera_turns_by_its_twist(turn):
+    from scipy.spatial.transform import Rotation
+
+    twist = np.array([0.6, -0.64, 0.48, 0, 0, 0]) * turn
+    camera = gsjax.make_camera(viewmat=np.eye(4), K=np.eye(3), width=8, height=8)
+    camera = with_shutter(camera, "top_to_bottom", twist=twist)
+    point = np.array([0.3, -0.2, 0.5])
+    for time in (-0.5, 0.4, 1.5):
+        seen = exposed_at(camera, tuple(point), moment_at(camera, jnp.float32(time)))
+        wanted = Rotation.from_rotvec(time * twist[:3]).apply(point)
+        np.testing.assert_allclose(seen, wanted, atol=1e-6)
