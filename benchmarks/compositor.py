@@ -27,7 +27,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import gsjax
 from gsjax.raster.compositing import fused, schedules
-from gsjax.raster.compositing.alpha import alphas, pixel_centres
+from gsjax.raster.compositing.alpha import evaluate, pixel_centres
 from gsjax.raster.compositing.blending import running_product, splats_of, tables_of
 from gsjax.raster.compositing.chunked import CHUNKED, take_rows
 from gsjax.raster.compositing.compositor import composite
@@ -139,7 +139,7 @@ def count_evaluations(made: Prepared) -> tuple[float, float]:
             carried = jnp.where(first, 1, carried)
             go = live & jnp.any(carried > config.transmittance_min, 1, keepdims=True)
             go = (go if singly else jnp.any(go)) & jnp.ones((group, 1), bool)
-            alpha = alphas(splats_of(splats, corner), pixels, config)
+            alpha = evaluate(splats_of(splats, corner), pixels, config).alpha
             total, before = running_product(alpha)
             reached = carried[:, None] * before
             if config.stop_rule == "before":

@@ -57,6 +57,7 @@ STEREOGRAPHIC = Lens(
 # --8<-- [end:lens]
 
 # --8<-- [start:primitive]
+from gsjax.raster.forms import AtPixel, Form, Parts, Plane
 from gsjax.raster.primitives.ellipsoid import ELLIPSOID
 
 _EDGE = 8.0  # Q at which a bump ends
@@ -74,12 +75,18 @@ def _bump_project(inputs, config, order, count):
     return out._replace(footprint=out.footprint._replace(reach=reach))
 
 
-def _bump_alpha(shape, dx, dy):
-    """Return opacity · (1 − Q / 8)², which ends smoothly at the edge."""
-    inv_sx, slope, inv_sy, opacity = shape
-    y1, y2 = inv_sx * dx, inv_sy * (dy - slope * dx)
-    inside = jnp.maximum(1 - (y1 * y1 + y2 * y2) / _EDGE, 0)
-    return opacity * inside * inside
+def _bump_parts(shape):
+    """Return y1 and y2, linear in the offset of a pixel from the centre."""
+    inv_sx, slope, inv_sy = shape
+    return Parts((Plane(0.0, inv_sx, 0.0), Plane(0.0, -inv_sy * slope, inv_sy)))
+
+
+def _bump_evaluate(values, depth, limits, once):
+    """Return the logarithm of (1 − Q / 8)², which ends smoothly at the edge."""
+    del depth, limits, once
+    y1, y2 = values
+    inside = 1 - (y1 * y1 + y2 * y2) / _EDGE
+    return AtPixel(2 * jnp.log(jnp.where(inside > 1e-9, inside, 1e-9)))
 
 
 BUMP = ELLIPSOID._replace(
@@ -87,7 +94,7 @@ BUMP = ELLIPSOID._replace(
     bounds=_bump_bounds,
     project=_bump_project,
     occluders=None,
-    alpha=_bump_alpha,
+    form=Form(_bump_parts, _bump_evaluate),
 )
 # gsjax.RasterConfig(primitive=BUMP)
 # --8<-- [end:primitive]
@@ -259,8 +266,6 @@ def test_lens():
 def test_primitive():
     gaussians, camera = scene(), camera_of(19, 13, focal=(20.0, 21.0))
     config = training.SMOOTH.replace(primitive=BUMP)
-    with pytest.raises(gsjax.InputError, match="absgrad"):
-        config.replace(absgrad=True)
     bumps = gsjax.render(gaussians, camera, config)
     ellipsoids = gsjax.render(gaussians, camera, training.SMOOTH)
     assert not bumps.overflowed

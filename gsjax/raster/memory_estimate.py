@@ -10,6 +10,7 @@ import jax
 from gsjax.raster.compositing.compositor import choose, choose_for_gradient
 from gsjax.raster.compositing.types import Task
 from gsjax.raster.lists import binning
+from gsjax.raster.primitives.table import with_primitive
 from gsjax.raster.tile_render import default_pair_capacity
 from gsjax.raster.types import RasterConfig
 from gsjax.runtime.devices import platform_name
@@ -57,6 +58,7 @@ def render_estimate(
     capacity = config.pair_capacity or default_pair_capacity(seen, grid)
     share = -(-capacity // devices)
     numbers = 11 + 3 * bases
+    config = with_primitive(config)
     task = Task(platform_name(), 3, width, grid, config)
     compositor = choose_for_gradient(task) if gradients else choose(task)
     blended, kept = compositor.memory(share, task, gradients)

@@ -13,6 +13,7 @@ from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.raster.argument_checks import batched_inputs, check_types
 from gsjax.raster.lists.counting import total_count
+from gsjax.raster.primitives.table import with_primitive
 from gsjax.raster.render_camera import finish, mark_overflow, render_camera
 from gsjax.raster.types import Array, Demand, Inputs, RasterConfig, Render
 from gsjax.runtime.devices import platform_name
@@ -47,7 +48,8 @@ def render(
       mask: [H, W] bool, or [B, H, W] for a batch: the pixels to draw. Tiles without any
         are skipped; other pixels, and gradients by them, are undefined. `Demand.pairs`
         leaves out tiles before the first and after the last masked tile of a row.
-      features: [N, C] composited in place of the SH colour.
+      features: [N, C] composited in place of the SH colour; or beside it with
+        "features" in ``config.outputs``.
       probe: [N, 2], or [B, N, 2] for a batch, zeros: added to the projected means in
         px. Its gradient is the screen-space statistic of densification; with
         ``config.absgrad``, the sum over pixels of the absolute per-pixel gradient.
@@ -60,8 +62,8 @@ def render(
       `Render.check` raises an error in that case.
 
     Raises:
-      InputError: if an argument is of the wrong class or shape, a number is complex, or
-        there is no camera or no slot.
+      InputError: if an argument is of the wrong class or shape, a number is complex,
+        there is no camera or no slot, or the lens does not suit the primitive.
     """
     check_types(gaussians, camera, config)
     if config.absgrad and probe is None:
@@ -72,7 +74,10 @@ def render(
     background, features, probe, mask, alpha_min = (
         None if value is None else jnp.asarray(value) for value in values
     )
+    if "features" in config.outputs and features is None:
+        raise InputError("features: expected [N, C] for that output, got None")
     inputs = Inputs(gaussians, camera, features, probe, mask, alpha_min)
+    config = with_primitive(config)
     return _render_compiled(inputs, background, config, platform_name())
 
 
@@ -97,9 +102,7 @@ def _render(
         sums, radii, demands, flags = jax.tree.map(lambda a: a[None], out)
     else:
         sums, radii, demands, flags = lax.map(render_one, by_camera)
-    features = inputs.features
-    colors = 3 if features is None else features.shape[1]
-    images = finish(sums, config, background, count, colors)
+    images = finish(sums, inputs, config, background)
     images = mark_overflow(images, flags, config)
     if single:
         images = {name: image[0] for name, image in images.items()}
@@ -109,6 +112,9 @@ def _render(
         alpha=images.get("alpha"),
         depth=images.get("depth"),
         median_depth=images.get("median_depth"),
+        features=images.get("features"),
+        normals=images.get("normals"),
+        distortion=images.get("distortion"),
         radii=radii,
         demand=Demand(
             visible=jnp.max(demands.visible),

@@ -3,6 +3,8 @@
 Axis legend: N Gaussians (capacity), H W image, B cameras, C channels.
 """
 
+from itertools import accumulate
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -12,7 +14,7 @@ from gsjax.cameras.lens import copies
 from gsjax.errors import InputError
 from gsjax.math.numerics import safe_divide
 from gsjax.raster.argument_checks import check_real
-from gsjax.raster.compositing.types import Images
+from gsjax.raster.compositing.types import Images, summed_channels
 from gsjax.raster.lists import binning, occlusion_culling
 from gsjax.raster.lists.blocks import by_blocks
 from gsjax.raster.lists.depth_order import depth_order
@@ -152,37 +154,63 @@ def visible_order(
 
 
 def finish(
-    sums: Images, config: RasterConfig, background, cameras: int, colors: int
+    sums: Images, inputs: Inputs, config: RasterConfig, background: Array | None
 ) -> Images:
     """Add the background and normalise: sums [B, H, W, C] to named images."""
-    total = sums["sums"]
-    alpha = total[..., -1]
+    features = 0 if inputs.features is None else inputs.features.shape[1]
+    shown = features if inputs.replaces_colors(config) else 3
+    behind = features if "features" in config.outputs else 0
+    colors = shown + behind if behind and "rgb" in config.outputs else shown
+    parts = _parts(sums["sums"], summed_channels(config, colors))
+    alpha = parts["ones"][..., 0]
     out = {}
     if "rgb" in config.outputs:
-        rgb = total[..., :colors]
-        if background is not None:
-            check_real("background", background)
-            background = jnp.asarray(background, rgb.dtype)
-            if background.shape not in ((colors,), (cameras, colors)):
-                raise InputError(
-                    f"background: expected shape ({colors},) or ({cameras}, {colors}), "
-                    f"got {background.shape}"
-                )
-            # A component that is not finite would show through the scene.
-            background = jnp.where(jnp.abs(background) < COLOR_LIMIT, background, 0)
-            background = jnp.broadcast_to(background, (cameras, colors))
-            # As a product: its transpose is one too, not a sum over few channels.
-            rgb = rgb + jnp.einsum(
-                "bhw,bc->bhwc", 1 - alpha, background, precision="highest"
-            )
-        out["rgb"] = rgb
+        out["rgb"] = _over(parts["colors"][..., :shown], alpha, background)
+    if behind:
+        out["features"] = parts["colors"][..., -behind:]
+    if "normals" in config.outputs:
+        out["normals"] = parts["normals"]
     if "alpha" in config.outputs:
         out["alpha"] = alpha
     if "depth" in config.outputs:
-        out["depth"] = safe_divide(total[..., -2], alpha, alpha > 1e-10)
+        depth = sums["depth"] if "depth" in sums else parts["depth"][..., 0]
+        out["depth"] = safe_divide(depth, alpha, alpha > 1e-10)
     if "median_depth" in config.outputs:
         out["median_depth"] = sums["median"]
+    if "distortion" in config.outputs:
+        if "disparity" in sums:
+            mean, square = sums["disparity"], sums["square"]
+        else:
+            mean, square = jnp.moveaxis(parts["disparities"], -1, 0)
+        out["distortion"] = alpha * square - mean * mean
     return out
+
+
+def _parts(total: Array, channels: dict[str, int]) -> Images:
+    """Return the channels [..., C] by name."""
+    ends = list(accumulate(channels.values()))
+    starts = [end - count for end, count in zip(ends, channels.values())]
+    spans = zip(channels, starts, ends)
+    return {name: total[..., start:end] for name, start, end in spans}
+
+
+def _over(rgb: Array, alpha: Array, background: Array | None) -> Array:
+    """Return colours [B, H, W, C] over the background."""
+    if background is None:
+        return rgb
+    cameras, *_, colors = rgb.shape
+    check_real("background", background)
+    background = jnp.asarray(background, rgb.dtype)
+    if background.shape not in ((colors,), (cameras, colors)):
+        raise InputError(
+            f"background: expected shape ({colors},) or ({cameras}, {colors}), "
+            f"got {background.shape}"
+        )
+    # A component that is not finite would show through the scene.
+    background = jnp.where(jnp.abs(background) < COLOR_LIMIT, background, 0)
+    background = jnp.broadcast_to(background, (cameras, colors))
+    # As a product: its transpose is one too, not a sum over few channels.
+    return rgb + jnp.einsum("bhw,bc->bhwc", 1 - alpha, background, precision="highest")
 
 
 def mark_overflow(images: Images, overflowed: Array, config: RasterConfig) -> Images:

@@ -9,7 +9,7 @@ import numpy as np
 from gsjax.gaussians import make_gaussians
 from gsjax.math.numerics import in_float64
 from gsjax.math.sh import dc_to_rgb
-from gsjax.raster.compositing.alpha import alphas
+from gsjax.raster.compositing.alpha import evaluate
 from gsjax.raster.compositing.blending import running_product, transmittance
 from gsjax.raster.exact import render_exact
 from gsjax.raster.lists.counting import total_count
@@ -84,7 +84,7 @@ def cap_tie(_full: bool) -> Measurement:
     def alpha(opacity):
         half, zero = jnp.full((1, 1), 0.5), jnp.zeros((1, 1))
         splats = (half, zero, half, opacity.reshape(1, 1), half, half)
-        return alphas(splats, pixel, COMPAT)[0, 0, 0]
+        return evaluate(splats, pixel, COMPAT).alpha[0, 0, 0]
 
     cap = np.float32(COMPAT.alpha_max)
     below = np.nextafter(cap, np.float32(0))

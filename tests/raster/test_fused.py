@@ -15,8 +15,14 @@ from pictures import assert_close
 from gsjax import RasterConfig
 from gsjax.raster.compositing import chunked, fused, fused_vjp
 from gsjax.raster.compositing.blending import running_product
-from gsjax.raster.compositing.types import Task, Tiles
+from gsjax.raster.compositing.types import (
+    Task,
+    Tiles,
+    pixel_channels,
+    summed_channels,
+)
 from gsjax.raster.lists.binning import Lists, corners, make_grid
+from gsjax.raster.primitives.surfel import SURFEL
 from gsjax.raster.types import Channels, Splat
 from gsjax.runtime import loops
 
@@ -140,7 +146,7 @@ def test_the_reverse_pass_is_the_transpose_of_the_chunks(stop, dtype, bar, repor
             return chunked.composite_steps(given, steps)["sums"]
 
         images, residuals = fused.composite_fused(tiles, task, keep=True)
-        given = tiles, residuals, cotangent, task
+        given = tiles, residuals, {"sums": cotangent}, task
         found = {k: fused_vjp.backward(*given, frozenset(v)) for k, v in KINDS.items()}
         wanted, transpose = jax.vjp(sums, tiles.splat, tiles.channels)
         return images["sums"], wanted, found, transpose(cotangent)
@@ -166,7 +172,7 @@ def test_lists_that_did_not_fit_are_not_read():
     @jax.jit
     def both(tiles):
         images, residuals = fused.composite_fused(tiles, task, keep=True)
-        ones = jnp.ones_like(images["sums"])
+        ones = jax.tree.map(jnp.ones_like, {"sums": images["sums"]})
         back = fused_vjp.backward(tiles, residuals, ones, task)
         return images["sums"], residuals.blocks, back
 
@@ -174,14 +180,23 @@ def test_lists_that_did_not_fit_are_not_read():
         assert not np.asarray(array).any()
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+GEOMETRY = ("rgb", "normals", "depth", "distortion")
+
+
+@pytest.mark.parametrize(
+    ("dtype", "primitive"),
+    [("float32", None), ("float64", None), ("float32", SURFEL)],
+)
 @pytest.mark.parametrize("reverse", [False, True])
-def test_one_kernel_wherever_it_suits(reverse, dtype):
+def test_one_kernel_wherever_it_suits(reverse, dtype, primitive):
     """With the most colours and with the largest tiles that suit."""
     one = partial(jax.ShapeDtypeStruct, dtype=dtype)
     whole = partial(jax.ShapeDtypeStruct, dtype=np.int32)
     suits = fused_vjp.suits if reverse else fused.suits
     config = RasterConfig() if reverse else RasterConfig(outputs=ALL)
+    numbers = 4
+    if primitive is not None:
+        config, numbers = RasterConfig(primitive=primitive, outputs=GEOMETRY), 8
     names = {"ranks": whole((9000,)), "start": whole((64,)), "length": whole((64,))}
     names["fit"] = jax.ShapeDtypeStruct((), np.bool_)
 
@@ -195,15 +210,21 @@ def test_one_kernel_wherever_it_suits(reverse, dtype):
     for task in (task_with(8, colors[-1]), task_with(sides[-1], COLORS)):
         row, size = one((5000,)), task.grid.tile**2
         tiles = Tiles(
-            Splat(row, row, (row,) * 4),
-            Channels(one((task.colors, 5000)), row),
+            Splat(row, row, (row,) * numbers),
+            Channels(
+                colors=one((task.colors, 5000)),
+                depth=row,
+                normals=None if primitive is None else one((3, 5000)),
+            ),
             Lists(**{name: names.get(name, whole(())) for name in Lists._fields}),
             whole(()),
         )
         kept = fused.Residuals(
             one((9000 // fused.BLOCK + 64, size)), whole((64,)), whole((64,))
         )
-        cotangent = one((64, task.colors + 2, size))
+        summed = sum(summed_channels(config, task.colors).values())
+        cotangent = {"sums": one((64, summed, size))}
+        cotangent |= dict.fromkeys(pixel_channels(config), one((64, size)))
 
         def run(tiles, kept, cotangent, task=task):
             if reverse:

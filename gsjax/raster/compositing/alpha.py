@@ -8,6 +8,7 @@ six moments per Gaussian, by one matrix product [G K, P] × [P, 6].
 """
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,8 @@ import numpy as np
 from jax import lax
 
 from gsjax.math.numerics import exp_negative
+from gsjax.raster.compositing.types import form_of
+from gsjax.raster.forms import AtPixel, Form, Plane, unmarked, values_at
 from gsjax.raster.types import Array, RasterConfig
 
 _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
@@ -30,29 +33,89 @@ def pixel_centres(tile: int, dtype) -> np.ndarray:
     return np.stack([x.ravel(), y.ravel()]).astype(dtype)
 
 
-def alphas(
+class Evaluated(NamedTuple):
+    """Splats at the pixels of their tiles, [G, K, P] each.
+
+    Attributes:
+      alpha: α after its limits.
+      depth, disparity: of the point that a pixel shows, see `AtPixel`; None without a
+        form.
+    """
+
+    alpha: Array
+    depth: Array | None = None
+    disparity: Array | None = None
+
+
+def evaluate(
     splats: tuple[Array, ...],
     pixels: np.ndarray,
     config: RasterConfig,
     alpha_min: Array | None = None,
-) -> Array:
-    """Return α [G, K, P] of Gaussians at the pixels of their tiles.
+) -> Evaluated:
+    """Return Gaussians at the pixels of their tiles.
 
     Args:
       splats: [G, K] each: the numbers of `Splat.shape`, then the centre's x, y relative
         to the corner of the tile.
       pixels: [2, P] x and y, relative to the corner as well.
-      config: primitive, alpha_max and alpha_min are used.
+      config: primitive, ray_depth, alpha_max and alpha_min are used.
       alpha_min: [] in place of that of ``config``, or None.
     """
-    primitive = config.primitive
-    if primitive is not None and primitive.alpha is not None:
-        *shape, x, y = (value[..., None] for value in splats)
-        raw = primitive.alpha(tuple(shape), pixels[0] - x, pixels[1] - y)
-        return _limited(raw, config, alpha_min)
+    form = form_of(config)
+    if form is not None:
+        at = _at_pixels(splats, pixels, form, config.tile_size / 2)
+        raw = splats[-3][..., None] * exp_negative(at.power)
+        return Evaluated(_limited(raw, config, alpha_min), at.depth, at.disparity)
     if alpha_min is not None:
-        return _limited(_gaussian(splats, pixels), config, alpha_min)
-    return _gaussian_alphas(splats, pixels, config)
+        return Evaluated(_limited(_gaussian(splats, pixels), config, alpha_min))
+    return Evaluated(_gaussian_alphas(splats, pixels, config))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1, 2, 3))
+def _at_pixels(
+    splats: tuple[Array, ...], pixels: np.ndarray, form: Form, half: float
+) -> AtPixel:
+    """Return a form at pixels; ``half`` is half the side of a tile."""
+    del half
+    *shape, _, x, y = (value[..., None] for value in splats)
+    parts = form.parts(tuple(shape))
+    values = values_at(parts, pixels[0] - x, pixels[1] - y)
+    return form.evaluate(values, parts.depth, parts.limits, unmarked)
+
+
+@_at_pixels.defjvp
+def _at_pixels_jvp(pixels, form, half, primals, tangents):
+    """Differentiate the planes by one matrix product each, [G K, 3] × [3, P]."""
+    x, y = pixels - half
+    monomials = np.stack([np.ones_like(x), x, y])
+
+    def about_middle(*splats):
+        *shape, _, x, y = splats
+        parts = form.parts(tuple(shape))
+        one, none = jnp.ones_like(x), jnp.zeros_like(x)
+        rows = [
+            jnp.stack([p.value(half - x, half - y), *_slopes(p, one, none)], -1)
+            for p in parts.planes
+        ]
+        return rows, none if parts.depth is None else parts.depth
+
+    _, (rows, depth_rate) = jax.jvp(about_middle, primals[0], tangents[0])
+    rates = tuple(_einsum("gkm,mp->gkp", row, monomials) for row in rows)
+    *shape, _, x, y = (value[..., None] for value in primals[0])
+    parts = form.parts(tuple(shape))
+    depth = 0 * x if parts.depth is None else parts.depth
+    given = values_at(parts, pixels[0] - x, pixels[1] - y), depth
+
+    def evaluated(values, depth):
+        return form.evaluate(values, depth, parts.limits, unmarked)
+
+    return jax.jvp(evaluated, given, (rates, depth_rate[..., None]))
+
+
+def _slopes(plane: Plane, one: Array, none: Array) -> tuple[Array, Array]:
+    """Return the derivatives of a plane, as arrays."""
+    return one * plane.by_x + none, one * plane.by_y + none
 
 
 def _limited(raw: Array, config: RasterConfig, alpha_min: Array | None) -> Array:
@@ -136,10 +199,29 @@ def collect_absolute(
 
 def _slopes_by_mean(alpha, splats, pixels, config) -> tuple[Array, Array]:
     """Return ∂α/∂x and ∂α/∂y [G, K, P] by the centre's x and y."""
+    form = form_of(config)
+    if form is not None:
+        return _slopes_of_form(form, alpha, splats, pixels, config)
     inv_sx, slope, inv_sy, *_ = (value[..., None] for value in splats)
     y1, y2 = _offsets(splats, pixels)
     free = jnp.where(alpha < config.alpha_max, alpha, 0)
     return free * (inv_sx * y1 - inv_sy * slope * y2), free * inv_sy * y2
+
+
+def _slopes_of_form(form: Form, alpha, splats, pixels, config):
+    *shape, _, x, y = (value[..., None] for value in splats)
+
+    parts = form.parts(tuple(shape))
+
+    def power(dx, dy):
+        values = values_at(parts, dx, dy)
+        return form.evaluate(values, parts.depth, parts.limits, unmarked).power
+
+    at = pixels[0] - x, pixels[1] - y
+    one, none = (jnp.full_like(at[0], value) for value in (1, 0))
+    free = jnp.where(alpha < config.alpha_max, alpha, 0)
+    ways = (one, none), (none, one)
+    return tuple(-free * jax.jvp(power, at, way)[1] for way in ways)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3, 4))

@@ -18,7 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from gsjax.raster.compositing.alpha import alphas, collect_absolute
+from gsjax.math.numerics import safe_divide
+from gsjax.raster.compositing.alpha import Evaluated, collect_absolute, evaluate
+from gsjax.raster.compositing.types import (
+    has_ray_depth,
+    pixel_channels,
+    summed_channels,
+)
+from gsjax.raster.forms import AtPixel
 from gsjax.raster.types import Array, Channels, RasterConfig, Splat
 
 _einsum = partial(jnp.einsum, precision=lax.Precision.HIGHEST)
@@ -101,7 +108,7 @@ class Parts(NamedTuple):
     Attributes:
       splats: [..., S] u, v and the numbers of `Splat.shape`.
       channels: [..., C] values that are summed.
-      depth: [..., 1], or None if no median is asked for.
+      depth: [..., 1], or None unless a median of it is asked for.
       probe: [..., 2] zeros that collect the absolute gradient, or None.
     """
 
@@ -127,15 +134,20 @@ def columns_of(
     splat: Splat, channels: Channels, config: RasterConfig
 ) -> dict[str, list[Array]]:
     """Return the columns [R] of each of `Parts` that is needed."""
-    outputs = config.outputs
-    summed = list(channels.colors) if "rgb" in outputs else []
-    summed += [channels.depth] if "depth" in outputs else []
-    columns = {
-        "splats": [splat.u, splat.v, *splat.shape],
-        "channels": [*summed, jnp.ones_like(splat.u)],
-    }
-    if "median_depth" in outputs:
-        columns["depth"] = [channels.depth]
+    parts, depth = [], channels.depth
+    for name in summed_channels(config, len(channels.colors)):
+        if name == "disparities":
+            there = depth != 0
+            disparity = safe_divide(jnp.ones_like(depth), depth, there)
+            parts += [disparity, disparity * disparity]
+        elif name == "ones":
+            parts.append(jnp.ones_like(splat.u))
+        else:
+            values = getattr(channels, name)
+            parts += [values] if values.ndim == 1 else list(values)
+    columns = {"splats": [splat.u, splat.v, *splat.shape], "channels": parts}
+    if "median_depth" in config.outputs and not has_ray_depth(config):
+        columns["depth"] = [depth]
     if channels.probe is not None:
         columns["probe"] = list(channels.probe)
     return columns
@@ -193,42 +205,55 @@ def blend_chunk(
 
     Returns:
       The transmittance behind the chunk as if no pixel stopped (it never rises again,
-      so it still tells which pixels have stopped), and the sums to add: "sums" [G, C,
-      P], "median" [G, P] if asked for.
+      so it still tells which pixels have stopped), and the images to add, see
+      `Compositor`.
     """
-    alpha = alphas_of(chunk, pixels, config, alpha_min)
-    total, out = sums_behind(carried, alpha, chunk.parts, config)
+    at = evaluated(chunk, pixels, config, alpha_min)
+    total, out = sums_behind(carried, at, chunk.parts, config)
     # ``carried`` is a factor outside: its derivative then needs no sum over Gaussians.
-    return carried * total, {**out, "sums": carried[:, None] * out["sums"]}
+    return carried * total, times(carried, out)
 
 
-def alphas_of(
+def times(factor: Array, images: dict[str, Array]) -> dict[str, Array]:
+    """Return images times a factor [G, P], except the median."""
+
+    def one(name: str, image: Array) -> Array:
+        if name == "median":
+            return image
+        return (factor[:, None] if name == "sums" else factor) * image
+
+    return {name: one(name, image) for name, image in images.items()}
+
+
+def evaluated(
     chunk: Chunk,
     pixels: np.ndarray,
     config: RasterConfig,
     alpha_min: Array | None = None,
-) -> Array:
-    """Return α [G, K, P] of a chunk; see `alphas`."""
+) -> Evaluated:
+    """Return a chunk at the pixels of its tiles; see `evaluate`."""
     splats = splats_of(chunk.parts.splats, chunk.corner)
-    alpha = alphas(splats, pixels, config, alpha_min)
-    if chunk.parts.probe is not None:
-        alpha = collect_absolute(alpha, splats, pixels, chunk.parts.probe, config)
-    return alpha
+    at = evaluate(splats, pixels, config, alpha_min)
+    if chunk.parts.probe is None:
+        return at
+    probe = chunk.parts.probe
+    return at._replace(alpha=collect_absolute(at.alpha, splats, pixels, probe, config))
 
 
 def sums_behind(
     carried: Array,
-    alpha: Array,
+    at: Evaluated,
     parts: Parts,
     config: RasterConfig,
     left: Array | None = None,
 ) -> tuple[Array, dict[str, Array]]:
-    """Return `blend_chunk` for known ``alpha`` [G, K, P], without factor ``carried``.
+    """Return `blend_chunk` for known α [G, K, P], without factor ``carried``.
 
     ``carried`` [G, P] only decides which pixels stop. ``left`` [G, P] is the
     transmittance that the chunk behind receives; None for the product.
     """
     # A limit of 1 needs the rule that does not divide by 1 − α.
+    alpha = at.alpha
     apart = np.asarray(config.alpha_max, alpha.dtype) < 1
     product = transmittance if apart else running_product
     total, before = product(alpha)
@@ -239,12 +264,24 @@ def sums_behind(
     ) > config.transmittance_min
     weight = jnp.where(blended, alpha * before, 0)
     out = {"sums": channel_sums(weight, parts.channels)}
-    if parts.depth is not None:
+    for name in pixel_channels(config):
+        out[name] = jnp.sum(weight * pixel_value(name, at), axis=1)
+    if "median_depth" in config.outputs:
         # The last Gaussian that more than half reaches, if less is left behind all. It
         # is found by counting: rounding may let T rise from one to the next.
         number = jnp.sum(reached > 0.5, axis=1, dtype=jnp.int32, keepdims=True)
         last = lax.broadcasted_iota(jnp.int32, reached.shape, 1) == number - 1
         left = carried * total if left is None else left
         half = last & (left <= 0.5)[:, None] & blended
-        out["median"] = jnp.sum(jnp.where(half, parts.depth, 0), axis=1)
+        depth = pixel_value("depth", at) if parts.depth is None else parts.depth
+        out["median"] = jnp.sum(jnp.where(half, depth, 0), axis=1)
     return total, out
+
+
+def pixel_value(name: str, at: Evaluated | AtPixel) -> Array:
+    """Return the value of a channel of `pixel_channels`."""
+    if name == "depth":
+        assert at.depth is not None
+        return at.depth
+    assert at.disparity is not None
+    return at.disparity * at.disparity if name == "square" else at.disparity

@@ -28,10 +28,16 @@ from gsjax.raster.compositing.blending import (
     tables_of,
 )
 from gsjax.raster.compositing.schedules import Schedule, Work
-from gsjax.raster.compositing.types import Compositor, Images, Task, Tiles
+from gsjax.raster.compositing.types import (
+    Compositor,
+    Images,
+    Task,
+    Tiles,
+    single_images,
+)
 from gsjax.raster.lists.binning import Grid, Lists, corners
 from gsjax.raster.size_buckets import run_at_bucket
-from gsjax.raster.types import Array
+from gsjax.raster.types import Array, RasterConfig
 from gsjax.raster.vmap_branching import any_in_batch
 
 T = TypeVar("T")
@@ -77,7 +83,7 @@ def composite_chunks(tiles: Tiles, task: Task) -> Images:
 
     pixels = pixel_centres(grid.tile, rows.dtype)
     group = schedule.tiles.shape[1]
-    nothing = _nothing(jax.eval_shape(parts_of, rows), group, pixels.shape[1])
+    nothing = _nothing(jax.eval_shape(parts_of, rows), group, pixels.shape[1], config)
 
     def of_block(block, images):
         tile = schedule.tiles[block]
@@ -137,7 +143,7 @@ def _scan(
     dtype = tables.splats.dtype
     pixels = pixel_centres(grid.tile, dtype)
     blocks, group = schedule.tiles.shape
-    nothing = _nothing(tables, group, pixels.shape[1])
+    nothing = _nothing(tables, group, pixels.shape[1], config)
     # Ahead of the loop, so that the transpose is one scatter-add and not one a step.
     corner = corners(schedule.tiles[work.block], grid, tiles.device, dtype)
     chunks = Chunk(take_rows(tables, work.ranks), corner)
@@ -183,12 +189,12 @@ def take_rows(rows: T, index: Array) -> T:
     return jax.tree.map(lambda a: a.at[index].get(mode="promise_in_bounds"), rows)
 
 
-def _nothing(tables: Parts, group: int, pixels: int) -> Images:
+def _nothing(tables: Parts, group: int, pixels: int, config: RasterConfig) -> Images:
     """Return what a skipped chunk adds."""
     dtype = tables.channels.dtype
     nothing = {"sums": jnp.zeros((group, tables.channels.shape[1], pixels), dtype)}
-    if tables.depth is not None:
-        nothing["median"] = jnp.zeros((group, pixels), dtype)
+    for name in single_images(config):
+        nothing[name] = jnp.zeros((group, pixels), dtype)
     return nothing
 
 

@@ -88,6 +88,7 @@ def _composite_jvp(task, primals, tangents):
     if not own:
         return jvp_of_active(stepped, leaves, slopes, SymbolicZero)
     images, residuals = _with_residuals(tiles, task)
+    names = tuple(images)
     active = [i for i, s in enumerate(slopes) if not isinstance(s, SymbolicZero)]
     count, kinds = len(leaves), _kinds(tiles, active)
     residuals, of_residuals = jax.tree.flatten(residuals)
@@ -95,17 +96,19 @@ def _composite_jvp(task, primals, tangents):
     def forward(*values):
         slopes = dict(zip(active, values[count + len(residuals) :]))
         slopes = [slopes.get(i) for i in range(count)]
-        return [jvp_of_active(stepped, values[:count], slopes, type(None))[1]["sums"]]
+        rates = jvp_of_active(stepped, values[:count], slopes, type(None))[1]
+        return [rates[name] for name in names]
 
     def transpose(*values):
         tiles = jax.tree.unflatten(tree, values[:count])
-        residuals = jax.tree.unflatten(of_residuals, values[count:-1])
-        back = _backward(tiles, residuals, values[-1], task, kinds)
+        residuals = jax.tree.unflatten(of_residuals, values[count : -len(names)])
+        cotangents = dict(zip(names, values[-len(names) :]))
+        back = _backward(tiles, residuals, cotangents, task, kinds)
         return [jax.tree.leaves(back)[i] for i in active]
 
-    slopes, like = [slopes[i] for i in active], [images["sums"]]
-    (sums,) = custom_transpose(forward, transpose, (*leaves, *residuals), slopes, like)
-    return images, {"sums": sums}
+    slopes, like = [slopes[i] for i in active], [images[name] for name in names]
+    rates = custom_transpose(forward, transpose, (*leaves, *residuals), slopes, like)
+    return images, dict(zip(names, rates))
 
 
 def _automatic(task: Task) -> Callable[[Tiles], Images]:
@@ -144,31 +147,31 @@ def _with_residuals_jvp(task, primals, tangents):
 
 @partial(jax.custom_jvp, nondiff_argnums=(3, 4))
 def _backward(
-    tiles: Tiles, residuals: Any, cotangent: Array, task: Task, kinds: frozenset[str]
+    tiles: Tiles, residuals: Any, cotangents: Images, task: Task, kinds: frozenset[str]
 ) -> tuple[Splat, Channels]:
     """Return the reverse pass; its own derivative is that of the automatic kernel."""
     reverse = choose(task).reverse
     assert reverse is not None
 
     @_one_by_one
-    def one(tiles, residuals, cotangent):
-        return reverse.backward(tiles, residuals, cotangent, task, kinds)
+    def one(tiles, residuals, cotangents):
+        return reverse.backward(tiles, residuals, cotangents, task, kinds)
 
-    return one(tiles, residuals, cotangent)
+    return one(tiles, residuals, cotangents)
 
 
 @_backward.defjvp
 def _backward_jvp(task, kinds, primals, tangents):
-    tiles, _, cotangent = primals
+    tiles, _, cotangents = primals
     automatic = _automatic(task._replace(room_for_all=True))
 
-    def by_transpose(splat, channels, cotangent):
-        def sums(splat, channels):
-            return automatic(tiles._replace(splat=splat, channels=channels))["sums"]
+    def by_transpose(splat, channels, cotangents):
+        def images(splat, channels):
+            return automatic(tiles._replace(splat=splat, channels=channels))
 
-        return jax.vjp(sums, splat, channels)[1](cotangent)
+        return jax.vjp(images, splat, channels)[1](cotangents)
 
-    given = tiles.splat, tiles.channels, cotangent
+    given = tiles.splat, tiles.channels, cotangents
     slopes = tangents[0].splat, tangents[0].channels, tangents[2]
     back = _backward(*primals, task, kinds)
     return back, jax.jvp(by_transpose, given, slopes)[1]

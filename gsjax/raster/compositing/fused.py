@@ -17,9 +17,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from gsjax.raster.compositing.alpha import alphas, pixel_centres
-from gsjax.raster.compositing.blending import columns_of, pass_through, table_of
-from gsjax.raster.compositing.types import Images, Task, Tiles
+from gsjax.raster.compositing.alpha import Evaluated, evaluate, pixel_centres
+from gsjax.raster.compositing.blending import (
+    columns_of,
+    pass_through,
+    pixel_value,
+    table_of,
+)
+from gsjax.raster.compositing.types import (
+    Images,
+    Task,
+    Tiles,
+    pixel_channels,
+    single_images,
+)
 from gsjax.raster.lists.binning import Grid, corners
 from gsjax.raster.lists.counting import cumulative_sum
 from gsjax.raster.types import Array, RasterConfig
@@ -40,8 +51,8 @@ class Reading(NamedTuple):
 
     Attributes:
       rows: [R + 1, columns] the Gaussians; the last is empty.
-      widths: numbers of columns of the splat (u, v, inv_sx, slope, inv_sy, opacity), of
-        the channels, and of the depth if a median is asked for.
+      widths: numbers of columns of the splat (u, v and `Splat.shape`), of the channels,
+        and of the depth if its median is asked for.
       ranks: the lists, one behind the other.
       start, end: [T] where each begins and ends.
       left, top: [T] corners of the tiles, px.
@@ -69,13 +80,13 @@ class Reading(NamedTuple):
         columns = self.rows.shape[1]
         return rank, part_at(self.rows, (rank[0], jnp.int32(0)), (1, columns))[0]
 
-    def alpha(self, splat: Array, tile: Array, config: RasterConfig) -> Array:
-        """Return α [P] of a splat [6] at the pixels of a tile []."""
-        u, v, *shape = (number[0] for number in lax.split(splat, [1] * 6))
+    def at(self, splat: Array, tile: Array, config: RasterConfig) -> Evaluated:
+        """Return a splat [S] at the pixels [P] of a tile []."""
+        u, v, *shape = (number[0] for number in lax.split(splat, [1] * self.widths[0]))
         offset = u - number_at(self.left, tile)[0], v - number_at(self.top, tile)[0]
+        at = evaluate((*shape, *offset), self.pixels, config, self.alpha_min)
         # The division keeps XLA from evaluating α again for each channel.
-        alpha = alphas((*shape, *offset), self.pixels, config, self.alpha_min)
-        return alpha / self.ones
+        return at._replace(alpha=at.alpha / self.ones)
 
 
 class Residuals(NamedTuple):
@@ -96,11 +107,12 @@ class Residuals(NamedTuple):
 def suits(task: Task) -> bool:
     """Return whether the loops are one kernel here, made of vector instructions."""
     channels = task.colors + 3  # depth, ones, the median
+    channels = max(channels, task.channels + 1)
     pixels = task.grid.tile**2
     touched = task.itemsize * pixels * (_ARRAYS + _PER_CHANNEL * channels)
     fits = pixels >= _FEWEST and touched <= KERNEL_BYTES
     on_cpu = task.platform == "cpu"
-    return on_cpu and task.gaussian_form and fits and loops.large_loops_are_kernels()
+    return on_cpu and fits and loops.large_loops_are_kernels()
 
 
 def block_capacity(capacity: int, grid: Grid) -> int:
@@ -145,8 +157,8 @@ def composite_fused(
     read = reading_of(tiles, task)
     empty = jnp.zeros_like(read.ones)
     nothing = {"sums": jnp.zeros((read.widths[1], len(empty)), empty.dtype)}
-    if "median_depth" in config.outputs:
-        nothing["median"] = empty
+    nothing |= dict.fromkeys(single_images(config), empty)
+    varying = pixel_channels(config)
     images = {
         name: jnp.zeros((grid.tiles, *one.shape), one.dtype)
         for name, one in nothing.items()
@@ -160,17 +172,19 @@ def composite_fused(
         def blend(place, carried, image):
             _, row = read.row(place, end)
             splat, values, *depth = lax.split(row, read.widths)
-            alpha = read.alpha(splat, tile, config)
+            at = read.at(splat, tile, config)
             # Pixels that have stopped carry 0.
-            passed = pass_through(carried, alpha)
+            passed = pass_through(carried, at.alpha)
             behind = jnp.where(passed > config.transmittance_min, passed, 0)
-            weight = carried * alpha
+            weight = carried * at.alpha
             if config.stop_rule == "before":
                 weight = jnp.where(behind > 0, weight, 0)
             added = {"sums": weight * values[:, None]}
-            if depth:
+            added |= {name: weight * pixel_value(name, at) for name in varying}
+            if "median" in nothing:
                 half = (carried > 0.5) & (passed <= 0.5) & (weight > 0)
-                added["median"] = jnp.where(half, depth[0], 0)
+                there = depth[0] if depth else pixel_value("depth", at)
+                added["median"] = jnp.where(half, there, 0)
             return behind, {name: image[name] + added[name] for name in image}
 
         def turn(state):

@@ -9,9 +9,8 @@ pixel, and D_k the derivative of L by the transmittance behind it divided by tha
     ∂L/∂α_k = T_k (v_k − D_k)
     D_{k−1} = D_k + α_k (v_k − D_k)
 
-so that nothing is divided by 1 − α. α depends on its Gaussian through y1 and y2 alone
-(see `Splat`), and both are linear over a tile. So the cotangents of a Gaussian follow
-from six moments of q = α ∂L/∂α over the pixels: of 1, y1, y2, y1², y1 y2, y2².
+so that nothing is divided by 1 − α. `fused_moments` reduces q = α ∂L/∂α, and the
+cotangents of depths, over the pixels to a few sums a Gaussian.
 
 Axis legend: T tiles, P pixels of a tile, C channels, R ranks, L blocks of Gaussians.
 """
@@ -22,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from gsjax.math.numerics import safe_divide
 from gsjax.raster.compositing import fused
 from gsjax.raster.compositing.blending import pass_through
 from gsjax.raster.compositing.fused import (
@@ -32,29 +32,37 @@ from gsjax.raster.compositing.fused import (
     number_at,
     reading_of,
 )
+from gsjax.raster.compositing.fused_moments import reduction_of
 from gsjax.raster.compositing.types import (
     Compositor,
+    Images,
     ReversePass,
     Task,
     Tiles,
+    form_of,
     listed_pairs,
+    summed_channels,
 )
 from gsjax.raster.types import Array, Channels, RasterConfig, Splat
 from gsjax.runtime.loops import part_at, with_part
 from gsjax.runtime.setup import KERNEL_BYTES
 
 TURN = 2  # Gaussians, as in `fused`; BLOCK is a multiple
-_MOMENTS = 6
 _product = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
 # Upper limit of the arrays [P] that a turn touches, as in `fused`.
 _ARRAYS, _PER_CHANNEL = 108, 7
+# The same with a form, and bytes of a pixel beside them.
+_ARRAYS_OF_FORM, _PER_CHANNEL_OF_FORM, _BYTES_OF_FORM = 80, 10, 480
 
 
 def suits(task: Task) -> bool:
     """Return whether `backward` is one kernel here and gives all that is asked for."""
-    channels = task.colors + 2  # depth, ones
+    channels = max(task.colors + 2, task.channels)  # depth, ones
     pixels = task.grid.tile**2
     touched = task.itemsize * pixels * (_ARRAYS + _PER_CHANNEL * channels)
+    if form_of(task.config) is not None:
+        arrays = _ARRAYS_OF_FORM + _PER_CHANNEL_OF_FORM * task.channels
+        touched = pixels * (task.itemsize * arrays + _BYTES_OF_FORM)
     config = task.config
     given = not config.absgrad and "median_depth" not in config.outputs
     return given and touched <= KERNEL_BYTES and fused.suits(task)
@@ -63,18 +71,21 @@ def suits(task: Task) -> bool:
 def backward(
     tiles: Tiles,
     residuals: Residuals,
-    cotangent: Array,
+    cotangents: Images,
     task: Task,
     kinds: frozenset[str] = frozenset({"splats", "channels"}),
 ) -> tuple[Splat, Channels]:
     """Return ∂L/∂splat and ∂L/∂channels; see `ReversePass.backward`."""
     grid, config = task.grid, task.config
-    read = reading_of(tiles, task)
+    read, reduction = reading_of(tiles, task), reduction_of(task)
     ranks, _ = read.rows.shape
-    channels, pixels = cotangent.shape[1:]
+    channels, pixels = cotangents["sums"].shape[1:]
     empty = jnp.zeros_like(read.ones)
-    zero = jnp.int32(0)
-    monomials = _monomials(read.pixels - grid.tile / 2)
+    zero, width = jnp.int32(0), read.widths[0]
+
+    def of(tile, images):
+        start = tile, *(zero,) * (images.ndim - 1)
+        return part_at(images, start, (1, *images.shape[1:]))
 
     def blended(on, values):
         return jnp.where(on, values, 0) if config.stop_rule == "before" else values
@@ -82,16 +93,16 @@ def backward(
     def of_tile(tile, sums):
         start, end = number_at(read.start, tile), number_at(read.end, tile)
         first = number_at(residuals.first, tile)
-        image = part_at(cotangent, (tile, zero, zero), (1, channels, pixels))[0]
-        half = grid.tile / 2
-        middle = number_at(read.left, tile) + half, number_at(read.top, tile) + half
+        image = {name: of(tile, all_)[0] for name, all_ in cotangents.items()}
+        corner = number_at(read.left, tile), number_at(read.top, tile)
+        at_tile = partial(reduction.at, corner, read.ones)
 
         def ahead(state):
             """Recompute α and T of the next Gaussians of a block."""
             at, base, carried, alphas, reached = state
             for _ in range(TURN):
                 _, row = read.row(base + at, end)
-                alpha = read.alpha(row[:6], tile, config)
+                alpha = read.at(row[:width], tile, config).alpha
                 alphas = with_part(alphas, alpha[None], (at[0], zero))
                 reached = with_part(reached, carried[None], (at[0], zero))
                 passed = pass_through(carried, alpha)
@@ -108,15 +119,17 @@ def backward(
                 alpha = part_at(alphas, (at[0], zero), (1, pixels))[0]
                 carried = part_at(reached, (at[0], zero), (1, pixels))[0]
                 on, more = behind > 0, []
+                weight = blended(on, carried * alpha)
                 if "splats" in kinds:
                     gained = jnp.where(on, gained, 0)
-                    slope = blended(on, _product(row[6:], image) - gained)
+                    worth = _product(row[width:], image["sums"])
+                    worth, moments = at_tile(row[:width], worth, image)
+                    slope = blended(on, worth - gained)
                     free = jnp.where(alpha < config.alpha_max, alpha, 0)
-                    moments = _product(monomials, free * carried * slope)
-                    more.append(_moments_about_mean(row, middle, moments))
+                    more.append(moments(free * carried * slope, weight))
                     gained = gained + alpha * slope
                 if "channels" in kinds:
-                    more.append(_product(image, blended(on, carried * alpha)))
+                    more.append(_product(image["sums"], weight))
                 behind = carried
                 more = jnp.concatenate(more)
                 old = part_at(sums, (rank[0], zero), (1, len(more)))
@@ -126,9 +139,7 @@ def backward(
         def block(state):
             number, gained, alphas, reached, sums = state
             base = start + number * BLOCK
-            carried = part_at(
-                residuals.carried, ((first + number)[0], zero), (1, pixels)
-            )[0]
+            carried = of((first + number)[0], residuals.carried)[0]
             begun = jnp.zeros(1, jnp.int32), base, carried, alphas, reached
             at, _, behind, alphas, reached = lax.while_loop(
                 lambda state: state[0][0] < BLOCK, ahead, begun
@@ -143,80 +154,33 @@ def backward(
         begun = number_at(residuals.blocks, tile) - 1, empty, room, room, sums
         return lax.while_loop(lambda state: state[0][0] >= 0, block, begun)[-1]
 
-    columns = ("splats" in kinds) * _MOMENTS + ("channels" in kinds) * channels
+    moments = reduction.size(tiles.splat)
+    columns = ("splats" in kinds) * moments + ("channels" in kinds) * channels
     sums = jnp.zeros((ranks, columns), read.rows.dtype)
     sums = lax.fori_loop(zero, jnp.int32(grid.tiles), of_tile, sums)[:-1].T
     if "splats" not in kinds:
-        sums = jnp.pad(sums, ((_MOMENTS, 0), (0, 0)))
+        sums = jnp.pad(sums, ((moments, 0), (0, 0)))
     if "channels" not in kinds:
         sums = jnp.pad(sums, ((0, channels), (0, 0)))
-    return _cotangents(tiles.splat, tiles.channels, sums, config)
+    by_splat = reduction.cotangent(tiles.splat, sums[:moments])
+    return by_splat, _by_channels(tiles.channels, sums[moments:], config)
 
 
-def _monomials(pixels: np.ndarray) -> np.ndarray:
-    """Return 1, x, y, x², xy, y² [6, P] of pixels, from the middle of the tile."""
-    x, y = pixels
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
-
-
-def _moments_about_mean(
-    row: Array, middle: tuple[Array, Array], moments: Array
-) -> Array:
-    """Return the moments [6] in y1 and y2 of a Gaussian, from those of `_monomials`.
-
-    y1 and y2 are a few standard deviations in the middle of any tile that the Gaussian
-    touches, and change by no more within it. So little cancels, however far the mean.
-    """
-    u, v, inv_sx, slope, inv_sy, _ = lax.split(row[:6], [1] * 6)
-    one, x, y, xx, xy, yy = lax.split(moments, [1] * _MOMENTS)
-    dx, dy = middle[0] - u, middle[1] - v
-    y1, y2 = inv_sx * dx, inv_sy * (dy - slope * dx)
-    by_1, by_2 = inv_sx * x, inv_sy * (y - slope * x)
-    by_11 = inv_sx * inv_sx * xx
-    by_12 = inv_sx * inv_sy * (xy - slope * xx)
-    by_22 = inv_sy * inv_sy * (yy - slope * (2 * xy - slope * xx))
-    about = (
-        one,
-        y1 * one + by_1,
-        y2 * one + by_2,
-        y1 * (y1 * one + 2 * by_1) + by_11,
-        y2 * (y1 * one + by_1) + y1 * by_2 + by_12,
-        y2 * (y2 * one + 2 * by_2) + by_22,
-    )
-    return jnp.concatenate(about)
-
-
-def _cotangents(
-    splat: Splat, channels: Channels, sums: Array, config: RasterConfig
-) -> tuple[Splat, Channels]:
-    """Return the cotangents from moments and Σ α T ∂L/∂C of each channel [6 + C, R].
-
-    They follow from d log α = d log opacity − y1 dy1 − y2 dy2.
-    """
-    one, y1, y2, y11, y12, y22 = sums[:_MOMENTS]
-    summed = list(sums[_MOMENTS:-1])  # the last channel is ones
-    inv_sx, slope, inv_sy, opacity = splat.shape
-
-    def over(moment, number):
-        # Gaussians that are not drawn may hold anything, and have no moments.
-        return jnp.where(number != 0, moment / jnp.where(number != 0, number, 1), 0)
-
-    by_colors = jnp.zeros_like(channels.colors)
-    if "rgb" in config.outputs:
-        count = len(channels.colors)
-        by_colors, summed = jnp.stack(summed[:count]), summed[count:]
-    by_shape = (
-        -over(y11, inv_sx),
-        over(inv_sy * y12, inv_sx),
-        -over(y22, inv_sy),
-        over(one, opacity),
-    )
-    return (
-        Splat(inv_sx * y1 - inv_sy * slope * y2, inv_sy * y2, by_shape),
-        channels._replace(
-            colors=by_colors,
-            depth=summed[0] if "depth" in config.outputs else jnp.zeros_like(one),
-        ),
+def _by_channels(channels: Channels, sums: Array, config: RasterConfig) -> Channels:
+    """Return the cotangent of channels, from the sums [C, R] of Σ α T ∂L/∂C."""
+    count = len(channels.colors)
+    widths = summed_channels(config, count)
+    splits = np.cumsum([*widths.values()])[:-1]
+    parts = dict(zip(widths, jnp.split(sums, splits)))
+    by_colors = parts.get("colors", jnp.zeros_like(channels.colors))
+    by_depth = parts["depth"][0] if "depth" in parts else jnp.zeros_like(channels.depth)
+    if "disparities" in parts:
+        mean, square = parts["disparities"]
+        there = channels.depth != 0
+        disparity = safe_divide(jnp.ones_like(mean), channels.depth, there)
+        by_depth -= (mean + 2 * disparity * square) * disparity * disparity
+    return channels._replace(
+        colors=by_colors, depth=by_depth, normals=parts.get("normals", channels.normals)
     )
 
 

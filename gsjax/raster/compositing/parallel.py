@@ -28,9 +28,10 @@ from gsjax.raster.compositing.alpha import pixel_centres
 from gsjax.raster.compositing.blending import (
     Chunk,
     Parts,
-    alphas_of,
     columns_of,
+    evaluated,
     sums_behind,
+    times,
 )
 from gsjax.raster.compositing.schedules import ranks_at
 from gsjax.raster.compositing.types import (
@@ -109,9 +110,10 @@ def composite_parallel(tiles: Tiles, task: Task) -> Images:
         mine = Entries(tile_of, take(level, some))
         through = take(carried, some), take(left, some)
         added = _blended(tables, mine, through, chunk_of, tiles, task)
-        sums = {"sums": _along_lists(jnp.add, mine, added["sums"])}
-        if "median" in added:
-            sums["median"] = _along_lists(_first, mine, added["median"])
+        sums = {
+            name: _along_lists(_first if name == "median" else jnp.add, mine, image)
+            for name, image in added.items()
+        }
         return {name: take(value, last) for name, value in sums.items()}
 
     return run_at_bucket(count, room, max(1, config.num_size_buckets - 1), of_size)
@@ -146,8 +148,8 @@ def _transmittances(
     pixels = pixel_centres(grid.tile, tables.splats.dtype)
 
     def through(entries: Entries) -> Array:
-        alpha = alphas_of(chunk_of(bare, entries), pixels, config, alpha_min)
-        return jnp.sum(jnp.log1p(-alpha), axis=1)
+        at = evaluated(chunk_of(bare, entries), pixels, config, alpha_min)
+        return jnp.sum(jnp.log1p(-at.alpha), axis=1)
 
     there = entries.tile < grid.tiles
     log_total = _in_batches(through, there, entries, batch_size(config))
@@ -175,15 +177,15 @@ def _blended(
     @jax.checkpoint
     def blend(inputs) -> tuple[Array, dict[str, Array]]:
         (carried, left), chunk = inputs
-        alpha = alphas_of(chunk, pixels, config, alpha_min)
-        return sums_behind(carried, alpha, chunk.parts, config, left)
+        at = evaluated(chunk, pixels, config, alpha_min)
+        return sums_behind(carried, at, chunk.parts, config, left)
 
     # Ahead of the loop, so that the transpose is one scatter-add and not one a batch.
     inputs = through, chunk_of(tables, entries)
     there = entries.tile < grid.tiles
     total, out = _in_batches(blend, there, inputs, batch_size(config))
     front = _in_front(total, through[0], entries)
-    return {**out, "sums": front[:, None] * out["sums"]}
+    return times(front, out)
 
 
 @jax.custom_jvp

@@ -7,6 +7,7 @@ C channels.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from gsjax.raster.forms import Form
 from gsjax.raster.lists.binning import Grid, Lists
 from gsjax.raster.types import Array, Channels, RasterConfig, Splat
 
@@ -26,6 +27,54 @@ class Tiles(NamedTuple):
     channels: Channels
     lists: Lists
     device: Array
+
+
+def form_of(config: RasterConfig) -> Form | None:
+    """Return the form of the splats; None for the Gaussian form of `Splat`."""
+    primitive = config.primitive
+    if primitive is None or primitive.form is not None:
+        return None if primitive is None else primitive.form
+    return primitive.ray_form if config.blends_ray_depth else None
+
+
+def has_ray_depth(config: RasterConfig) -> bool:
+    """Return whether the depth of a splat varies from pixel to pixel."""
+    form = form_of(config)
+    return form is not None and form.has_depth
+
+
+def summed_channels(config: RasterConfig, colors: int) -> dict[str, int]:
+    """Return the channels of "sums" in their order, with the number of each.
+
+    The disparities are 1 / z and 1 / z²; ones give alpha.
+
+    Args:
+      config: static settings.
+      colors: number of colours and features.
+    """
+    outputs, of_mean = config.outputs, not has_ray_depth(config)
+    there = {
+        "colors": colors * ("rgb" in outputs or "features" in outputs),
+        "normals": 3 * ("normals" in outputs),
+        "depth": 1 * (of_mean and "depth" in outputs),
+        "disparities": 2 * (of_mean and "distortion" in outputs),
+        "ones": 1,
+    }
+    return {name: count for name, count in there.items() if count}
+
+
+def pixel_channels(config: RasterConfig) -> tuple[str, ...]:
+    """Return the blended values that vary from pixel to pixel, images of their own."""
+    if not has_ray_depth(config):
+        return ()
+    there = ("depth",) if "depth" in config.outputs else ()
+    return (*there, "disparity", "square") if "distortion" in config.outputs else there
+
+
+def single_images(config: RasterConfig) -> tuple[str, ...]:
+    """Return the names of the images beside "sums", [T, P] each."""
+    median = ("median",) if "median_depth" in config.outputs else ()
+    return (*pixel_channels(config), *median)
 
 
 class Task(NamedTuple):
@@ -50,15 +99,9 @@ class Task(NamedTuple):
 
     @property
     def channels(self) -> int:
-        """Number of blended channels: colours, depth if asked for, ones."""
-        outputs = self.config.outputs
-        return self.colors * ("rgb" in outputs) + ("depth" in outputs) + 1
-
-    @property
-    def gaussian_form(self) -> bool:
-        """True if α has the Gaussian form of `Splat`."""
-        primitive = self.config.primitive
-        return primitive is None or primitive.alpha is None
+        """Number of blended channels."""
+        summed = sum(summed_channels(self.config, self.colors).values())
+        return summed + len(pixel_channels(self.config))
 
 
 class ReversePass(NamedTuple):
@@ -67,9 +110,9 @@ class ReversePass(NamedTuple):
     Attributes:
       suits: task → whether it is available.
       forward: (tiles, task) → images, residuals.
-      backward: (tiles, residuals, cotangent of "sums" [T, C, P], task, kinds) →
-        cotangents of (splat, channels). ``kinds`` is a subset of {"splat", "channels"};
-        cotangents of the other kind may be zeros.
+      backward: (tiles, residuals, cotangents of the images except "median", task,
+        kinds) → cotangents of (splat, channels). ``kinds`` is a subset of {"splats",
+        "channels"}; cotangents of the other kind may be zeros.
     """
 
     suits: Callable[[Task], bool]
@@ -80,8 +123,9 @@ class ReversePass(NamedTuple):
 class Compositor(NamedTuple):
     """A compositing kernel.
 
-    Images are {"sums": [T, C, P] with colour, depth if asked for, and alpha; "median":
-    [T, P] if asked for}, before the background, T in the order of the grid.
+    Images are {"sums": [T, C, P], see `summed_channels`; "depth" and the like [T, P],
+    see `pixel_channels`; "median": [T, P] if asked for}, before the background, T in
+    the order of the grid.
 
     Attributes:
       name: for messages.

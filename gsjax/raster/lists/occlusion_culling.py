@@ -14,6 +14,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jax import lax
 
+from gsjax.raster.forms import unmarked, values_at
 from gsjax.raster.lists.counting import compact_indices
 from gsjax.raster.lists.depth_order import depth_of_slots
 from gsjax.raster.lists.sorting import argsort_float
@@ -95,7 +96,7 @@ def closed_from(
     """Return the depth [Y, X] behind which nothing shows in a square; infinity if none.
 
     Args:
-      front: splats of the candidates in the Gaussian form, front to back, [K] each.
+      front: splats of the candidates, front to back, [K] each.
       depth: [K] by which they are sorted.
       count: [] number of candidates; those behind it have opacity 0.
       size: (width, height) of the image, px.
@@ -114,13 +115,12 @@ def closed_from(
 
     def at_corners(start):
         """Return a lower bound of α [M, Y + 1, X + 1]."""
-        u, v, inv_sx, slope, inv_sy, opacity = (
+        u, v, *shape, opacity = (
             cut(column, start)[:, None, None]
             for column in (front.u, front.v, *front.shape)
         )
-        dx, dy = xs - u, ys - v
-        y1, y2 = inv_sx * dx, inv_sy * (dy - slope * dx)
-        alpha = opacity * jnp.exp(-0.5 * (y1 * y1 + y2 * y2)) * ALPHA_MARGIN
+        power = _power(tuple(shape), xs - u, ys - v, config)
+        alpha = opacity * jnp.exp(power) * ALPHA_MARGIN
         alpha = jnp.minimum(alpha, config.alpha_max)
         return jnp.where(alpha > config.alpha_min, alpha, 0)
 
@@ -152,6 +152,18 @@ def closed_from(
         jnp.full((rows, cols), jnp.inf, dtype),
     )
     return lax.while_loop(unfinished, step, init)[3]
+
+
+def _power(shape, dx: Array, dy: Array, config: RasterConfig) -> Array:
+    """Return the logarithm of α / opacity, or less, at offsets from the centre."""
+    form = None if config.primitive is None else config.primitive.form
+    if form is None:
+        inv_sx, slope, inv_sy, *_ = shape
+        y1, y2 = inv_sx * dx, inv_sy * (dy - slope * dx)
+        return -0.5 * (y1 * y1 + y2 * y2)
+    parts = (form.convex_parts or form.parts)(shape)
+    values = values_at(parts, dx, dy)
+    return form.evaluate(values, parts.depth, parts.limits, unmarked).power
 
 
 def behind(closed: Array, box: Box, depth: Array, size: tuple[int, int]) -> Array:

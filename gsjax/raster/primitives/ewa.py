@@ -22,8 +22,16 @@ _CHEAP = (PINHOLE, ORTHOGRAPHIC)
 
 
 def ewa_jacobian(camera: Camera, point):
+    """Return the rows (du/d·, dv/d·) of the lens Jacobian near a camera point.
+
+    It is limited far outside the image, see `Lens.linearise`.
+    """
+    return lens_jacobian(camera, camera.linearise(point))
+
+
+def lens_jacobian(camera: Camera, point):
     """Return the rows (du/d·, dv/d·) of the lens Jacobian at a camera point."""
-    at = once(camera, camera.linearise(point))
+    at = once(camera, point)
     one, zero = jnp.ones_like(at[0]), jnp.zeros_like(at[0])
     columns = [
         jax.jvp(
@@ -103,7 +111,7 @@ def dilated(m1, m2, dilation: float):
     sharp_a, sharp_c = sum(m * m for m in m1), sum(m * m for m in m2)
     b = sum(p * q for p, q in zip(m1, m2))
     pairs = [(1, 2), (2, 0), (0, 1)]
-    if len(m1) > 3:
+    if len(m1) != 3:
         pairs = list(combinations(range(len(m1)), 2))
     minors = [m1[i] * m2[j] - m1[j] * m2[i] for i, j in pairs]
     det_sharp = sum(n * n for n in minors)

@@ -1,0 +1,144 @@
+"""Depth along each ray, and normals, of ellipsoids (Zhang et al. 2024, RaDe-GS).
+
+A ray shows an ellipsoid at its densest point. With m = S⁻¹ Rᵀ μ the mean seen from the
+camera and r = S⁻¹ Rᵀ (ray), both in standard deviations, that is where z = (r · m) /
+(r · r). At an offset (dx, dy) of the pixel from the mean r = (m + p dx + q dy) / z₀, so
+
+    z = z₀ e / (e² + κ²),   e = 1 + g · (dx, dy),   κ² = k₁² + k₂²,
+
+where e − 1 is the part of p dx + q dy along m over |m|, and κ the rest over |m|, of
+which k₁ and k₂ are triangular components. Exact for a pinhole; other lenses are
+perspective about the mean, to first order. The normal is that of the surface of equal
+density at the mean.
+
+Nothing is divided by a scale: all are taken relative to the smallest one, so flat
+ellipsoids and needles keep their digits.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from gsjax.cameras.camera import Camera
+from gsjax.cameras.lenses import z_depth
+from gsjax.cameras.shutter import Exposure, entry, image_rows
+from gsjax.math import rotations
+from gsjax.math.numerics import safe_normalize
+from gsjax.raster.forms import (
+    AtPixel,
+    Form,
+    Numbers,
+    Once,
+    Parts,
+    Plane,
+    gaussian_power,
+)
+from gsjax.raster.primitives.ewa import lens_jacobian
+from gsjax.raster.primitives.rows import cross, dot
+from gsjax.raster.types import Array
+
+_LEAST = 1e-12  # of e² + κ², and of the squares that are divided by
+
+
+def _parts(shape: Numbers) -> Parts:
+    inv_sx, slope, inv_sy, gx, gy, k1, k2x, k2y, depth = shape
+    planes = (
+        Plane(0.0, inv_sx, 0.0),
+        Plane(0.0, -inv_sy * slope, inv_sy),
+        Plane(1.0, gx, gy),
+        Plane(0.0, k1, 0.0),
+        Plane(0.0, k2x, k2y),
+    )
+    return Parts(planes, depth)
+
+
+def _evaluate(values: Numbers, depth, limits: Numbers, once: Once) -> AtPixel:
+    del limits
+    y1, y2, e, k1, k2 = values
+    depth = jnp.where(depth > 0, depth, 1)  # 0 where a list has ended
+    below = e * e + k1 * k1 + k2 * k2
+    over = once(_inverse(below))
+    good = jnp.abs(e) > _LEAST**0.5
+    disparity = jnp.where(good, below / (depth * jnp.where(good, e, 1)), 0)
+    return AtPixel(gaussian_power(y1, y2), depth * e * over, disparity)
+
+
+@jax.custom_jvp
+def _inverse(x: Array) -> Array:
+    """Return 1 / x for x > 0, limited."""
+    return 1 / jnp.maximum(x, _LEAST)
+
+
+@_inverse.defjvp
+def _inverse_jvp(primals, tangents):
+    over = _inverse(*primals)
+    return over, -over * over * tangents[0]
+
+
+RAY_FORM = Form(_parts, _evaluate, has_depth=True)
+
+
+def _in_deviations(vector, quat, scales) -> tuple[Array, ...]:
+    """Return S⁻¹ Rᵀ of a world vector, times the smallest scale."""
+    rotation = rotations.rotation_rows(*quat)
+    over = 1 / sum(q * q for q in quat)
+    smallest = jnp.minimum(jnp.minimum(scales[0], scales[1]), scales[2])
+    return tuple(
+        dot([row[j] for row in rotation], vector) * (over * (smallest / scales[j]))
+        for j in range(3)
+    )
+
+
+def _mean_from_eye(exposure: Exposure) -> tuple[Array, ...]:
+    """Return the mean relative to the camera, in world axes."""
+    view = exposure.viewmat
+    columns = [[entry(view, i, j) for i in range(3)] for j in range(3)]
+    return tuple(dot(column, exposure.point) for column in columns)
+
+
+def _positive(x: Array) -> Array:
+    return jnp.where(x > _LEAST, x, _LEAST)
+
+
+def ray_numbers(camera: Camera, exposure: Exposure, quat, scales) -> Numbers:
+    """Return gx, gy, k1, k2x, k2y and z₀ of `RAY_FORM`, [R] each.
+
+    Args:
+      camera: a single camera.
+      exposure: from `expose`.
+      quat: (w, x, y, z), any norm above zero.
+      scales: three standard deviations.
+    """
+    depth, view = camera.lens.depth(exposure.point), exposure.viewmat
+    u, v = image_rows(camera, exposure, lens_jacobian(camera, exposure.point))
+    if camera.lens.depth is z_depth:
+        away = tuple(entry(view, 2, j) for j in range(3))
+    else:
+        ray = [p / depth for p in exposure.point]
+        away = tuple(
+            sum(ray[i] * entry(view, i, j) for i in range(3)) for j in range(3)
+        )
+    # Steps at equal depth that move the image by a pixel along u, and along v.
+    over = 1 / dot(away, cross(u, v))
+    p = _in_deviations([n * over for n in cross(v, away)], quat, scales)
+    q = _in_deviations([n * over for n in cross(away, u)], quat, scales)
+    m = _in_deviations(_mean_from_eye(exposure), quat, scales)
+    square = dot(m, m)
+    gx, gy = dot(m, p) / square, dot(m, q) / square
+    rest = [a - gy * b for a, b in zip(q, m)]
+    length = jnp.sqrt(_positive(dot(rest, rest) / square))
+    across = [a - gx * b for a, b in zip(p, m)]
+    k2x = dot(across, rest) / (square * length)
+    k1 = dot(m, cross(p, q)) / (square * jnp.sqrt(square) * length)
+    return gx, gy, k1, k2x, length, depth
+
+
+def ray_normals(exposure: Exposure, quat, scales) -> tuple[Array, ...]:
+    """Return the normal (x, y, z) in camera coordinates; it faces the camera."""
+    m = _in_deviations(_mean_from_eye(exposure), quat, scales)
+    smallest = jnp.minimum(jnp.minimum(scales[0], scales[1]), scales[2])
+    inward = tuple(n * (smallest / s) for n, s in zip(m, scales))
+    rotation = rotations.rotation_rows(*quat)
+    world = [-dot(row, inward) for row in rotation]
+    view = exposure.viewmat
+    seen = tuple(dot([entry(view, i, j) for j in range(3)], world) for i in range(3))
+    return safe_normalize(seen, (0.0, 0.0, -1.0))[0]
