@@ -63,6 +63,14 @@ class TrainCommand(HeavyCommand):
     absgrad: bool = False
     """Split by absolute gradients in the adaptive strategy: sharper, with more
     Gaussians."""
+    primitive: Literal["ellipsoid", "surfel", "surfel_area"] = "ellipsoid"
+    """What is trained: ellipsoids, or surfels (2D Gaussian splatting) with the filter
+    of the paper or one that keeps the area."""
+    normal_weight: float | None = None
+    """Weight of the loss of normals that disagree with those of the depth. Default:
+    0.05 for surfels, else 0."""
+    distortion_weight: float = 0.0
+    """Weight of the loss of depth distortion. Default: 0."""
     refine_poses: bool = False
     """Optimise the camera poses together with the scene, with accurate render
     thresholds."""
@@ -245,6 +253,17 @@ class TrainCommand(HeavyCommand):
             start=start,
         )
 
+    def _geometry(self) -> dict:
+        """Return the settings of the primitive and of the losses of geometry."""
+        flat, normals = self.primitive != "ellipsoid", self.normal_weight
+        if normals is None:
+            normals = 0.05 if flat else 0.0
+        return {
+            "primitive": self.primitive if flat else None,
+            "normal_weight": normals,
+            "distortion_weight": self.distortion_weight,
+        }
+
     def _config(self, *, continued: bool):
         """Return the preset changed by the options."""
         from gsjax.train.config import continuation_config, preset, scaled
@@ -273,6 +292,7 @@ class TrainCommand(HeavyCommand):
             refine_shutter=self.refine_shutter,
             undistort=self.undistort,
             exposure=self.exposure,
+            **self._geometry(),
             prune_invisible=not self.keep_unseen,
         )
         if self.antialias:  # after refine_poses, which chooses the default

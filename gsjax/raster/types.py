@@ -14,6 +14,7 @@ from jax.experimental import checkify
 
 from gsjax.errors import CapacityError
 from gsjax.raster.config import OUTPUTS as OUTPUTS
+from gsjax.raster.config import PRIMITIVES as PRIMITIVES
 from gsjax.raster.config import RasterConfig
 from gsjax.raster.forms import Form
 

@@ -10,7 +10,7 @@ from gsjax.densify.mcmc import McmcSettings, mcmc
 from gsjax.densify.schedule import EditSchedule
 from gsjax.densify.types import Strategy
 from gsjax.errors import InputError
-from gsjax.raster.types import RasterConfig
+from gsjax.raster.types import PRIMITIVES, RasterConfig
 from gsjax.runtime.settings import as_float, convert_fields, require_ranges
 from gsjax.train.optimiser import Rates
 
@@ -20,6 +20,7 @@ _CHOICES = {
     "strategy": STRATEGIES,
     "background": ("auto", "black", "white", "random"),
     "initial": ("auto", "points", "dense", "random"),
+    "primitive": (None, *PRIMITIVES),
 }
 
 
@@ -47,6 +48,11 @@ class Level:
 # config holds these very objects unless the user passes one.
 _RASTER = RasterConfig(num_size_buckets=1, occlusion=False)
 _ACCURATE = RasterConfig.accurate(num_size_buckets=1, occlusion=False)
+_DEFAULTS = {
+    (primitive, precise): raster.replace(primitive=primitive) if primitive else raster
+    for primitive in (None, *PRIMITIVES)
+    for precise, raster in ((False, _RASTER), (True, _ACCURATE))
+}
 
 
 @dataclass(frozen=True)
@@ -82,6 +88,13 @@ class TrainConfig:
         all views share. Pinholes get OpenCV's k1 k2 p1 p2.
       refine_shutter: optimise the motion of each camera during the exposure of a
         rolling ``shutter``.
+      primitive: what is trained, see `RasterConfig.primitive`; None for that of
+        ``raster``. Surfels start in the planes of neighbouring points.
+      normal_weight, distortion_weight, entropy_weight: weights of
+        `gsjax.train.geometry_loss`: of `normal_consistency`, of `distortion_term`, and
+        of `opacity_entropy`; 0 leaves a term out.
+      normal_from, distortion_from, entropy_from: share of the steps from which each
+        counts.
       exposure: optimise an affine correction of the colours of each photograph.
       pose_rate, intrinsics_rate, shutter_rate, exposure_rate: learning rates of these
         corrections; that of distortion is 10 × ``intrinsics_rate``. Those of intrinsics
@@ -123,6 +136,13 @@ class TrainConfig:
     refine_intrinsics: bool = False
     refine_shutter: bool = False
     exposure: bool = False
+    primitive: str | None = None
+    normal_weight: float = 0.0
+    normal_from: float = 0.25
+    distortion_weight: float = 0.0
+    distortion_from: float = 0.1
+    entropy_weight: float = 0.0
+    entropy_from: float = 0.5
     pose_rate: float = 1e-5
     intrinsics_rate: float = 1e-3
     shutter_rate: float = 1e-3
@@ -136,10 +156,7 @@ class TrainConfig:
     def __post_init__(self):
         convert_fields(self)
         require_ranges(self, _CHOICES)
-        if self.raster is _RASTER or self.raster is _ACCURATE:
-            precise = self.refine_poses or self.refine_shutter
-            default = _ACCURATE if precise else _RASTER
-            object.__setattr__(self, "raster", default)
+        object.__setattr__(self, "raster", self._own_raster())
         rates = _as_floats(self.rates)
         object.__setattr__(self, "rates", rates)
         first, last = rates.means
@@ -154,6 +171,7 @@ class TrainConfig:
         non_negative_fields = (
             "pose_rate", "intrinsics_rate", "shutter_rate", "exposure_rate",
             "dense_count", "every_eval", "every_checkpoint",
+            "normal_weight", "distortion_weight", "entropy_weight",
         )  # fmt: skip
         rolling = not self.refine_shutter or SHUTTERS[self.shutter].rolling
         opacity, scale = 0 < settings.initial_opacity < 1, settings.initial_scale > 0
@@ -171,10 +189,28 @@ class TrainConfig:
             "rates": (positive, "numbers ≥ 0"),
             f"{self.strategy}'s initial_opacity": (opacity, "a number in (0, 1)"),
             f"{self.strategy}'s initial_scale": (scale, "a number in (0, inf)"),
+            **dict.fromkeys(("normal_from", "distortion_from"), "[0, 1]"),
+            "entropy_from": "[0, 1]",
             **dict.fromkeys(positive_fields, "[1, inf)"),
             **dict.fromkeys(non_negative_fields, "[0, inf)"),
         }
         require_ranges(self, checks)
+
+    def _own_raster(self) -> RasterConfig:
+        """Return the render settings: the default, or those of the user."""
+        raster = self.raster
+        if any(raster is some for some in _DEFAULTS.values()):
+            precise = self.refine_poses or self.refine_shutter
+            raster = _DEFAULTS[self.primitive, precise]
+        elif self.primitive is not None:
+            raster = raster.replace(primitive=self.primitive)
+        return raster
+
+    @property
+    def draws_surfels(self) -> bool:
+        """True if the Gaussians are surfels."""
+        primitive = self.raster.primitive
+        return f"{getattr(primitive, 'name', primitive)}".startswith("surfel")
 
     def replace(self, **changes) -> "TrainConfig":
         """Return a copy with some settings changed.

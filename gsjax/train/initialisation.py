@@ -12,6 +12,7 @@ from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, compact, make_gaussians, with_sh_degree
 from gsjax.init.dense import find_points
 from gsjax.init.gaussians import init_gaussians
+from gsjax.init.surfels import laid_on_points
 from gsjax.math.sh import num_bases
 from gsjax.train.capacity_policy import slots_for
 from gsjax.train.config import TrainConfig
@@ -95,6 +96,8 @@ def initial_state(
         capacity=lambda count: slots_for(count, 0, config, setup.schedule),
         seed=config.seed,
     )
+    if config.draws_surfels:
+        gaussians = laid_on_points(gaussians)
     return _jitted_state(setup, gaussians, views)
 
 

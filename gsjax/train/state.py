@@ -24,6 +24,7 @@ from gsjax.io.npy import read_npy
 from gsjax.runtime.files import write_file
 from gsjax.train.camera_refinement import CameraRefinement, init_refinement
 from gsjax.train.config import TrainConfig
+from gsjax.train.geometry_loss import geometry_terms
 from gsjax.train.losses import LossTerm
 from gsjax.train.models import (
     IDENTITY,
@@ -151,7 +152,7 @@ def make_setup(
         config=config,
         extent=extent,
         strategy=strategy,
-        loss_terms=tuple(loss_terms),
+        loss_terms=(*geometry_terms(config), *loss_terms),
         model=model,
         optimiser=make_optimiser(table),
         schedule=strategy.schedule or schedule_of(strategy.due, config.steps),

@@ -1,0 +1,166 @@
+"""Losses of geometry: normals of analytic depth, values by hand, a run of surfels."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import camera_of
+from training import RASTER, dataset, photos
+
+import gsjax
+from gsjax.errors import InputError
+from gsjax.init.surfels import flattened, laid_on_points
+from gsjax.math.rotations import covariance, quaternion_to_matrix
+from gsjax.train.geometry_loss import (
+    geometry_terms,
+    normal_consistency,
+    normals_of_depth,
+    opacity_entropy,
+)
+
+WIDTH, HEIGHT = 41, 30
+CAMERA = camera_of(WIDTH, HEIGHT, viewmat=np.eye(4))
+PLANE = np.array([0.3, -0.2, -0.9]) / np.linalg.norm([0.3, -0.2, -0.9])
+INSIDE = slice(1, -1), slice(1, -1)
+
+
+def rays(camera):
+    ys, xs = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    K = np.asarray(camera.K)
+    x, y = (xs - K[0, 2]) / K[0, 0], (ys - K[1, 2]) / K[1, 1]
+    return np.stack([x, y, np.ones_like(x)], -1)
+
+
+def test_normals_of_a_plane():
+    depth = 3 * PLANE[2] / (rays(CAMERA) @ PLANE)
+    normals = np.asarray(normals_of_depth(jnp.asarray(depth), CAMERA))
+    np.testing.assert_allclose(normals[INSIDE], np.broadcast_to(PLANE, (28, 39, 3)))
+    assert not normals[0].any()
+    assert not normals[:, -1].any()
+
+
+def test_normals_of_a_sphere_by_range():
+    """A fisheye measures the distance; neighbours of holes have no normal."""
+    coefficients = [0.0, 0.0, 0.0, 0.0]
+    camera = camera_of(
+        WIDTH, HEIGHT, viewmat=np.eye(4), lens="fisheye", coefficients=coefficients
+    )
+    xs, ys = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    ray = camera.lens.unproject(camera.K, camera.coefficients, (xs, ys))
+    ray = np.stack([np.asarray(r) for r in ray], -1)
+    ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    centre, radius = np.array([0.1, 0.0, 4.0]), 2.0
+    along = ray @ centre
+    missing = centre @ centre - along**2
+    hit = missing < radius**2
+    depth = np.where(hit, along - np.sqrt(np.maximum(radius**2 - missing, 0)), 0)
+    found = np.asarray(normals_of_depth(jnp.asarray(depth), camera))
+    wanted = (depth[..., None] * ray - centre) / radius
+    steep = np.sum(wanted * ray, -1) < -0.5
+    clear = hit & steep & found.any(-1)
+    assert 50 < clear.sum() < hit.sum()
+    assert np.sum(found * wanted, -1)[clear].min() > 0.999
+    assert not found[~hit].any()
+
+
+def test_consistency_by_hand():
+    depth = jnp.asarray(3 * PLANE[2] / (rays(CAMERA) @ PLANE))
+    alpha = jnp.full(depth.shape, 0.75)
+    normals = 0.75 * jnp.broadcast_to(PLANE, (*depth.shape, 3))
+    same = normal_consistency(normals, alpha, depth, CAMERA)
+    np.testing.assert_allclose(same, 0, atol=1e-12)
+    opposite = normal_consistency(-normals, alpha, depth, CAMERA)
+    share = 28 * 39 / (HEIGHT * WIDTH)
+    np.testing.assert_allclose(opposite, 1.5 * share, rtol=1e-12)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, 1e-20, 1e20])
+def test_gradients_are_finite(value):
+    depth = jnp.full((HEIGHT, WIDTH), value)
+    normals = jnp.zeros((HEIGHT, WIDTH, 3))
+    gradient = jax.grad(normal_consistency, (0, 1, 2))
+    for leaf in gradient(normals, jnp.zeros_like(depth), depth, CAMERA):
+        assert np.isfinite(leaf).all()
+
+
+def test_entropy_by_hand():
+    opacity = jnp.array([0.5, 0.0, 1.0, 0.5])
+    active = jnp.array([True, True, True, False])
+    value = jax.value_and_grad(opacity_entropy)
+    found, slopes = value(opacity, active)
+    np.testing.assert_allclose(found, np.log(2) / 3)
+    assert np.isfinite(slopes).all()
+    assert opacity_entropy(opacity, active & False) == 0
+
+
+def test_flattened_keeps_covariances():
+    rng = np.random.default_rng(0)
+    scales, quats = rng.normal(size=(30, 3)), rng.normal(size=(30, 4))
+    given = gsjax.make_gaussians(
+        means=np.zeros((30, 3)),
+        quats=quats,
+        log_scales=scales,
+        logit_opacities=np.zeros(30),
+        sh=np.zeros((30, 1, 3)),
+    )
+    params = flattened(given).params
+    assert (np.argmin(params.log_scales, -1) == 2).all()
+    before = covariance(given.params.quats, jnp.exp(given.params.log_scales))
+    after = covariance(params.quats, jnp.exp(params.log_scales))
+    np.testing.assert_allclose(after, before, atol=1e-12)
+
+
+def test_surfels_lie_in_the_plane_of_their_neighbours():
+    rng = np.random.default_rng(0)
+    across = np.linalg.svd(PLANE[None])[2][1:]
+    points = rng.uniform(-1, 1, (200, 2)) @ across
+    made = gsjax.make_gaussians(
+        means=points,
+        quats=np.tile([1.0, 0, 0, 0], (200, 1)),
+        log_scales=np.full((200, 3), -2.0),
+        logit_opacities=np.zeros(200),
+        sh=np.zeros((200, 1, 3)),
+        capacity=256,
+    )
+    params = laid_on_points(made).params
+    normals = quaternion_to_matrix(params.quats[:200])[:, :, 2]
+    np.testing.assert_allclose(np.abs(normals @ PLANE), 1, atol=1e-9)
+    np.testing.assert_allclose(params.log_scales[:200, 2], -9)
+
+
+def test_a_run_of_surfels_with_all_losses():
+    config = gsjax.TrainConfig(
+        steps=40,
+        sh_degree=0,
+        raster=RASTER.replace(pair_capacity=None),
+        primitive="surfel",
+        normal_weight=0.05,
+        distortion_weight=10.0,
+        entropy_weight=0.01,
+        prune_invisible=False,
+    )
+    assert config.draws_surfels
+    terms = geometry_terms(config)
+    assert [term.name for term in terms] == ["normals", "distortion", "entropy"]
+    assert [term.start for term in terms] == [10, 4, 20]
+    result = gsjax.fit(dataset(), photos(), config)
+    thin = np.asarray(result.gaussians.params.log_scales)
+    active = np.asarray(result.gaussians.active)
+    assert (thin[active, 2] < thin[active, :2].min(-1) - 4).all()
+    view = gsjax.evaluate(
+        result.gaussians, dataset().views, photos(), config=config.raster
+    )
+    assert np.mean([one.psnr for one in view]) > 15
+
+
+def test_settings_of_geometry():
+    default = gsjax.TrainConfig()
+    assert not default.draws_surfels
+    assert geometry_terms(default) == ()
+    surfels = default.replace(primitive="surfel")
+    assert surfels.raster == default.raster.replace(primitive="surfel")
+    precise = surfels.replace(refine_poses=True)
+    assert precise.raster.alpha_min == 1e-5
+    assert precise.draws_surfels
+    with pytest.raises(InputError, match="primitive"):
+        default.replace(primitive="disc")
