@@ -25,6 +25,9 @@ from gsjax.runtime.files import opened, replacing
 from gsjax.runtime.memory import Estimate, require
 
 _NORMALS = ("nx", "ny", "nz")
+_SURFELS = "2dgs"  # of "comment SplatRenderMode"
+_THIRD = "scale_2"
+_THIN = 7.0  # by which the log of a third scale is less, where surfels have none
 _FILTER = "filter_3D"  # of Mip-Splatting: σ of the filter of each Gaussian
 # Exporters write ±inf for opacities of exactly 0 and 1; the range of `logit`.
 _MAX_LOGIT = math.log((1 - 2.0**-23) / 2.0**-23)
@@ -38,6 +41,9 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
     opacities (Yu et al., "Mip-Splatting", CVPR 2024, equation 9). Opacities of ±inf are
     clamped to the logit of [2^-23, 1 - 2^-23] with a warning. Zero quaternions, values
     that look activated and trailing bytes are warned about.
+
+    Surfels have two scales, or "comment SplatRenderMode: 2dgs"; a third that is absent
+    or −inf becomes a thousandth of the others. `render_mode` tells them apart.
 
     Args:
       path: the file.
@@ -55,11 +61,46 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
     path = Path(path)
     with opened(path, "a .ply file") as file:
         header = read_header(file, path)
-        bases = check_properties(header, _columns(_allocate(0, 1, np.float32)))
+        needed = [*_columns(_allocate(0, 1, np.float32))]
+        needed.remove(_THIRD)
+        bases = check_properties(header, needed)
         check_size(header)
         fields = _read_body(file, header, bases)
+    _fill_third_scales(header, fields["log_scales"])
     _check_values(path, fields, drop_nonfinite)
     return make_gaussians(**fields, capacity=None)
+
+
+def render_mode(path: str | PathLike[str]) -> str | None:
+    """Return how the Gaussians of a PLY file are to be drawn.
+
+    Returns:
+      "2dgs" for surfels, "mip" for ellipsoids trained with antialiasing, another word
+      of "comment SplatRenderMode" in lower case, or None without one.
+
+    Raises:
+      InputError: if the file cannot be read or is not a PLY.
+    """
+    path = Path(path)
+    with opened(path, "a .ply file") as file:
+        header = read_header(file, path)
+    return _SURFELS if _has_surfels(header) else header.render_mode
+
+
+def _has_surfels(header: Header) -> bool:
+    types = header.vertex.types
+    two = {"scale_0", "scale_1"} <= types.keys() and _THIRD not in types
+    return two or header.render_mode == _SURFELS
+
+
+def _fill_third_scales(header: Header, log_scales: np.ndarray) -> None:
+    """Set the third scales [N] that a file of surfels leaves out, in place."""
+    if _has_surfels(header):
+        thin = log_scales[:, :2].min(axis=1, initial=np.inf) - _THIN
+        if _THIRD not in header.vertex.types:
+            log_scales[:, 2] = thin
+        absent = np.isneginf(log_scales[:, 2])
+        log_scales[absent, 2] = thin[absent]
 
 
 def _allocate(count: int, bases: int, dtype) -> dict[str, np.ndarray]:
@@ -99,6 +140,8 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
     )
     fields = _allocate(count, bases, dtype)
     views = _columns(fields)
+    if _THIRD not in header.vertex.types:
+        del views[_THIRD]
     if _FILTER in header.vertex.types:
         views[_FILTER] = np.empty(count, dtype)
     moved = np.zeros(count)  # by rounding to float32, where it is much of the size
@@ -110,7 +153,7 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
                 view[rows] = columns[name]
             if wide and dtype == np.float32:
                 shift = np.max([abs(columns[a] - views[a][rows]) for a in "xyz"], 0)
-                sizes = np.exp(np.max([views[f"scale_{i}"][rows] for i in range(3)], 0))
+                sizes = np.exp(np.max([views[f"scale_{i}"][rows] for i in range(2)], 0))
                 far = np.isfinite(shift) & (shift > MAX_SHIFT * sizes)
                 moved[rows] = np.where(far, shift, 0)
             start += size
@@ -189,14 +232,21 @@ def _warn_of_values(path: Path, fields: Mapping[str, np.ndarray]) -> None:
 
 
 def write_ply(
-    path: str | PathLike[str], gaussians: Gaussians, *, overwrite: bool = False
+    path: str | PathLike[str],
+    gaussians: Gaussians,
+    *,
+    overwrite: bool = False,
+    mode: str | None = None,
 ) -> None:
     """Write the active Gaussians, in their order, as a standard 3DGS PLY.
 
     The file is binary, little-endian float32: x y z nx ny nz f_dc f_rest opacity scale
     rot, with normals of zero. Means are written as float64 if float32 would round them.
     Values that are not finite are written with a warning.
-    Arguments as `gsjax.io.formats.save`.
+
+    Args:
+      path, gaussians, overwrite: as `gsjax.io.formats.save` takes them.
+      mode: written as "comment SplatRenderMode", see `render_mode`; or None.
 
     Raises:
       InputError: if the file exists and ``overwrite`` is not set, if its folder is
@@ -205,12 +255,12 @@ def write_ply(
     path = Path(path)
     require_new(path, overwrite)
     with replacing(path, durable=True) as file:
-        nonfinite = _write_body(file, gaussians)
+        nonfinite = _write_body(file, gaussians, mode)
     if nonfinite:
         warn(f"{path}: {nonfinite} of the Gaussians written are NaN or infinite")
 
 
-def _write_body(file: BinaryIO, gaussians: Gaussians) -> int:
+def _write_body(file: BinaryIO, gaussians: Gaussians, mode: str | None) -> int:
     """Write header and rows; return the number of rows that are not finite."""
     params = gaussians.params.__dict__
     views = _columns({name: np.asarray(array) for name, array in params.items()})
@@ -218,7 +268,9 @@ def _write_body(file: BinaryIO, gaussians: Gaussians) -> int:
     slots = np.flatnonzero(np.asarray(gaussians.active))
     wide = "xyz" if any(_is_rounded(views[axis][slots]) for axis in "xyz") else ""
     kinds = {name: "double" if name in wide else "float" for name in names}
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(slots)}"]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment SplatRenderMode: {mode}"] if mode else []
+    lines += [f"element vertex {len(slots)}"]
     lines += [f"property {kind} {name}" for name, kind in kinds.items()]
     file.write("\n".join([*lines, "end_header", ""]).encode())
     codes = {"float": "<f4", "double": "<f8"}

@@ -20,6 +20,7 @@ _TYPES = {
 _FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _F_REST_COUNTS = [3 * (num_bases(d) - 1) for d in range(MAX_DEGREE + 1)]
 _MAX_HEADER = 1 << 20
+_RENDER_MODE = re.compile(r"^comment\s+SplatRenderMode\s*:\s*(\w+)", re.I | re.M)
 
 
 class Element(NamedTuple):
@@ -48,6 +49,7 @@ class Header(NamedTuple):
       order: byte order of the body, "<", ">", or "" for ascii.
       before, vertex, after: the elements, in the order of the body.
       body, size: byte at which the body starts, and bytes of the file.
+      render_mode: lower-case value of the last "comment SplatRenderMode:"; or None.
     """
 
     path: Path
@@ -57,6 +59,7 @@ class Header(NamedTuple):
     after: list[Element]
     body: int
     size: int
+    render_mode: str | None = None
 
 
 def read_header(file: BinaryIO, path: Path) -> Header:
@@ -84,7 +87,9 @@ def read_header(file: BinaryIO, path: Path) -> Header:
         raise InputError(f"{path}: the header has no 'element vertex'; {found}")
     at = names.index("vertex")
     before, after = elements[:at], elements[at + 1 :]
-    return Header(path, order, before, elements[at], after, end.end(), size)
+    modes = _RENDER_MODE.findall(text.decode("ascii", "replace"))
+    mode = modes[-1].lower() if modes else None
+    return Header(path, order, before, elements[at], after, end.end(), size, mode)
 
 
 def _parse_header(

@@ -112,7 +112,6 @@ class RasterConfig:
             object.__setattr__(self, "unscented", tuple(self.unscented))
         outputs = isinstance(self.outputs, tuple) and len(self.outputs) > 0
         outputs = outputs and set(self.outputs) <= set(OUTPUTS)
-        flat = getattr(self.primitive, "flat", f"{self.primitive}".startswith("surfel"))
         checks = {
             "alpha_min": "(0, 1)",
             "alpha_max": f"({self.alpha_min}, 1]",
@@ -124,7 +123,7 @@ class RasterConfig:
                 not isinstance(self.primitive, str) or self.primitive in PRIMITIVES,
                 f"a gsjax.raster.types.Primitive or one of {', '.join(PRIMITIVES)}",
             ),
-            "projection": PROJECTIONS if not flat else ("ewa",),
+            "projection": ("ewa",) if self.draws_surfels else PROJECTIONS,
             "unscented": (
                 _sigma_weights(self.unscented),
                 "(α, β, κ): 0 < α² ≤ β, κ > −3",
@@ -139,6 +138,12 @@ class RasterConfig:
             "devices": "[1, inf)",
         }
         require_ranges(self, checks)
+
+    @property
+    def draws_surfels(self) -> bool:
+        """True if the Gaussians are drawn as surfels."""
+        name = getattr(self.primitive, "name", self.primitive)
+        return f"{name}".startswith("surfel")
 
     @property
     def blends_ray_depth(self) -> bool:

@@ -9,8 +9,9 @@ import numpy as np
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, num_active, select, with_sh_degree
 from gsjax.io.formats import load, save
+from gsjax.io.ply import render_mode, write_ply
 from gsjax.io.spz import write_spz
-from gsjax.runs.folder import load_settings
+from gsjax.runs.folder import load_settings, ply_mode
 from gsjax.runs.scene_source import is_run, splat_file
 from gsjax.runtime.files import make_folder, reject_existing
 
@@ -52,9 +53,18 @@ def export_scene(
         if out.suffix.lower() == ".spz":
             antialias = is_run(source) and load_settings(source).config.raster.antialias
             write_spz(out, gaussians, overwrite=True, antialias=antialias)
+        elif out.suffix.lower() == ".ply":
+            write_ply(out, gaussians, overwrite=True, mode=_mode(source))
         else:
             save(out, gaussians, overwrite=True)
         return int(num_active(gaussians)), found
+
+
+def _mode(source: Path) -> str | None:
+    """Return the render mode of a run or file."""
+    if is_run(source):
+        return ply_mode(load_settings(source).config.raster)
+    return render_mode(source) if source.suffix.lower() == ".ply" else None
 
 
 def _load_opaque(path: Path, min_opacity: float) -> tuple[Gaussians, int]:

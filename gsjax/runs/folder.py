@@ -29,7 +29,9 @@ from gsjax.data.splits import split_views
 from gsjax.data.types import Dataset, View
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
-from gsjax.io.formats import load, save
+from gsjax.io.formats import load
+from gsjax.io.ply import write_ply
+from gsjax.raster.types import RasterConfig
 from gsjax.runs.config_json import check_types, config_from_json
 from gsjax.runs.history import read_metrics
 from gsjax.runs.refined_cameras import load_cameras
@@ -230,13 +232,22 @@ def save_settings(folder: Path, settings: RunSettings) -> None:
 
 
 def save_scene(
-    path: Path, gaussians: Gaussians, dataset: Dataset, *, overwrite: bool = False
+    path: Path, gaussians: Gaussians, dataset: Dataset, config: TrainConfig
 ) -> None:
-    """Write Gaussians in the coordinates of the dataset's files; as `gsjax.save`."""
+    """Write Gaussians as a PLY in the coordinates of the dataset's files.
+
+    Replaces an existing file.
+    """
+    options: dict = {"overwrite": True, "mode": ply_mode(config.raster)}
     if not np.any(dataset.origin):
-        return save(path, gaussians, overwrite=overwrite)
+        return write_ply(path, gaussians, **options)
     with jax.enable_x64(True):
-        save(path, _moved(gaussians, dataset.origin), overwrite=overwrite)
+        write_ply(path, _moved(gaussians, dataset.origin), **options)
+
+
+def ply_mode(raster: RasterConfig) -> str | None:
+    """Return the render mode that a PLY file of a scene is marked with."""
+    return "2dgs" if raster.draws_surfels else None
 
 
 def _moved(gaussians: Gaussians, offset: np.ndarray) -> Gaussians:

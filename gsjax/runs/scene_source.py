@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.gaussians import Gaussians
+from gsjax.io.ply import render_mode
 from gsjax.raster.types import RasterConfig
 from gsjax.runs import folder as run_folder
 
@@ -73,8 +74,8 @@ def open_scene_source(
       path: a .ply or .spz file, or the folder of a run.
       origin: [3] to subtract from the file's coordinates, as `load_dataset` and
         `load_near_transforms` do from those of the cameras.
-      raster: render settings, except ``antialias``, which is that of the run; None for
-        `free_view_config` of the run, or "compat" for a file.
+      raster: render settings, except ``antialias`` and ``primitive``, which are those
+        of the scene; None for `free_view_config` of the run, or "compat" for a file.
       background: RGB; None for that of the run, or black for a file.
 
     Raises:
@@ -85,8 +86,11 @@ def open_scene_source(
         trained = run_folder.load_settings(path).config
         config, behind = trained.raster, run_folder.background_color(trained)
         config = free_view_config(config)
-    if raster is not None:  # opacities are learnt for one value of antialias
-        config = raster.replace(antialias=config.antialias)
+    elif path.suffix.lower() == ".ply" and render_mode(path) == "2dgs":
+        config = config.replace(primitive="surfel")
+    if raster is not None:  # a scene is learnt for one way of drawing
+        same = {"antialias": config.antialias, "primitive": config.primitive}
+        config = raster.replace(**same)
     splat = splat_file(path)
     origin = np.zeros(3) if origin is None else origin
     reader = partial(run_folder.load_scene, splat, origin)

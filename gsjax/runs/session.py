@@ -117,7 +117,7 @@ class Session:
     def save_result(self, state: TrainState) -> None:
         """Write the current scene, and its cameras if they are refined."""
         files, dataset = self.files, self.split.dataset
-        save_scene(files.splat, state.gaussians, dataset, overwrite=True)
+        save_scene(files.splat, state.gaussians, dataset, self.config)
         if (cameras := self.cameras(state)) is not dataset:
             save_cameras(files.cameras, cameras)
 

@@ -206,12 +206,6 @@ class TrainConfig:
             raster = raster.replace(primitive=self.primitive)
         return raster
 
-    @property
-    def draws_surfels(self) -> bool:
-        """True if the Gaussians are surfels."""
-        primitive = self.raster.primitive
-        return f"{getattr(primitive, 'name', primitive)}".startswith("surfel")
-
     def replace(self, **changes) -> "TrainConfig":
         """Return a copy with some settings changed.
 

@@ -96,7 +96,7 @@ def initial_state(
         capacity=lambda count: slots_for(count, 0, config, setup.schedule),
         seed=config.seed,
     )
-    if config.draws_surfels:
+    if config.raster.draws_surfels:
         gaussians = laid_on_points(gaussians)
     return _jitted_state(setup, gaussians, views)
 

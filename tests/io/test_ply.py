@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 from gsjax.gaussians import Gaussians, grow, make_gaussians, select
 from gsjax.io.formats import load, save
 from gsjax.io.numerals import BLOCK, find_words, parse_number, parse_numbers
-from gsjax.io.ply import read_ply, write_ply
+from gsjax.io.ply import read_ply, render_mode, write_ply
 from gsjax.runs.export import export_scene
+from gsjax.runs.scene_source import open_scene_source
 
 FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
@@ -335,6 +336,40 @@ def test_the_filter_of_mip_splatting_is_applied(tmp_path):
     for name in ("means", "quats", "sh"):
         np.testing.assert_array_equal(getattr(read, name), fields[name])
     np.testing.assert_array_equal(read.log_scales[:4], fields["log_scales"][:4])
+
+
+@pytest.mark.parametrize("third", ["absent", "-inf", "given"])
+def test_files_of_surfels(tmp_path, third):
+    """A third scale that is absent or −inf is thin; the render mode is told and kept."""
+    fields = random_fields(20, 0)
+    table = table_of(fields)
+    if third == "absent":
+        del table["scale_2"]
+    elif third == "-inf":
+        table["scale_2"] = np.full(20, -np.inf, np.float32)
+    content = ply_file(table)
+    if third != "absent":
+        line = b"comment SPLATRENDERMODE: 2DGS"
+        content = content.replace(b"comment made by a test", line)
+    path = put(tmp_path, content)
+    assert render_mode(path) == "2dgs"
+    read = load(path).params
+    wanted = fields["log_scales"].copy()
+    if third != "given":
+        wanted[:, 2] = wanted[:, :2].min(1) - 7
+    np.testing.assert_allclose(read.log_scales, wanted, rtol=1e-6)
+    assert open_scene_source(path).config.primitive == "surfel"
+    out = tmp_path / "out.ply"
+    export_scene(path, out)
+    assert render_mode(out) == "2dgs"
+    assert b"comment SplatRenderMode: 2dgs\n" in out.read_bytes()
+    np.testing.assert_array_equal(load(out).params.log_scales, read.log_scales)
+
+
+def test_files_of_ellipsoids_have_no_render_mode(tmp_path):
+    path = put(tmp_path, standard(random_fields(5, 1)))
+    assert render_mode(path) is None
+    assert open_scene_source(path).config.primitive is None
 
 
 def zero_quaternion(fields):

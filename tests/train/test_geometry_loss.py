@@ -139,7 +139,7 @@ def test_a_run_of_surfels_with_all_losses():
         entropy_weight=0.01,
         prune_invisible=False,
     )
-    assert config.draws_surfels
+    assert config.raster.draws_surfels
     terms = geometry_terms(config)
     assert [term.name for term in terms] == ["normals", "distortion", "entropy"]
     assert [term.start for term in terms] == [10, 4, 20]
@@ -155,12 +155,12 @@ def test_a_run_of_surfels_with_all_losses():
 
 def test_settings_of_geometry():
     default = gsjax.TrainConfig()
-    assert not default.draws_surfels
+    assert not default.raster.draws_surfels
     assert geometry_terms(default) == ()
     surfels = default.replace(primitive="surfel")
     assert surfels.raster == default.raster.replace(primitive="surfel")
     precise = surfels.replace(refine_poses=True)
     assert precise.raster.alpha_min == 1e-5
-    assert precise.draws_surfels
+    assert precise.raster.draws_surfels
     with pytest.raises(InputError, match="primitive"):
         default.replace(primitive="disc")

@@ -104,7 +104,7 @@ def test_a_page_of_a_run_holds_its_cameras_and_photographs(tmp_path, capsys):
     """Far from the origin; up is +y in the browser, by default that of the cameras."""
     run = run_at(tmp_path, TrainConfig(), origin=FAR)
     far = replace(training.dataset(), origin=FAR)
-    save_scene(run_files(run).splat, training.true_gaussians(), far)
+    save_scene(run_files(run).splat, training.true_gaussians(), far, TrainConfig())
     sizes = []
     for up in (None, "+x", "-y"):
         out = tmp_path / f"{up}.html"
