@@ -340,7 +340,7 @@ def test_the_filter_of_mip_splatting_is_applied(tmp_path):
 
 @pytest.mark.parametrize("third", ["absent", "-inf", "given"])
 def test_files_of_surfels(tmp_path, third):
-    """A third scale that is absent or −inf is thin; the render mode is told and kept."""
+    """A third scale that is absent or −inf is thin; the render mode is kept."""
     fields = random_fields(20, 0)
     table = table_of(fields)
     if third == "absent":
