@@ -31,13 +31,15 @@ from gsjax.runs.demo import demo_config
 from gsjax.runs.refined_cameras import refine_dataset, refine_photos
 from gsjax.synthetic.optics import Optics
 from gsjax.synthetic.raycaster import surface_points
-from gsjax.train.config import TrainConfig
+from gsjax.train.config import Level, TrainConfig
 from gsjax.train.loop import subset
 
 LENS = Optics("opencv", (-0.1, 0.02, 0.0, 0.0))
 SHUTTER = "top_to_bottom"
 TOO_LONG = 1.02
 DISPLACEMENT = 20.0  # px over the exposure
+# The motion is first found where it is few pixels long.
+LEVELS = (Level(0.0, 8), Level(0.1, 4), Level(0.2, 2), Level(0.3, 1))
 NO_LENS = dict.fromkeys(("focal off, %", "centre off, px", "k1 off", "k2 off"))
 NO_MOTION = {"motion off, px": None, "largest, px": None}
 
@@ -144,8 +146,8 @@ def shutter_rows(capture, config: TrainConfig, seed: int) -> list[dict]:
     # Training does not see the motions of the held-out views.
     still = with_twists(given, rest, motions)
     still = with_twists(still, chosen, np.zeros((len(motions), 6)))
-    config = config.replace(shutter=SHUTTER)
-    refining = config.replace(refine_shutter=True)
+    config = config.replace(shutter=SHUTTER, levels=LEVELS)
+    refining = config.replace(refine_shutter=True, shutter_rate=2e-3)
     cases = {
         "true motion": (true, config.replace(raster=refining.raster)),
         "no motion": (still, config.replace(raster=refining.raster)),
