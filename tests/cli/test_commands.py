@@ -226,6 +226,27 @@ def test_export(demo, tmp_path, capsys):
     assert not (tmp_path / "c.ply").exists()
 
 
+def test_mesh(demo, tmp_path, capsys):
+    trimesh = pytest.importorskip("trimesh")
+    out = tmp_path / "new" / "mesh.glb"
+    words = ["mesh", demo / "run", "-o", out, "--resolution", "32"]
+    text = run(*words, "--box=-3,-3,-1,3,3,2", "--parts", "0").out
+    found = trimesh.load(out, force="mesh")
+    assert text.startswith(
+        f"{out}  {len(found.faces):,} triangles, open, voxels 0.1875"
+    )
+    assert len(found.faces) > 100
+    assert (np.abs(found.vertices[:, :2]) <= 3).all()
+    assert main([str(word) for word in words]) == 3
+    assert "exists; pass --overwrite" in capsys.readouterr().err
+    for wrong, message in (("--box=1,2", "six numbers"), ("-o=a.xyz", ".stl")):
+        assert main([*map(str, words), "--overwrite", wrong]) == 2
+        assert message in capsys.readouterr().err
+    nowhere = [*map(str, words), "--overwrite", "--box=90,90,90,91,91,91"]
+    assert main(nowhere) == 3
+    assert "check the box" in capsys.readouterr().err
+
+
 def test_info_of_a_run(demo, tmp_path):
     facts = json.loads(run("info", demo / "run", "--json").out)
     report, gaussians = facts["run"], gsjax.load(demo / "run" / "splat.ply")
