@@ -36,7 +36,7 @@ _MARGIN = 0.05  # of the box, added on each side
 
 
 class MeshSettings(NamedTuple):
-    """How a mesh is made.
+    """Settings of a mesh.
 
     Attributes:
       resolution: voxels along the longest side of the box.
@@ -55,7 +55,7 @@ class MeshSettings(NamedTuple):
 
 
 class MeshReport(NamedTuple):
-    """What was made.
+    """A mesh, and how it was made.
 
     Attributes:
       mesh: the mesh, in the coordinates of the dataset's files.
