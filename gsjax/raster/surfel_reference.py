@@ -35,8 +35,13 @@ class DensePixels(NamedTuple):
 def pixel_rays(camera: Camera) -> Array:
     """Return points [P, 3] at z = 1 on the rays of all pixels, row by row."""
     ys, xs = jnp.mgrid[: camera.height, : camera.width] + 0.5
-    x = (xs.ravel() - camera.K[0, 2]) / camera.K[0, 0]
-    y = (ys.ravel() - camera.K[1, 2]) / camera.K[1, 1]
+    return _rays_through(camera, jnp.stack([xs.ravel(), ys.ravel()], -1))
+
+
+def _rays_through(camera: Camera, pixels: Array) -> Array:
+    """Return points [..., 3] at z = 1 on the rays of places [..., 2] of the image."""
+    x = (pixels[..., 0] - camera.K[0, 2]) / camera.K[0, 0]
+    y = (pixels[..., 1] - camera.K[1, 2]) / camera.K[1, 1]
     return jnp.stack([x, y, jnp.ones_like(x)], -1)
 
 
@@ -120,16 +125,20 @@ def dense_ellipsoids(
 ) -> DensePixels:
     """Return ellipsoids at every pixel, with the depth of a ray's densest point."""
     means, _ = _seen(gaussians, camera)
-    rays, params = pixel_rays(camera), gaussians.params
+    params = gaussians.params
     rotation = camera.viewmat[:3, :3]
     world = covariance(params.quats, jnp.exp(params.log_scales))
     inverse = jnp.linalg.inv(rotation @ world @ rotation.T)
     pulled = jnp.einsum("nij,nj->ni", inverse, means)
-    across = jnp.einsum("pi,nij,pj->np", rays, inverse, rays)
-    depth = (pulled @ rays.T) / across
     means2d, _, cov2d, *_ = reference_project(gaussians, camera, config.dilation)
     ys, xs = jnp.mgrid[: camera.height, : camera.width] + 0.5
     offset = jnp.stack([xs, ys], -1).reshape(-1, 2) - means2d[:, None]
+    # Where a pixel is expected to lie before the dilation.
+    sharp = cov2d - config.dilation * jnp.eye(2)
+    expected = jnp.einsum("nij,njk,npk->npi", sharp, jnp.linalg.inv(cov2d), offset)
+    rays = _rays_through(camera, means2d[:, None] + expected)
+    across = jnp.einsum("npi,nij,npj->np", rays, inverse, rays)
+    depth = jnp.einsum("ni,npi->np", pulled, rays) / across
     power = jnp.einsum("npi,nij,npj->np", offset, jnp.linalg.inv(cov2d), offset)
     opacity = jax.nn.sigmoid(params.logit_opacities)
     normals = -pulled / jnp.linalg.norm(pulled, axis=-1, keepdims=True)

@@ -165,7 +165,8 @@ def test_depth_and_normals_of_ellipsoids(report):
         sh=np.zeros((count, 1, 3)),
     )
     camera = camera_in(data, 1e-3)
-    config = COMPAT.replace(outputs=("depth", "normals"), ray_depth=True)
+    outputs = "depth", "normals"
+    config = COMPAT.replace(outputs=outputs, ray_depth=True, dilation=0)
     owner, pixel = data["pair_gaussian"], data["pair_pixel"] + 0.5
 
     @jax.jit

@@ -202,7 +202,8 @@ def _project_components(
     colors = colors_of(rows._replace(means=means), camera, exposure, live)
     shape = (1 / jnp.sqrt(a), b / a, jnp.sqrt(a / det))
     if config.blends_ray_depth:
-        numbers = ray_numbers(camera, exposure, quat, scales)
+        filtered = a, b, c, det, config.dilation
+        numbers = ray_numbers(camera, exposure, quat, scales, filtered)
         shape = (*shape, *(jnp.where(live, number, 1) for number in numbers))
     normals = None
     if "normals" in config.outputs:

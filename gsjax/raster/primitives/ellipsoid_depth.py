@@ -11,6 +11,10 @@ which k₁ and k₂ are triangular components. Exact for a pinhole; other lenses
 perspective about the mean, to first order. The normal is that of the surface of equal
 density at the mean.
 
+The image of an ellipsoid is dilated. So an offset d of a pixel stands for the offset
+(1 − s Σ'⁻¹) d before the dilation by s, its expectation given d: a ray that passes
+beside a thin ellipsoid shows it where it is, not where it would be extended to.
+
 Nothing is divided by a scale: all are taken relative to the smallest one, so flat
 ellipsoids and needles keep their digits.
 """
@@ -40,12 +44,12 @@ _LEAST = 1e-12  # of e² + κ², and of the squares that are divided by
 
 
 def _parts(shape: Numbers) -> Parts:
-    inv_sx, slope, inv_sy, gx, gy, k1, k2x, k2y, depth = shape
+    inv_sx, slope, inv_sy, gx, gy, k1x, k1y, k2x, k2y, depth = shape
     planes = (
         Plane(0.0, inv_sx, 0.0),
         Plane(0.0, -inv_sy * slope, inv_sy),
         Plane(1.0, gx, gy),
-        Plane(0.0, k1, 0.0),
+        Plane(0.0, k1x, k1y),
         Plane(0.0, k2x, k2y),
     )
     return Parts(planes, depth)
@@ -99,14 +103,16 @@ def _positive(x: Array) -> Array:
     return jnp.where(x > _LEAST, x, _LEAST)
 
 
-def ray_numbers(camera: Camera, exposure: Exposure, quat, scales) -> Numbers:
-    """Return gx, gy, k1, k2x, k2y and z₀ of `RAY_FORM`, [R] each.
+def ray_numbers(camera: Camera, exposure: Exposure, quat, scales, filtered) -> Numbers:
+    """Return the numbers of `RAY_FORM` behind those of an ellipsoid, [R] each.
 
     Args:
       camera: a single camera.
       exposure: from `expose`.
       quat: (w, x, y, z), any norm above zero.
       scales: three standard deviations.
+      filtered: a, b, c and the determinant of the dilated covariance, and the px² by
+        which it was dilated.
     """
     depth, view = camera.lens.depth(exposure.point), exposure.viewmat
     u, v = image_rows(camera, exposure, lens_jacobian(camera, exposure.point))
@@ -129,7 +135,15 @@ def ray_numbers(camera: Camera, exposure: Exposure, quat, scales) -> Numbers:
     across = [a - gx * b for a, b in zip(p, m)]
     k2x = dot(across, rest) / (square * length)
     k1 = dot(m, cross(p, q)) / (square * jnp.sqrt(square) * length)
-    return gx, gy, k1, k2x, length, depth
+    a, b, c, det, dilation = filtered
+
+    def before(x: Array | float, y: Array | float) -> tuple[Array, Array]:
+        """Return a row times 1 − s Σ'⁻¹."""
+        share = dilation / det
+        return x - share * (c * x - b * y), y - share * (a * y - b * x)
+
+    rows = before(gx, gy), before(k1, 0.0), before(k2x, length)
+    return *(number for row in rows for number in row), depth
 
 
 def ray_normals(exposure: Exposure, quat, scales) -> tuple[Array, ...]:
