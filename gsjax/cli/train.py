@@ -64,8 +64,8 @@ class TrainCommand(HeavyCommand):
     """Split by absolute gradients in the adaptive strategy: sharper, with more
     Gaussians."""
     primitive: Literal["ellipsoid", "surfel", "surfel_area"] = "ellipsoid"
-    """What is trained: ellipsoids, or surfels (2D Gaussian splatting) with the filter
-    of the paper or one that keeps the area."""
+    """Kind of Gaussian: ellipsoids, or surfels (2D Gaussian splatting) with the filter
+    of the paper (surfel) or one that keeps the area (surfel_area)."""
     normal_weight: float | None = None
     """Weight of the loss of normals that disagree with those of the depth. Default:
     0.05 for surfels, else 0."""

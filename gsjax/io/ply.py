@@ -66,7 +66,6 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
         bases = check_properties(header, needed)
         check_size(header)
         fields = _read_body(file, header, bases)
-    _fill_third_scales(header, fields["log_scales"])
     _check_values(path, fields, drop_nonfinite)
     return make_gaussians(**fields, capacity=None)
 
@@ -157,6 +156,7 @@ def _read_body(file: BinaryIO, header: Header, bases: int) -> dict[str, np.ndarr
                 far = np.isfinite(shift) & (shift > MAX_SHIFT * sizes)
                 moved[rows] = np.where(far, shift, 0)
             start += size
+        _fill_third_scales(header, fields["log_scales"])
         if _FILTER in views:
             _smooth(fields, views[_FILTER])
     if moved.any():

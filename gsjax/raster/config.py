@@ -47,7 +47,7 @@ class RasterConfig:
       ray_depth: blend the depth of the point at which the ray of a pixel meets a
         Gaussian, instead of that of its mean: the densest point along the ray (Zhang et
         al. 2024, RaDe-GS). Surfels always do.
-      primitive: what is drawn: "ellipsoid"; "surfel", a flat Gaussian with the low-pass
+      primitive: kind of Gaussian: "ellipsoid"; "surfel", flat, with the low-pass
         filter of Huang et al. (2024); "surfel_area", which filters by ``dilation`` and
         ``antialias`` instead; or a `Primitive`. None for ellipsoids.
       projection: how an ellipsoid is brought to the image: "ewa" linearises lens and

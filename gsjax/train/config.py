@@ -88,7 +88,7 @@ class TrainConfig:
         all views share. Pinholes get OpenCV's k1 k2 p1 p2.
       refine_shutter: optimise the motion of each camera during the exposure of a
         rolling ``shutter``.
-      primitive: what is trained, see `RasterConfig.primitive`; None for that of
+      primitive: kind of Gaussian, see `RasterConfig.primitive`; None for that of
         ``raster``. Surfels start in the planes of neighbouring points.
       normal_weight, distortion_weight, entropy_weight: weights of
         `gsjax.train.geometry_loss`: of `normal_consistency`, of `distortion_term`, and

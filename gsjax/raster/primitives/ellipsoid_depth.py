@@ -23,7 +23,6 @@ import jax
 import jax.numpy as jnp
 
 from gsjax.cameras.camera import Camera
-from gsjax.cameras.lenses import z_depth
 from gsjax.cameras.shutter import Exposure, entry, image_rows
 from gsjax.math import rotations
 from gsjax.math.numerics import safe_normalize
@@ -37,7 +36,7 @@ from gsjax.raster.forms import (
     gaussian_power,
 )
 from gsjax.raster.primitives.ewa import lens_jacobian
-from gsjax.raster.primitives.rows import cross, dot
+from gsjax.raster.primitives.rows import cross, depth_slopes, dot
 from gsjax.raster.types import Array
 
 _LEAST = 1e-12  # of e² + κ², and of the squares that are divided by
@@ -114,15 +113,9 @@ def ray_numbers(camera: Camera, exposure: Exposure, quat, scales, filtered) -> N
       filtered: a, b, c and the determinant of the dilated covariance, and the px² by
         which it was dilated.
     """
-    depth, view = camera.lens.depth(exposure.point), exposure.viewmat
+    depth = camera.lens.depth(exposure.point)
     u, v = image_rows(camera, exposure, lens_jacobian(camera, exposure.point))
-    if camera.lens.depth is z_depth:
-        away = tuple(entry(view, 2, j) for j in range(3))
-    else:
-        ray = [p / depth for p in exposure.point]
-        away = tuple(
-            sum(ray[i] * entry(view, i, j) for i in range(3)) for j in range(3)
-        )
+    away = depth_slopes(camera, exposure)
     # Steps at equal depth that move the image by a pixel along u, and along v.
     over = 1 / dot(away, cross(u, v))
     p = _in_deviations([n * over for n in cross(v, away)], quat, scales)

@@ -13,7 +13,14 @@ from jax import lax
 
 from gsjax.cameras.camera import LENS_RANGE, NEAREST, Camera, camera_centre
 from gsjax.cameras.lenses import everywhere, z_depth
-from gsjax.cameras.shutter import Exposure, Moment, centre, expose, exposed_at
+from gsjax.cameras.shutter import (
+    Exposure,
+    Moment,
+    centre,
+    entry,
+    expose,
+    exposed_at,
+)
 from gsjax.math import sh as sh_lib
 from gsjax.math.numerics import safe_normalize
 from gsjax.raster.lists.occlusion_culling import is_wide
@@ -194,6 +201,19 @@ def cross(a: Sequence[Any], b: Sequence[Any]) -> Sequence[Array]:
         a[2] * b[0] - a[0] * b[2],
         a[0] * b[1] - a[1] * b[0],
     )
+
+
+def depth_slopes(camera: Camera, exposure: Exposure) -> tuple[Array, ...]:
+    """Return the derivative of depth by a world point, [R] components.
+
+    Of the depth along the ray of the mean, for lenses that order by distance.
+    """
+    view = exposure.viewmat
+    if camera.lens.depth is z_depth:
+        return tuple(entry(view, 2, j) for j in range(3))
+    depth = camera.lens.depth(exposure.point)
+    ray = [p / depth for p in exposure.point]
+    return tuple(dot(ray, [entry(view, i, j) for i in range(3)]) for j in range(3))
 
 
 class Components(NamedTuple):

@@ -30,8 +30,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from gsjax.cameras.camera import Camera
-from gsjax.cameras.lenses import z_depth
-from gsjax.cameras.shutter import Exposure, entry, expose, image_rows
+from gsjax.cameras.shutter import entry, expose, image_rows
 from gsjax.errors import InputError
 from gsjax.math import rotations
 from gsjax.math.numerics import (
@@ -60,6 +59,7 @@ from gsjax.raster.primitives.rows import (
     candidates,
     colors_of,
     cross,
+    depth_slopes,
     dot,
     order_depth,
     project_rows,
@@ -227,7 +227,7 @@ def _project_components(
     m1, m2 = (tuple(dot(row, a) * s for a, s in zip(axes, scales)) for row in images)
     m1, m2 = shortened(m1, m2)
     m1, m2 = materialize(m1, live), materialize(m2, live)
-    away = _depth_slopes(camera, exposure)
+    away = depth_slopes(camera, exposure)
     pulls = tuple(-dot(away, a) * s / depth for a, s in zip(axes, scales))
     opacity = jax.nn.sigmoid(jnp.where(live, rows.logit_opacities, 0))
     minor = scales[0] * scales[1] * dot(across, normal)
@@ -261,19 +261,6 @@ def _axes(quat):
     over = 1 / sum(q * q for q in quat)
     columns = [tuple(row[j] * over for row in rotation) for j in range(3)]
     return columns[:2], columns[2]
-
-
-def _depth_slopes(camera: Camera, exposure: Exposure) -> tuple[Array, ...]:
-    """Return the derivative of depth by a world point, [R] components.
-
-    Of the depth along the ray of the mean, for lenses that order by distance.
-    """
-    view = exposure.viewmat
-    if camera.lens.depth is z_depth:
-        return tuple(entry(view, 2, j) for j in range(3))
-    depth = camera.lens.depth(exposure.point)
-    ray = [p / depth for p in exposure.point]
-    return tuple(dot(ray, [entry(view, i, j) for i in range(3)]) for j in range(3))
 
 
 def _factored(filter: str, m, pulls, minor: Array, live: Array, config: RasterConfig):
