@@ -242,7 +242,9 @@ def _project_components(
         facing * sum(entry(exposure.viewmat, i, j) * normal[j] for j in range(3))
         for i in range(3)
     ]
-    outline = _outline(filter, lax.stop_gradient(shape), reach)
+    place = jnp.where(live, u, 0), jnp.where(live, v, 0)
+    fixed = lax.stop_gradient((place, shape))
+    outline = _outline(filter, *fixed, reach, camera)
     return Projected(
         u=u,
         v=v,
@@ -291,33 +293,66 @@ def _factored(filter: str, m, pulls, minor: Array, live: Array, config: RasterCo
     return (inv_sx, slope, inv_sy, w1, w2), live, jnp.where(live, sharp, 1) / det
 
 
-def _outline(filter: str, shape: Numbers, reach: Array) -> tuple[Array, ...]:
+def _outline(
+    filter: str, place: Numbers, shape: Numbers, reach: Array, camera: Camera
+) -> tuple[Array, ...]:
     """Return shift of the centre (u, v) and covariance a, b, c, det of an ellipse.
 
-    It holds all offsets with |y| ≤ q e, q² = ``reach``: a conic with its focus at the
-    centre, of eccentricity q |w|. What reaches the near plane is held by the disc
-    |y| ≤ q z₀ / near instead. With a floor it holds the blob, too.
+    It holds all offsets in the image with |y| ≤ q e, q² = ``reach``, that meet the
+    surfel beyond the near plane. In the direction of w, |y| ≤ q e is a conic with its
+    focus at the centre and of eccentricity k = q |w|; from its vertex, at q / (1 + k)
+    before the focus, its half width t at distance x is t² = 2 q x + (k² − 1) x². The
+    ellipse is the conic itself, or the least one about its first part, to x = D, if
+    that is smaller: of half axes 2 D / 3 and 2 t / √3, about x = 2 D / 3. With a floor
+    it holds the blob, too.
     """
     inv_sx, slope, inv_sy, w1, w2, _, nearest = shape
     sx, sy = 1 / inv_sx, 1 / inv_sy
-    away = jnp.sqrt(reach * (w1 * w1 + w2 * w2))
-    conic = 1 - away > nearest
-    away = jnp.where(conic, away, 0)
-    grown = jnp.where(conic, 1 / (1 - away * away), 1 / jnp.square(nearest))
-    longer = jnp.where(conic, grown * reach, 0)
-    # L w, along which the conic is longer and its centre lies.
-    p = sx * w1
-    q = slope * p + sy * w2
-    a = grown * (sx * sx + longer * p * p)
-    b = grown * (slope * sx * sx + longer * p * q)
-    c = grown * (slope * slope * sx * sx + sy * sy + longer * q * q)
-    det = jnp.square(grown * sx * sy) * jnp.where(conic, grown, 1)
-    more = 0.0
+    steep = jnp.sqrt(w1 * w1 + w2 * w2)
+    tilted = steep > 0
+    n1 = jnp.where(tilted, safe_divide(w1, steep, tilted), 1)
+    n2 = safe_divide(w2, steep, tilted)
+    # L n, and L times the vector across.
+    along = sx * n1, sx * slope * n1 + sy * n2
+    across = -sx * n2, -sx * slope * n2 + sy * n1
+    q = jnp.sqrt(reach)
+    k = q * steep
+    # Largest y · n in the image, and in front of the near plane, over q.
+    v_side = inv_sy * n2
+    u_side = inv_sx * n1 - slope * v_side
+    end = _farthest(u_side, place[0], camera.width)
+    end += _farthest(v_side, place[1], camera.height)
+    end = safe_divide(jnp.maximum(end, 0), q, q > 0)
+    near = safe_divide(1 / nearest - 1, k, k > 0)
+    end = jnp.where(k > 0, jnp.minimum(end, near), end)
+    first = 1 / (1 + k)
+    length = end + first
+    wide = k * length
+    part = (3 - 2 * length + 2 * k * wide >= 0) | (k >= 1)
+    square = jnp.where(part, 0, k * k)
+    whole = 1 / (1 - square)
+    shift = q * jnp.where(part, 2 / 3 * length - first, k * whole)
+    long = jnp.where(part, jnp.square(2 / 3 * length), whole * whole)
+    half = jnp.where(part, length * (2 - length) + wide * wide, 0)
+    short = jnp.where(part, 4 / 3 * half, whole)
+    a = long * along[0] ** 2 + short * across[0] ** 2
+    b = long * along[0] * along[1] + short * across[0] * across[1]
+    c = long * along[1] ** 2 + short * across[1] ** 2
+    det = long * short * jnp.square(sx * sy)
     if filter == "floor":
-        blob = FLOOR / jnp.square(1 - away)
+        # An ellipse about the sum of the part, which holds the focus, and the blob.
+        blob = FLOOR / jnp.square(1 - jnp.where(part, 0, k))
         more = jnp.maximum(blob - safe_divide(det, a + c, a + c > 0), 0)
-    det = det + more * (a + c) + more * more
-    return longer * p, longer * q, a + more, b, c + more, det
+        more = jnp.where(part, 5 * FLOOR, more)
+        times = jnp.where(part, 1.25, 1)
+        det = times * (times * det + more * (a + c)) + more * more
+        a, b, c = times * a + more, times * b, times * c + more
+    return shift * along[0], shift * along[1], a, b, c, det
+
+
+def _farthest(side: Array, place: Array, size) -> Array:
+    """Return the largest ``side`` · (x − place) of x in an image of that size."""
+    return jnp.where(side > 0, side * (size - place), -side * place)
 
 
 def _footprint(out: Projected) -> Footprint:
