@@ -7,53 +7,79 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from gsjax.cli.common import HeavyCommand, UsageError, start_jax
-from gsjax.cli.options import integer
+from gsjax.cli.options import integer, real
 from gsjax.runtime.console import say
 
 
 @dataclass(kw_only=True)
 class MeshCommand(HeavyCommand):
-    """Make a triangle mesh of a run, to print, measure or view."""
+    """Make a triangle mesh of a scene, to print, measure or view."""
 
-    run_folder: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Folder of a run; surfels give the best meshes (gsjax train --primitive
-    surfel)."""
-    out: Annotated[Path, arg(aliases=["-o"], metavar="MESH")]
-    """File to write: .ply, .glb, .obj or .stl (without colours)."""
+    scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
+    """Folder of a run, or a .ply or .spz file (with --sphere); surfels give the best
+    meshes (gsjax train --primitive surfel)."""
+    out: Annotated[Path | None, arg(aliases=["-o"], metavar="MESH")] = None
+    """File to write: .ply, .glb, .obj or .stl (without colours). Default: mesh.ply in
+    the folder of the run, where gsjax view --mesh finds it."""
     resolution: Annotated[int, integer(8, 4096)] = 256
     """Voxels along the longest side of the box."""
     box: Annotated[str | None, arg(metavar="X,Y,Z,X,Y,Z")] = None
     """Corners of the box in the coordinates of the dataset. Default: a box that holds
     the opaque Gaussians but for 2 % on each side."""
-    depth: Literal["median", "expected"] = "median"
-    """Depth of a pixel: where half of the light has been blocked, or the mean."""
-    parts: Annotated[int, integer(0)] = 1
-    """Number of connected parts to keep, the largest; 0 keeps all."""
+    unbounded: bool = False
+    """Mesh all that the views show; voxels grow with the distance from the box, which
+    takes half of the voxels of each axis."""
+    sphere: Annotated[int, integer(0, 10_000)] = 0
+    """Take depth from this many views on a sphere about the box, not from the training
+    views."""
+    depth: Literal["median", "expected"] | None = None
+    """Depth of a pixel: where half of the light has been blocked, or the mean. Default:
+    median, or expected with --unbounded."""
+    truncation: Annotated[float, real(1, 100)] = 4.0
+    """Depth behind the surface, in voxels, to which an image counts: more for noisy
+    depth, less for thin objects."""
+    parts: Annotated[int | None, integer(0)] = None
+    """Number of connected parts to keep, the largest; 0 keeps all. Default: those with
+    at least 1 % of the triangles."""
     closed: bool = False
-    """Close the mesh where no view has seen anything, so that it is watertight."""
+    """Make a watertight solid for printing: what no view has seen behind a surface is
+    filled, down to the sides of the box."""
+    fill_holes: bool = False
+    """Close each hole by triangles about its middle."""
+    triangles: Annotated[int | None, integer(4)] = None
+    """Reduce the mesh to about this many triangles."""
     overwrite: bool = False
     """Replace an existing file."""
 
     def run(self) -> int:
         start_jax()
         from gsjax.mesh.surface import SUFFIXES
-        from gsjax.runs.mesh import MeshSettings, mesh_of_run
+        from gsjax.runs.mesh import MeshSettings, default_mesh, mesh_of_run
 
-        if self.out.suffix.lower() not in SUFFIXES:
+        out = self.out or default_mesh(self.scene)
+        if out.suffix.lower() not in SUFFIXES:
             expected = ", ".join(SUFFIXES)
-            raise UsageError(f"-o {self.out}: expected a suffix of {expected}")
+            raise UsageError(f"-o {out}: expected a suffix of {expected}")
         settings = MeshSettings(
-            self.resolution, self._corners(), self.depth, self.parts, self.closed
+            resolution=self.resolution,
+            box=self._corners(),
+            unbounded=self.unbounded,
+            sphere=self.sphere,
+            depth=self.depth,
+            truncation=self.truncation,
+            parts=self.parts,
+            closed=self.closed,
+            fill_holes=self.fill_holes,
+            triangles=self.triangles,
         )
-        report = mesh_of_run(
-            self.run_folder, self.out, settings, overwrite=self.overwrite
-        )
+        report = mesh_of_run(self.scene, out, settings, overwrite=self.overwrite)
         triangles, shape = len(report.mesh.faces), "open"
         if report.watertight:
             shape = "watertight"
-        of_all = f", {self.parts} of {report.parts} parts" if self.parts else ""
-        text = f"{triangles:,} triangles, {shape}{of_all}, voxels {report.voxel:.4g}"
-        say(f"{self.out}  {text}, {report.seconds:.1f} s")
+        kept, found = report.parts
+        parts = f"{kept} of {found} part{'s' * (found != 1)}"
+        text = f"{triangles:,} triangles, {shape}, {parts}, voxels {report.voxel:.4g}"
+        say(f"{out}  {text}, {report.seconds:.1f} s")
         return 0
 
     def _corners(self):

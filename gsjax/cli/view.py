@@ -24,6 +24,9 @@ class ViewCommand(HeavyCommand):
     """Folder of a run, or a .ply or .spz file."""
     html: Annotated[Path | None, arg(metavar="OUT.html")] = None
     """Write a page that opens offline, instead of serving."""
+    mesh: bool = False
+    """Show the mesh that gsjax mesh wrote beside the scene; the browser shows the
+    splats too, a page the mesh alone."""
     min_opacity: Annotated[float, real(0, 1)] = 0.0
     """Leave out Gaussians below this opacity; the browser never draws those below
     0.01."""
@@ -59,6 +62,7 @@ class ViewCommand(HeavyCommand):
             raster=RASTER_PRESETS[self.preset]() if self.preset else None,
             min_opacity=self.min_opacity,
             max_gaussians=self.max_gaussians,
+            with_mesh=self.mesh,
         )
         views = () if self.no_photos else shown.views
         if self.html is not None:
@@ -73,7 +77,7 @@ class ViewCommand(HeavyCommand):
         if views:
             content.frusta = frusta_with_photos(views, _THUMBNAIL)
         page = write_page(content, path, title=self.scene.stem)
-        missing = page.found - page.drawn
+        missing = 0 if page.triangles else page.found - page.drawn
         if missing and self.max_gaussians is None:
             least = max(self.min_opacity, MIN_DRAWN_OPACITY)
             why = f"opacity below {least:g}, or not finite"
@@ -82,9 +86,12 @@ class ViewCommand(HeavyCommand):
         count = len(content.frusta)
         cameras = f", {count} camera{'s' * (count != 1)}" if count else ""
         size = f"{page.size / 2**20:.2f} MiB"
-        say(f"{path}  {page.drawn:,}{of_all} Gaussians{cameras}, {size}")
+        drawn, remedy = f"{page.drawn:,}{of_all} Gaussians", "--max-gaussians"
+        if page.triangles:
+            drawn, remedy = f"{page.triangles:,} triangles", "gsjax mesh --triangles"
+        say(f"{path}  {drawn}{cameras}, {size}")
         if page.size > _LARGE_PAGE:
-            note("a page this large opens slowly; reduce it with --max-gaussians")
+            note(f"a page this large opens slowly; reduce it with {remedy}")
         return 0
 
     def _serve(self, content, views) -> int:

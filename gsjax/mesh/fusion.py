@@ -1,6 +1,6 @@
 """Fusion of depth images in a truncated signed distance field (Curless and Levoy 1996).
 
-Axis legend: X Y Z voxels of the grid, B images, H W image.
+Axis legend: X Y Z voxels of the grid, B images, H W image, V points.
 """
 
 from collections.abc import Iterable
@@ -19,20 +19,30 @@ from gsjax.runtime.memory import Estimate, require
 Array = jax.Array
 
 _MARGIN = 0.5  # px at the border of an image that do not count
+_LEAST = 1e-4  # of the cube of contracted space, next to its faces
 
 
 class Grid(NamedTuple):
-    """A box of cubic voxels.
+    """A box of cubic voxels, or all of space contracted to a cube.
 
     Attributes:
-      origin: [3] world coordinates of the centre of the first voxel.
-      voxel: side of a voxel, world units.
+      origin: [3] coordinates of the centre of the first voxel: of the world, or of the
+        cube from −2 to 2.
+      voxel: side of a voxel, in the units of ``origin``.
       shape: numbers of voxels along x, y and z.
+      inner: (centre [3], half the side) of the cube that is not contracted, world
+        units; None for a box.
     """
 
     origin: np.ndarray
     voxel: float
     shape: tuple[int, int, int]
+    inner: tuple[np.ndarray, float] | None = None
+
+    def places(self, indices: np.ndarray) -> np.ndarray:
+        """Return world coordinates [V, 3] of points, in voxels from the first."""
+        x, y, z = np.moveaxis(self.origin + self.voxel * indices, -1, 0)
+        return np.stack(_places((x, y, z), self.inner)[0], -1)
 
 
 class Field(NamedTuple):
@@ -42,12 +52,15 @@ class Field(NamedTuple):
       distance: [X, Y, Z] signed distance over the truncation, in −1 … 1, positive in
         front of the surface; 1 where no image counts.
       weight: [X, Y, Z] number of images that count.
+      inside: [X, Y, Z] bool: no image counts, and more of them show a surface in front
+        of the voxel than nothing.
       colors: [X, Y, Z, 3] mean colour near the surface, or None.
       grid: where the voxels are.
     """
 
     distance: Array
     weight: Array
+    inside: Array
     colors: Array | None
     grid: Grid
 
@@ -57,7 +70,7 @@ class DepthImage(NamedTuple):
 
     Attributes:
       camera: a single camera.
-      depth: [H, W] of the camera's lens; 0 where nothing is.
+      depth: [H, W] of the camera's lens; 0 where nothing is, NaN where it is unknown.
       rgb: [H, W, 3], or None.
     """
 
@@ -90,9 +103,42 @@ def make_grid(low, high, resolution: int) -> Grid:
     return Grid(low + voxel / 2, voxel, shape)  # pyright: ignore
 
 
-def fuse(
-    images: Iterable[DepthImage], grid: Grid, *, truncation: float | None = None
-) -> Field:
+def make_unbounded_grid(centre, half: float, resolution: int) -> Grid:
+    """Return a grid over all of space, fine in a cube and ever coarser outside.
+
+    Outside, a point at m times the half side from the centre (in its largest
+    coordinate) is drawn in to 2 − 1 / m (Barron et al. 2022, "Mip-NeRF 360", eq. 10).
+
+    Args:
+      centre: [3] of the cube, world units.
+      half: half the side of the cube, which gets half of the voxels of each axis.
+      resolution: voxels along each axis.
+
+    Raises:
+      InputError: if the cube is empty or not finite, or ``resolution`` too small.
+    """
+    centre = np.asarray(centre, np.float64)
+    make_grid(centre - half, centre + half, resolution)
+    grid = make_grid([-2.0] * 3, [2.0] * 3, resolution)
+    return grid._replace(inner=(centre, float(half)))
+
+
+def _places(coordinates, inner):
+    """Return world coordinates (x, y, z), and by how much lengths are stretched."""
+    if inner is None:
+        return coordinates, 1.0
+    x, y, z = coordinates
+    xp = jnp if isinstance(x, jax.Array) else np
+    centre, half = inner
+    most = xp.maximum(xp.maximum(abs(x), abs(y)), abs(z))
+    outside = most > 1
+    far = 1 / xp.maximum(2 - most, _LEAST)  # 2 − 1 / far = most
+    factor = half * xp.where(outside, far / xp.maximum(most, 1), 1)
+    world = tuple(c + factor * v for c, v in zip(centre, (x, y, z)))
+    return world, half * xp.where(outside, far * far, 1)
+
+
+def fuse(images: Iterable[DepthImage], grid: Grid, *, truncation: float = 4.0) -> Field:
     """Return the distance field of depth images.
 
     A voxel takes the mean over the images of (depth − its depth) over the truncation,
@@ -102,55 +148,75 @@ def fuse(
     Args:
       images: of any sizes and lenses; each size and lens is compiled once.
       grid: voxels.
-      truncation: world units; default four voxels.
+      truncation: in voxels; of contracted space, in their longest side.
 
     Raises:
       InputError: if no image has any depth in the box.
       CapacityError: if the grid does not fit in memory.
     """
-    truncation = truncation or 4 * grid.voxel
     count = int(np.prod(grid.shape))
     require(
-        Estimate({"for voxels": 4 * count * 5, "for the step": 4 * count}),
+        Estimate({"for the sums": 26 * count, "for the surface": 24 * count}),
         f"a grid of {' × '.join(map(str, grid.shape))} voxels of {grid.voxel:.4g}",
         "lower the resolution, or pass a smaller box",
     )
-    shapes = grid.shape, grid.shape, (*grid.shape, 3), grid.shape
-    state = tuple(jnp.zeros(shape, jnp.float32) for shape in shapes)
-    origin = jnp.asarray(grid.origin, jnp.float32)
-    seen = False
+    state = _Sums(*(jnp.zeros(grid.shape, jnp.float32) for _ in range(3)))
+    state = state._replace(
+        colors=jnp.zeros((*grid.shape, 3), jnp.float32),
+        behind=jnp.zeros(grid.shape, jnp.int16),
+    )
+    frame = jax.tree.map(
+        partial(jnp.asarray, dtype=jnp.float32), (grid.origin, grid.voxel, grid.inner)
+    )
     colored = False
     for image in images:
         rgb = image.rgb
         colored |= rgb is not None
         if rgb is None:
             rgb = jnp.zeros((*image.depth.shape, 3), jnp.float32)
-        sizes = grid.voxel, truncation
-        state = _add(state, image.camera, image.depth, rgb, origin, *sizes)
-        seen = True
-    total, weight, colors, near = state
-    if not seen or not bool(jnp.any(near > 0)):
+        state = _add(state, image.camera, image.depth, rgb, frame, truncation)
+    if not bool(jnp.any(state.near > 0)):
         raise InputError(
             "images: no depth image shows a surface in the box; check the box, or "
             "lower the opacity that a surface needs"
         )
-    distance = jnp.where(weight > 0, total / jnp.maximum(weight, 1), 1)
-    mean = colors / jnp.maximum(near, 1)[..., None]
-    return Field(distance, weight, mean if colored else None, grid)
+    counted = state.weight > 0
+    distance = jnp.where(counted, state.distance / jnp.maximum(state.weight, 1), 1)
+    mean = state.colors / jnp.maximum(state.near, 1)[..., None] if colored else None
+    inside = ~counted & (state.behind > 0)
+    return Field(distance, state.weight, inside, mean, grid)
+
+
+class _Sums(NamedTuple):
+    """Sums over images of [X, Y, Z].
+
+    Attributes:
+      distance, weight: of images that count.
+      near: number of images with a surface within the truncation.
+      colors: [X, Y, Z, 3] of those images.
+      behind: images with a surface in front of the voxel, less those with nothing.
+    """
+
+    distance: Array
+    weight: Array
+    near: Array
+    colors: Array = None  # pyright: ignore
+    behind: Array = None  # pyright: ignore
 
 
 @partial(jax.jit, donate_argnums=0)
-def _add(state, camera: Camera, depth, rgb, origin, voxel, truncation):
-    """Add a depth image to sums of distances, weights, colours and their weights."""
-    _, height, depths = state[0].shape
+def _add(state: _Sums, camera: Camera, depth, rgb, frame, truncation) -> _Sums:
+    """Add a depth image."""
+    origin, voxel, inner = frame
+    _, height, depths = state.distance.shape
     y = origin[1] + voxel * jnp.arange(height, dtype=jnp.float32)[:, None]
     z = origin[2] + voxel * jnp.arange(depths, dtype=jnp.float32)[None]
     view, size = camera.viewmat, jnp.asarray(depth.shape)
 
-    def slab(index, state):
-        x = origin[0] + voxel * index
+    def slab(index, state: _Sums) -> _Sums:
+        (px, py, pz), stretch = _places((origin[0] + voxel * index, y, z), inner)
         a, b, c = (
-            view[i, 0] * x + view[i, 1] * y + view[i, 2] * z + view[i, 3]
+            view[i, 0] * px + view[i, 1] * py + view[i, 2] * pz + view[i, 3]
             for i in range(3)
         )
         mine = camera.lens.depth((a, b, c))
@@ -163,19 +229,22 @@ def _add(state, camera: Camera, depth, rgb, origin, voxel, truncation):
         column = jnp.where(good, u, 0).astype(jnp.int32)
         row = jnp.where(good, v, 0).astype(jnp.int32)
         there = depth[row, column]
-        signed = (there - mine) / truncation
-        good &= (there > 0) & (signed > -1)
-        near = good & (signed < 1)
-        sums = (
-            jnp.where(good, jnp.minimum(signed, 1), 0),
-            good.astype(jnp.float32),
-            jnp.where(near[..., None], rgb[row, column], 0),
+        signed = (there - mine) / (truncation * voxel * stretch)
+        seen = good & (there > 0)
+        counts, near = seen & (signed > -1), seen & (jnp.abs(signed) < 1)
+        hidden = (seen & (signed <= -1)).astype(jnp.int16)
+        free = (good & (there == 0)).astype(jnp.int16)
+        more = _Sums(
+            jnp.where(counts, jnp.minimum(signed, 1), 0),
+            counts.astype(jnp.float32),
             near.astype(jnp.float32),
+            jnp.where(near[..., None], rgb[row, column], 0),
+            hidden - free,
         )
 
         def add(total: Array, more: Array) -> Array:
             return total.at[index].add(more.astype(total.dtype))
 
-        return jax.tree.map(add, state, sums)
+        return jax.tree.map(add, state, more)
 
-    return lax.fori_loop(0, state[0].shape[0], slab, state)
+    return lax.fori_loop(0, state.distance.shape[0], slab, state)

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from gsjax.errors import InputError, MissingExtraError
 from gsjax.mesh.fusion import Field
@@ -40,8 +41,9 @@ def surface_of(field: Field, *, least: int = 1, closed: bool = False) -> Mesh:
       field: from `gsjax.mesh.fusion.fuse`.
       least: images that must have seen all voxels around a triangle; others are left
         out. Ignored if ``closed``.
-      closed: take what no image has seen as outside; the surface is then watertight,
-        and closes where nothing was seen.
+      closed: make a solid: what lies behind a surface in the images is inside, and all
+        else that no image has seen is outside. The surface is then watertight, and
+        closes where nothing was seen.
 
     Raises:
       InputError: if there is no surface.
@@ -49,6 +51,8 @@ def surface_of(field: Field, *, least: int = 1, closed: bool = False) -> Mesh:
     """
     mcubes = _package("mcubes", "PyMCubes")
     distance = np.asarray(field.distance, np.float32)
+    if closed:
+        distance = np.where(field.inside, np.float32(-1), distance)
     padded = np.pad(distance, 1, constant_values=1)
     vertices, faces = mcubes.marching_cubes(padded, 0.0)
     vertices, faces = vertices - 1, faces.astype(np.int32)[:, ::-1]
@@ -67,8 +71,7 @@ def surface_of(field: Field, *, least: int = 1, closed: bool = False) -> Mesh:
             [map_coordinates(c, vertices.T, order=1, mode="nearest") for c in channels],
             -1,
         )
-    world = field.grid.origin + field.grid.voxel * vertices
-    return _used(Mesh(world, faces, colors))
+    return _used(Mesh(field.grid.places(vertices), faces, colors))
 
 
 def _observed(seen: np.ndarray, vertices: np.ndarray) -> np.ndarray:
@@ -108,14 +111,60 @@ def largest(mesh: Mesh, count: int) -> Mesh:
     return _used(mesh._replace(faces=mesh.faces[components(mesh) < count]))
 
 
+def filled(mesh: Mesh) -> Mesh:
+    """Close each hole by triangles about the mean of its border.
+
+    Flat or bowl-shaped holes close well; of a border that winds, triangles may cross.
+
+    Raises:
+      MissingExtraError: if trimesh is not installed.
+    """
+    repair = _package("trimesh", "trimesh").repair
+    if is_watertight(mesh):
+        return mesh
+    solid = as_trimesh(mesh._replace(colors=None))
+    fans, centres = repair.stitch(solid, insert_vertices=True)
+    vertices = np.concatenate([mesh.vertices, centres])
+    faces = np.concatenate([mesh.faces, fans]).astype(np.int32)
+    colors = mesh.colors
+    if colors is not None:
+        near = KDTree(mesh.vertices).query(centres)[1]
+        colors = np.concatenate([colors, colors[near]])
+    return Mesh(vertices, faces, colors)
+
+
+def simplified(mesh: Mesh, triangles: int) -> Mesh:
+    """Return a mesh with about that many triangles, by edge collapses.
+
+    Quadric error metrics (Garland and Heckbert 1997); a vertex takes the colour of the
+    nearest one. A mesh with fewer triangles is returned as it is.
+
+    Raises:
+      MissingExtraError: if fast-simplification is not installed.
+    """
+    if len(mesh.faces) <= triangles:
+        return mesh
+    simplify = _package("fast_simplification", "fast-simplification").simplify
+    low = mesh.vertices.mean(0)  # float32 below
+    points, faces = simplify(
+        (mesh.vertices - low).astype(np.float32), mesh.faces, target_count=triangles
+    )
+    vertices, colors = points + low, mesh.colors
+    if colors is not None:
+        colors = colors[KDTree(mesh.vertices).query(vertices)[1]]
+    return _used(Mesh(vertices, faces.astype(np.int32), colors))
+
+
 def is_watertight(mesh: Mesh) -> bool:
-    """Return whether each edge belongs to two triangles, once in each direction."""
-    edges = np.concatenate([mesh.faces[:, [i, (i + 1) % 3]] for i in range(3)])
-    forward = np.unique(edges, axis=0)
-    if len(forward) < len(edges):
-        return False
-    backward = np.unique(edges[:, ::-1], axis=0)
-    return np.array_equal(forward, backward)
+    """Return whether triangles meet at each edge as often in either direction.
+
+    Then nothing is open. Sheets may touch at an edge, as after edge collapses.
+    """
+    forward = np.concatenate([mesh.faces[:, [i, (i + 1) % 3]] for i in range(3)])
+    low, high = forward.min(1), forward.max(1)
+    way = np.where(forward[:, 0] == low, 1, -1)
+    _, edge = np.unique(low * np.int64(len(mesh.vertices)) + high, return_inverse=True)
+    return not np.bincount(edge, way).any()
 
 
 def write_mesh(
@@ -134,14 +183,43 @@ def write_mesh(
         )
     if path.exists() and not overwrite:
         raise InputError(f"{path}: exists; pass overwrite=True or another name")
-    trimesh = _package("trimesh", "trimesh")
-    colors = None if mesh.colors is None else _bytes(mesh.colors)
-    made = trimesh.Trimesh(
-        mesh.vertices, mesh.faces, vertex_colors=colors, process=False
-    )
-    content = made.export(file_type=path.suffix.lower()[1:])
+    content = as_trimesh(mesh).export(file_type=path.suffix.lower()[1:])
     with replacing(path, durable=True) as file:
         file.write(content if isinstance(content, bytes) else content.encode())
+
+
+def read_mesh(path: str | PathLike[str]) -> Mesh:
+    """Read a mesh that `write_mesh` wrote, or another of these formats.
+
+    Raises:
+      InputError: if there is no such file, or it is not a triangle mesh.
+      MissingExtraError: if trimesh is not installed.
+    """
+    trimesh = _package("trimesh", "trimesh")
+    try:
+        read = trimesh.load_mesh(Path(path), process=False)
+        vertices, faces = np.asarray(read.vertices), np.asarray(read.faces, np.int32)
+    except (OSError, ValueError, KeyError, AttributeError, IndexError) as error:
+        raise InputError(f"{path}: not read as a mesh: {error}") from error
+    if not len(faces):
+        raise InputError(f"{path}: has no triangles")
+    colors = None
+    if read.visual.kind == "vertex":
+        colors = np.asarray(read.visual.vertex_colors)[:, :3] / 255
+    return Mesh(vertices, faces, colors)
+
+
+def as_trimesh(mesh: Mesh):
+    """Return a `trimesh.Trimesh` with the same vertices, triangles and colours.
+
+    Raises:
+      MissingExtraError: if trimesh is not installed.
+    """
+    trimesh = _package("trimesh", "trimesh")
+    colors = None if mesh.colors is None else _bytes(mesh.colors)
+    return trimesh.Trimesh(
+        mesh.vertices, mesh.faces, vertex_colors=colors, process=False
+    )
 
 
 def _bytes(colors: np.ndarray) -> np.ndarray:

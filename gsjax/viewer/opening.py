@@ -8,9 +8,11 @@ from gsjax.data.photos import load_photos
 from gsjax.data.types import Dataset, Photo, View
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
+from gsjax.mesh.surface import read_mesh
 from gsjax.raster.types import RasterConfig
 from gsjax.runs import folder
 from gsjax.runs.info import describe_run
+from gsjax.runs.mesh import find_mesh
 from gsjax.runs.scene_source import free_view_config, is_run, open_scene_source
 from gsjax.runtime.console import note, one_line
 from gsjax.train.config import TrainConfig
@@ -33,6 +35,7 @@ def load_content(
     raster: RasterConfig | None = None,
     min_opacity: float = 0.0,
     max_gaussians: int | None = None,
+    with_mesh: bool = False,
 ) -> LoadedContent:
     """Load a scene by its file or run; a run brings the cameras of its dataset.
 
@@ -44,10 +47,13 @@ def load_content(
         −y without cameras, as in most scenes from COLMAP.
       raster: as `open_scene_source`.
       min_opacity, max_gaussians: see `ViewerContent`.
+      with_mesh: also load the mesh that `gsjax mesh` has written for the scene.
 
     Raises:
-      InputError: as `open_scene_source`, or if the file cannot be read.
+      InputError: as `open_scene_source`, or if a file is missing or cannot be read.
+      MissingExtraError: if there is a mesh, and trimesh is not installed.
     """
+    mesh = read_mesh(find_mesh(path)) if with_mesh else None
     dataset, status = None, ""
     if is_run(path):
         settings, run = folder.load_settings(path), describe_run(path)
@@ -63,6 +69,9 @@ def load_content(
     renderer = ExactRenderer(source.config, source.background)
     content = make_content(gaussians, renderer, cameras.frusta_of(views), up)
     content.status = status
+    if mesh is not None:
+        offset = 0 if origin is None else origin
+        content.mesh = mesh._replace(vertices=mesh.vertices - offset)
     content.min_opacity, content.max_gaussians = min_opacity, max_gaussians
     return LoadedContent(content, views)
 

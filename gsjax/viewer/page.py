@@ -10,7 +10,12 @@ from gsjax.runtime import files
 from gsjax.viewer.cameras import add_cameras, frustum_size, set_viewpoint
 from gsjax.viewer.session import ViewerContent
 from gsjax.viewer.splats import Cut, most_important, pack, within
-from gsjax.viewer.viser_server import open_server, set_background, stop_server
+from gsjax.viewer.viser_server import (
+    add_mesh,
+    open_server,
+    set_background,
+    stop_server,
+)
 
 _CAPTION = """<div style="position:fixed;left:12px;bottom:10px;z-index:9;color:#ddd;
 font:13px sans-serif;background:rgba(0,0,0,.7);padding:3px 7px;border-radius:4px;
@@ -58,18 +63,26 @@ _WORKERS = """<script>
 
 
 class Page(NamedTuple):
-    """Counts of a page: Gaussians drawn, Gaussians of the scene, and bytes."""
+    """Counts of a page.
+
+    Attributes:
+      drawn, found: Gaussians drawn, and of the scene.
+      size: bytes.
+      triangles: of the mesh, which is drawn in place of the Gaussians; 0 without one.
+    """
 
     drawn: int
     found: int
     size: int
+    triangles: int = 0
 
 
 def write_page(content: ViewerContent, path: Path, *, title: str) -> Page:
-    """Write a scene and its cameras into one HTML file.
+    """Write a scene, or its mesh, and its cameras into one HTML file.
 
     Args:
-      content: the scene, reduced by its ``min_opacity`` and ``max_gaussians``.
+      content: the scene, reduced by its ``min_opacity`` and ``max_gaussians``; or its
+        mesh, if there is one.
       path: of the file, replaced if it exists; its folder is created if missing.
       title: of the page.
 
@@ -77,18 +90,20 @@ def write_page(content: ViewerContent, path: Path, *, title: str) -> Page:
       MissingExtraError: if viser is absent.
       InputError: if no Gaussian would be drawn, or the file cannot be written.
     """
-    gaussians = content.gaussians
+    gaussians, mesh = content.gaussians, content.mesh
     shown = within(gaussians, Cut(content.min_opacity))
     splats = pack(gaussians, most_important(gaussians, shown, content.max_gaussians))
     drawn, found = len(splats.centers), int(num_active(gaussians))
-    if found and not drawn:
+    if found and not drawn and mesh is None:
         what = f"none of {found:,} Gaussians is opaque enough to be drawn"
         raise InputError(f"{path}: {what}; lower --min-opacity")
     server = open_server("127.0.0.1", 0)
     try:
         set_viewpoint(server, content.viewpoint)
         set_background(server.scene, content.renderer.background)
-        if drawn:
+        if mesh is not None:
+            add_mesh(server.scene, mesh)
+        elif drawn:
             server.scene.add_gaussian_splats("/splats", **splats._asdict())
         if content.frusta:
             size = frustum_size(content.frusta, content.viewpoint.distance)
@@ -96,9 +111,13 @@ def write_page(content: ViewerContent, path: Path, *, title: str) -> Page:
         text = server.scene.as_html(dark_mode=True)
     finally:
         stop_server(server)
+    what = (
+        f"{drawn:,} of {found:,} Gaussians in view-independent colours (SH degree 0)"
+        if mesh is None
+        else f"mesh of {len(mesh.faces):,} triangles"
+    )
     caption = (
-        f"{html.escape(title)} · {drawn:,} of {found:,} Gaussians in view-independent "
-        "colours (SH degree 0), drawn by viser; gsjax<br>"
+        f"{html.escape(title)} · {what}, drawn by viser; gsjax<br>"
         "Drag to rotate, drag with the right button to pan, scroll to zoom."
     )
     head, tail = text.rsplit("</body>", 1)
@@ -107,4 +126,6 @@ def write_page(content: ViewerContent, path: Path, *, title: str) -> Page:
     data = f"{head}{_CAPTION.format(caption)}</body>{tail}".encode()
     files.make_folder(path.parent)
     files.write_file(path, data)
+    if mesh is not None:
+        return Page(0, found, len(data), len(mesh.faces))
     return Page(drawn, found, len(data))

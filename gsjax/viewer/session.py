@@ -13,14 +13,16 @@ import numpy as np
 
 from gsjax.cameras.camera import NEAR
 from gsjax.gaussians import Gaussians, select
+from gsjax.mesh.surface import Mesh
 from gsjax.runtime.console import note, one_line
 from gsjax.viewer import cameras, splats
 from gsjax.viewer.exact import KINDS, ExactRenderer, camera_of, picture
-from gsjax.viewer.viser_server import set_background
+from gsjax.viewer.viser_server import add_mesh, set_background
 
 _HEIGHTS = ("270", "360", "540", "720", "1080")
 _REST = 0.3  # seconds without motion after which "follow" renders
 _NOWHERE = "–"
+_SCENES = ("mesh", "splats", "splats and mesh")
 
 
 @dataclass
@@ -33,6 +35,7 @@ class ViewerContent:
       status: a line about training, or "".
       max_gaussians: largest number in the browser; the most important ones are kept.
       min_opacity: initial value of the slider.
+      mesh: a mesh of the scene, shown in place of the splats at first; or None.
     """
 
     gaussians: Gaussians
@@ -42,6 +45,7 @@ class ViewerContent:
     status: str = ""
     max_gaussians: int | None = None
     min_opacity: float = 0.0
+    mesh: Mesh | None = None
 
 
 class Latest:
@@ -67,6 +71,8 @@ class Session:
     def __init__(self, client: Any, content: ViewerContent):
         self.client, self.content = client, content
         self.splats: Any = None
+        self.mesh: Any = None
+        self.choice: Any = None  # of splats or mesh
         # The scene and its mask in one tuple: another thread reads both.
         self.scene_shown: tuple[Gaussians, np.ndarray] | None = None
         self.closed = False
@@ -82,6 +88,8 @@ class Session:
         self.render = Latest(self._render)
         self.update_cameras = Latest(self._update_cameras)
         self._add_controls()
+        if content.mesh is not None:
+            self.mesh = add_mesh(client.scene, content.mesh)
         self.show_cameras()
         client.camera.on_update(lambda _: self._moved())
         self.refresh()
@@ -89,6 +97,9 @@ class Session:
     def _add_controls(self) -> None:
         gui, begin = self.client.gui, self.content.min_opacity
         self.counts = gui.add_markdown("")
+        if self.content.mesh is not None:
+            self.choice = gui.add_dropdown("Scene", _SCENES, initial_value=_SCENES[0])
+            self.choice.on_update(lambda _: self._choose())
         self.opacity = gui.add_slider(
             "Opacity from", min=0.0, max=max(0.99, begin), step=0.01,
             initial_value=begin, hint="hide Gaussians of lower opacity",
@@ -114,6 +125,17 @@ class Session:
             choice.on_update(lambda _: self._again())
         self.camera_folder = gui.add_folder("Cameras")
         self.go_to: Any = None
+
+    def _shows(self, what: str) -> bool:
+        """Return whether "splats" or "mesh" are visible."""
+        chosen = what == "splats" if self.choice is None else what in self.choice.value
+        return chosen and not self.covered
+
+    def _choose(self) -> None:
+        """Show splats, mesh or both, as chosen; neither under an exact image."""
+        for handle, what in ((self.splats, "splats"), (self.mesh, "mesh")):
+            if handle is not None:
+                handle.visible = self._shows(what)
 
     def _again(self) -> None:
         """Render again if an exact image is visible."""
@@ -193,7 +215,7 @@ class Session:
         packed = splats.pack(gaussians, sent)
         if len(packed.centers):
             self.splats = self.client.scene.add_gaussian_splats(
-                "/splats", **packed._asdict(), visible=not self.covered
+                "/splats", **packed._asdict(), visible=self._shows("splats")
             )
         elif self.splats is not None:
             self.splats.remove()
@@ -266,8 +288,7 @@ class Session:
                 set_background(scene, self.content.renderer.background)
             else:
                 scene.set_background_image(pixels, format="png")
-            if self.splats is not None:
-                self.splats.visible = not self.covered
+            self._choose()
         self.update_cameras()
 
     def _moved(self) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from gsjax.errors import InputError, MissingExtraError
 from gsjax.io import images
+from gsjax.mesh.surface import Mesh, as_trimesh
 
 
 def require_viser() -> Any:
@@ -92,3 +93,12 @@ def set_background(scene: Any, color: Sequence[float]) -> None:
     """Set the RGB background of a `viser.SceneApi`."""
     pixels = np.broadcast_to(images.to_8_bit(np.asarray(color)), (2, 2, 3))
     scene.set_background_image(np.ascontiguousarray(pixels), format="png")
+
+
+def add_mesh(scene: Any, mesh: Mesh) -> Any:
+    """Add a mesh to a `viser.SceneApi` and return its handle.
+
+    Raises:
+      MissingExtraError: if trimesh is not installed.
+    """
+    return scene.add_mesh_trimesh("/mesh", as_trimesh(mesh))

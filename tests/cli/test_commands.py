@@ -232,9 +232,9 @@ def test_mesh(demo, tmp_path, capsys):
     words = ["mesh", demo / "run", "-o", out, "--resolution", "32"]
     text = run(*words, "--box=-3,-3,-1,3,3,2", "--parts", "0").out
     found = trimesh.load(out, force="mesh")
-    assert text.startswith(
-        f"{out}  {len(found.faces):,} triangles, open, voxels 0.1875"
-    )
+    count = len(found.faces)
+    facts = rf"{count:,} triangles, open, (\d+) of \1 parts?, voxels 0\.1875"
+    assert re.match(re.escape(str(out)) + "  " + facts, text)
     assert len(found.faces) > 100
     assert (np.abs(found.vertices[:, :2]) <= 3).all()
     assert main([str(word) for word in words]) == 3
@@ -245,6 +245,26 @@ def test_mesh(demo, tmp_path, capsys):
     nowhere = [*map(str, words), "--overwrite", "--box=90,90,90,91,91,91"]
     assert main(nowhere) == 3
     assert "check the box" in capsys.readouterr().err
+
+
+def test_mesh_of_a_file(demo, tmp_path, capsys):
+    """From a sphere, to where ``gsjax view --mesh`` finds it."""
+    pytest.importorskip("trimesh")
+    pytest.importorskip("viser")
+    scene, page = tmp_path / "a.ply", tmp_path / "a.html"
+    shutil.copy(demo / "run" / "splat.ply", scene)
+    assert main(["mesh", str(scene)]) == 3
+    assert "--sphere 64" in capsys.readouterr().err
+    view = ["view", str(scene), "--mesh", "--html", str(page)]
+    assert main(view) == 3
+    assert f"make it with gsjax mesh {scene}" in capsys.readouterr().err
+    words = ["--sphere", "3", "--resolution", "32", "--triangles", "500", "--closed"]
+    text = run("mesh", scene, *words, "--fill-holes").out
+    count = re.search(r"([\d,]+) triangles, watertight", text)[1]
+    assert int(count.replace(",", "")) <= 500
+    assert text.startswith(str(tmp_path / "a.mesh.ply"))
+    assert f"{page}  {count} triangles, " in run(*view).out
+    assert f"mesh of {count} triangles, drawn by viser" in page.read_text()
 
 
 def test_info_of_a_run(demo, tmp_path):

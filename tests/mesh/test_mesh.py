@@ -6,15 +6,21 @@ import pytest
 
 import gsjax
 from gsjax.errors import CapacityError, InputError
-from gsjax.mesh.fusion import DepthImage, fuse, make_grid
-from gsjax.mesh.surface import (
-    SUFFIXES,
-    components,
+from gsjax.mesh import (
+    DepthImage,
+    filled,
+    fuse,
     is_watertight,
     largest,
+    make_grid,
+    make_unbounded_grid,
+    read_mesh,
+    simplified,
     surface_of,
     write_mesh,
 )
+from gsjax.mesh.surface import SUFFIXES, components
+from gsjax.runs.mesh import sphere_cameras
 
 RADIUS, CENTRE = 0.7, np.array([0.1, -0.05, 0.02])
 SIZE, FOCAL, VIEWS = 160, 240.0, 26
@@ -54,6 +60,11 @@ def field():
     return fuse(images, make_grid(*BOX, 64))
 
 
+def euler(mesh) -> int:
+    """Return the Euler characteristic of a watertight mesh."""
+    return len(mesh.vertices) - len(mesh.faces) // 2
+
+
 @pytest.mark.parametrize("closed", [False, True])
 def test_a_sphere(field, closed, report):
     mesh = largest(surface_of(field, closed=closed), 1)
@@ -63,8 +74,7 @@ def test_a_sphere(field, closed, report):
     assert error < 0.2
     assert np.abs(radii - RADIUS).max() < 0.5 * field.grid.voxel
     assert is_watertight(mesh)
-    edges = 3 * len(mesh.faces) // 2
-    assert len(mesh.vertices) - edges + len(mesh.faces) == 2
+    assert euler(mesh) == 2
     corners = mesh.vertices[mesh.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (np.sum(across * (corners.mean(1) - CENTRE), -1) > 0).all()
@@ -72,11 +82,79 @@ def test_a_sphere(field, closed, report):
     assert np.abs(mesh.colors - wanted).mean() < 0.05
 
 
-def test_a_sphere_seen_from_one_side_is_open():
+def test_a_sphere_seen_from_one_side():
+    """It is open, or a solid that reaches to the end of the box."""
     images = [sphere_image(CENTRE + (3.0, 0, 0)), sphere_image(CENTRE + (2.9, 0.5, 0))]
-    mesh = largest(surface_of(fuse(images, make_grid(*BOX, 48))), 1)
+    field = fuse(images, make_grid(*BOX, 48))
+    mesh = largest(surface_of(field), 1)
     assert not is_watertight(mesh)
     assert (mesh.vertices[:, 0] > CENTRE[0] - 0.2).all()
+    solid = surface_of(field, closed=True)
+    assert len(largest(solid, 1).faces) == len(solid.faces)
+    assert is_watertight(solid)
+    assert euler(solid) == 2
+    assert solid.vertices[:, 0].min() < BOX[0][0] + 2 * field.grid.voxel
+
+
+def test_unknown_depth_neither_fills_nor_frees():
+    """A solid is free where images show nothing, not where depth is unknown."""
+    (front,) = [sphere_image(CENTRE + (3.0, 0, 0))]
+    side = sphere_image(CENTRE + (0, 3.0, 0))
+    unknown = side._replace(depth=jnp.where(side.depth > 0, side.depth, jnp.nan))
+    blank = side._replace(depth=0 * side.depth)
+    count = {
+        name: int(fuse([front, *more], make_grid(*BOX, 32)).inside.sum())
+        for name, more in {"front": [], "blank": [blank], "nan": [unknown]}.items()
+    }
+    assert count["blank"] < 0.2 * count["front"]
+    nothing = unknown._replace(depth=jnp.full_like(side.depth, jnp.nan))
+    assert fuse([front, nothing], make_grid(*BOX, 32)).inside.sum() == count["front"]
+
+
+def test_unbounded_space():
+    """A sphere outside the fine cube: as accurate as the voxels there."""
+    grid = make_unbounded_grid(CENTRE, 0.35, 64)
+    inner = np.array([[21.5, 30.0, 40.0]])
+    wanted = CENTRE + 0.35 * (grid.origin + grid.voxel * inner)
+    np.testing.assert_allclose(grid.places(inner), wanted)
+    field = fuse((sphere_image(eye) for eye in eyes(14)), grid)
+    mesh = largest(surface_of(field), 1)
+    radii = np.linalg.norm(mesh.vertices - CENTRE, axis=1)
+    stretch = 0.35 * (RADIUS / 0.35) ** 2
+    assert abs(radii.mean() - RADIUS) < 0.2 * grid.voxel * stretch
+    assert is_watertight(mesh)
+    assert euler(mesh) == 2
+    far = grid.places(np.array([[63.0, 32.0, 32.0]]))[0, 0]
+    assert far == pytest.approx(CENTRE[0] + 0.35 / (0.5 * grid.voxel))
+
+
+def test_holes_and_fewer_triangles(field):
+    """Both keep the sphere; colours follow the nearest vertex."""
+    whole = surface_of(field)
+    top = whole.vertices[whole.faces].mean(1)[:, 2] > CENTRE[2] + 0.9 * RADIUS
+    torn = whole._replace(faces=whole.faces[~top])
+    assert not is_watertight(torn)
+    mended = filled(torn)
+    assert is_watertight(mended)
+    assert len(mended.vertices) == len(mended.colors) == len(whole.vertices) + 1
+    assert filled(whole) is whole
+    few = simplified(whole, 1000)
+    assert 900 <= len(few.faces) <= 1000
+    assert is_watertight(few)
+    radii = np.linalg.norm(few.vertices - CENTRE, axis=1)
+    assert np.abs(radii - RADIUS).max() < 0.5 * field.grid.voxel
+    wanted = 0.5 + 0.5 * (few.vertices - CENTRE) / radii[:, None]
+    assert np.abs(few.colors - wanted).mean() < 0.05
+    assert simplified(few, 10**6) is few
+
+
+def test_cameras_on_a_sphere_see_the_box():
+    low, high = np.array([0.0, -1, 2]), np.array([1.0, 3, 2.5])
+    corners = np.array(np.meshgrid(*np.stack([low, high], -1))).reshape(3, -1)
+    for camera in sphere_cameras(low, high, 9):
+        local = np.asarray(camera.viewmat[:3, :3]) @ corners
+        u, v = camera.project(tuple(local + np.asarray(camera.viewmat[:3, 3:])))
+        assert ((u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)).all()
 
 
 def test_depth_by_distance():
@@ -109,6 +187,10 @@ def test_files(field, suffix, tmp_path):
     write_mesh(path, mesh)
     read = trimesh.load(path, force="mesh")
     assert read.faces.shape == mesh.faces.shape
+    again = read_mesh(path)
+    assert len(again.faces) == len(mesh.faces)
+    if suffix != ".stl":
+        np.testing.assert_allclose(again.colors, mesh.colors, atol=0.003)
     assert read.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.02)
     with pytest.raises(InputError, match="exists"):
         write_mesh(path, mesh)
@@ -129,5 +211,7 @@ def test_bad_input(field, tmp_path):
         fuse([blank], make_grid(*BOX, 4096))
     with pytest.raises(InputError, match="no surface"):
         surface_of(field._replace(distance=jnp.ones_like(field.distance)))
+    with pytest.raises(InputError, match="not read as a mesh"):
+        read_mesh(tmp_path / "none.ply")
     with pytest.raises(InputError, match=r"\.glb"):
         write_mesh(tmp_path / "mesh.xyz", surface_of(field))

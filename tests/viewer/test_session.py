@@ -18,6 +18,7 @@ from gsjax.cli.main import main
 from gsjax.data.types import Photo
 from gsjax.errors import InputError
 from gsjax.math.rotations import quaternion_to_matrix
+from gsjax.mesh import Mesh
 from gsjax.runs.folder import run_files
 from gsjax.runs.run import RunResult
 from gsjax.train.config import TrainConfig
@@ -78,6 +79,27 @@ def joined(server):
 
 def sent_means(session) -> np.ndarray:
     return session.splats.buffer[:, :3].view(np.float32) * session.splats.scale
+
+
+def test_a_mesh_is_shown_first_and_splats_on_demand(server):
+    pytest.importorskip("trimesh")
+    corners, faces = (
+        np.eye(4, 3),
+        np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]),
+    )
+    server.content.mesh = Mesh(corners, faces, np.full((4, 3), 0.5))
+    browser = Browser(server.url)
+    try:
+        session = session_of(server)
+        assert (session.mesh.visible, session.splats.visible) == (True, False)
+        session.choice.value = "splats and mesh"
+        session._choose()
+        assert (session.mesh.visible, session.splats.visible) == (True, True)
+        session._cover(np.zeros((2, 2, 3), np.uint8))
+        assert (session.mesh.visible, session.splats.visible) == (False, False)
+    finally:
+        server.content.mesh = None
+        browser.close()
 
 
 def test_an_image_is_over_the_view_or_in_the_panel(server, joined):
