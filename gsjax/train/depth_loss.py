@@ -94,7 +94,7 @@ def depth_term(
       InputError: if an image is not an array [H, W] of real numbers, or ``hit_weight``
         is negative; in a step, if the images have another aspect ratio than the render.
     """
-    images = _stack(targets)
+    images = stack_images(targets)
     if not hit_weight >= 0:
         raise InputError(f"hit_weight: expected a number ≥ 0, got {hit_weight}")
 
@@ -103,33 +103,45 @@ def depth_term(
         depth, alpha = render.depth, render.alpha
         assert depth is not None
         assert alpha is not None
-        target = jnp.asarray(_resampled(images, depth.shape[-2:]))[batch.view]
+        target = jnp.asarray(resampled(images, depth.shape[-2:]))[batch.view]
         return depth_loss(depth, alpha, target, batch.valid, hit_weight=hit_weight)
 
     return LossTerm("depth", function, weight, start, ("alpha", "depth"))
 
 
-def _stack(targets: Sequence[ArrayLike] | np.ndarray) -> np.ndarray:
-    """Return images [V, H, W] float32, padded with 0 on the right and bottom."""
+def stack_images(
+    targets: Sequence[ArrayLike] | np.ndarray, channels: tuple[int, ...] = ()
+) -> np.ndarray:
+    """Return images [V, H, W, *channels] float32, padded with 0 at right and bottom.
+
+    Raises:
+      InputError: if there is none, or one has another shape or no real numbers.
+    """
     images = [np.asarray(image) for image in targets]
     if not images:
         raise InputError("targets: expected an image for each view, got none")
     for index, image in enumerate(images):
-        if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "fiu":
+        fits = image.ndim == 2 + len(channels) and image.shape[2:] == channels
+        if not fits or image.size == 0 or image.dtype.kind not in "fiu":
+            shape = ", ".join(["H", "W", *map(str, channels)])
             raise InputError(
-                f"targets[{index}]: expected real numbers of shape [H, W], got "
+                f"targets[{index}]: expected real numbers of shape [{shape}], got "
                 f"{image.dtype} of shape {image.shape}"
             )
-    height, width = np.max([image.shape for image in images], axis=0)
-    out = np.zeros((len(images), height, width), np.float32)
+    height, width = np.max([image.shape[:2] for image in images], axis=0)
+    out = np.zeros((len(images), height, width, *channels), np.float32)
     for row, image in zip(out, images):
         row[: image.shape[0], : image.shape[1]] = image
     return out
 
 
-def _resampled(images: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """Return the nearest pixels of images [V, H, W] at another size."""
-    given = images.shape[1:]
+def resampled(images: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """Return the nearest pixels of images [V, H, W, ...] at another size.
+
+    Raises:
+      InputError: if the size has another aspect ratio.
+    """
+    given = images.shape[1:3]
     if given == size:
         return images
     # Half a pixel of rounding on both sides.
