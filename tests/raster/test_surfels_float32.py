@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import camera_of
+from scipy.spatial.transform import Rotation
 from test_surfels import (
     GEOMETRY,
     HEIGHT,
@@ -36,6 +37,30 @@ def test_images():
     depth = np.asarray(view.depth * view.alpha)
     assert np.abs(depth - data["thr_depth_sel"])[clear].max() < 1e-3
     assert np.quantile(np.abs(depth - data["thr_depth_sel"])[clear], 0.99) < 1e-4
+
+
+def thin_params(params, camera, seed):
+    """Return Gaussians of sizes from e⁻²⁵ to e², nearly seen from their edge."""
+    rng = np.random.default_rng(seed)
+    view, count = np.asarray(camera.viewmat), len(params.means)
+    eye = -view[:3, :3].T @ view[:3, 3]
+    means = np.resize(np.asarray(some_scene().params.means), (count, 3))
+    ray = (means - eye) / np.linalg.norm(means - eye, axis=1, keepdims=True)
+    side = np.cross(ray, rng.normal(size=ray.shape))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    normal = side + 10 ** rng.uniform(-7, -1, (count, 1)) * ray
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    first = np.cross(normal, np.cross(side, ray))
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    axes = np.stack([first, np.cross(normal, first), normal], -1)
+    leaves = {
+        "means": means,
+        "quats": Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]],
+        "log_scales": rng.uniform(-25, 2, (count, 3)),
+        "logit_opacities": rng.normal(size=count),
+        "sh": rng.normal(size=params.sh.shape),
+    }
+    return params.replace(**{k: jnp.asarray(v, "f4") for k, v in leaves.items()})
 
 
 @pytest.mark.parametrize("kind", ["surfel", "ellipsoid"])
@@ -73,3 +98,10 @@ def test_bad_numbers(kind):
     (_, clean), _ = whole(off.params, off)
     for image, alone in zip(images, clean):
         np.testing.assert_array_equal(np.asarray(image), np.asarray(alone))
+    for seed in range(6):
+        params = thin_params(params, camera, seed)
+        found = whole(params, poisoned)
+        for leaf in jax.tree.leaves(found):
+            assert (
+                np.abs(np.asarray(leaf)).max() < 1e18
+            )  # which training takes, and not NaN

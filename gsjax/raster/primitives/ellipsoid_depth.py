@@ -40,6 +40,7 @@ from gsjax.raster.primitives.rows import cross, depth_slopes, dot
 from gsjax.raster.types import Array
 
 _LEAST = 1e-12  # of e² + κ², and of the squares that are divided by
+_THIN = 1e-5  # smallest scale, relative to the largest
 
 
 def _parts(shape: Numbers) -> Parts:
@@ -91,6 +92,13 @@ def _in_deviations(vector, quat, scales) -> tuple[Array, ...]:
     )
 
 
+def _limited(scales) -> list[Array]:
+    """Return scales, none below `_THIN` of the largest: their squares stay finite."""
+    largest = jnp.maximum(jnp.maximum(scales[0], scales[1]), scales[2])
+    least = _THIN * largest
+    return [jnp.where(scale > least, scale, least) for scale in scales]
+
+
 def _mean_from_eye(exposure: Exposure) -> tuple[Array, ...]:
     """Return the mean relative to the camera, in world axes."""
     view = exposure.viewmat
@@ -113,6 +121,7 @@ def ray_numbers(camera: Camera, exposure: Exposure, quat, scales, filtered) -> N
       filtered: a, b, c and the determinant of the dilated covariance, and the px² by
         which it was dilated.
     """
+    scales = _limited(scales)
     depth = camera.lens.depth(exposure.point)
     u, v = image_rows(camera, exposure, lens_jacobian(camera, exposure.point))
     away = depth_slopes(camera, exposure)
@@ -141,6 +150,7 @@ def ray_numbers(camera: Camera, exposure: Exposure, quat, scales, filtered) -> N
 
 def ray_normals(exposure: Exposure, quat, scales) -> tuple[Array, ...]:
     """Return the normal (x, y, z) in camera coordinates; it faces the camera."""
+    scales = _limited(scales)
     m = _in_deviations(_mean_from_eye(exposure), quat, scales)
     smallest = jnp.minimum(jnp.minimum(scales[0], scales[1]), scales[2])
     inward = tuple(n * (smallest / s) for n, s in zip(m, scales))

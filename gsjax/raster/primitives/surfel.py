@@ -281,7 +281,10 @@ def _factored(filter: str, m, pulls, minor: Array, live: Array, config: RasterCo
     )
     a, b, det = jnp.where(live, a, 1), jnp.where(live, b, 0), jnp.where(live, det, 1)
     inv_sx, slope = 1 / jnp.sqrt(a), b / a
-    inv_sy = jnp.sqrt(a / det)
+    # The derivative of a / det has det⁻², which overflows for a small surfel seen from
+    # its edge.
+    root = jnp.abs(minor) if filter == "floor" else jnp.sqrt(det)
+    inv_sy = jnp.sqrt(a) / jnp.where(live, root, 1)
     m1, m2 = ([jnp.where(live, n, 0) for n in row] for row in m)
     pulls = [jnp.where(live, p, 0) for p in pulls]
     w1 = inv_sx * dot(m1, pulls)
