@@ -139,6 +139,7 @@ def dense_ellipsoids(
     rays = _rays_through(camera, means2d[:, None] + expected)
     across = jnp.einsum("npi,nij,npj->np", rays, inverse, rays)
     depth = jnp.einsum("ni,npi->np", pulled, rays) / across
+    depth = jnp.where(depth > 1e-3 * means[:, 2:], depth, means[:, 2:])
     power = jnp.einsum("npi,nij,npj->np", offset, jnp.linalg.inv(cov2d), offset)
     opacity = jax.nn.sigmoid(params.logit_opacities)
     normals = -pulled / jnp.linalg.norm(pulled, axis=-1, keepdims=True)

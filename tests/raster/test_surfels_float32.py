@@ -103,6 +103,4 @@ def test_bad_numbers(kind):
         params = thin_params(params, camera, seed)
         found = whole(params, poisoned)
         for leaf in jax.tree.leaves(found):
-            assert (
-                np.abs(np.asarray(leaf)).max() < most
-            )  # which training takes, and not NaN
+            assert np.abs(np.asarray(leaf)).max() < most  # and not NaN

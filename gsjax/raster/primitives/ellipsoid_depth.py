@@ -39,7 +39,9 @@ from gsjax.raster.primitives.ewa import lens_jacobian
 from gsjax.raster.primitives.rows import cross, depth_slopes, dot
 from gsjax.raster.types import Array
 
-_LEAST = 1e-12  # of e² + κ², and of the squares that are divided by
+_LEAST = 1e-6  # of e² + κ²; below, a ray hardly comes near the ellipsoid
+_NEAREST = 1e-3  # depth relative to the mean's; a pixel nearer takes the mean's
+_SMALL = 1e-12  # of other squares that are divided by
 _THIN = 1e-5  # smallest scale, relative to the largest
 
 
@@ -61,9 +63,10 @@ def _evaluate(values: Numbers, depth, limits: Numbers, once: Once) -> AtPixel:
     depth = jnp.where(depth > 0, depth, 1)  # 0 where a list has ended
     below = e * e + k1 * k1 + k2 * k2
     over = once(_inverse(below))
-    good = jnp.abs(e) > _LEAST**0.5
-    disparity = jnp.where(good, below / (depth * jnp.where(good, e, 1)), 0)
-    return AtPixel(gaussian_power(y1, y2), depth * e * over, disparity)
+    ahead = e > _NEAREST * below
+    there = depth * jnp.where(ahead, e * over, 1)
+    disparity = jnp.where(ahead, below / jnp.where(ahead, e, 1), 1) / depth
+    return AtPixel(gaussian_power(y1, y2), there, disparity)
 
 
 @jax.custom_jvp
@@ -107,7 +110,7 @@ def _mean_from_eye(exposure: Exposure) -> tuple[Array, ...]:
 
 
 def _positive(x: Array) -> Array:
-    return jnp.where(x > _LEAST, x, _LEAST)
+    return jnp.where(x > _SMALL, x, _SMALL)
 
 
 def ray_numbers(camera: Camera, exposure: Exposure, quat, scales, filtered) -> Numbers:
@@ -135,8 +138,9 @@ def ray_numbers(camera: Camera, exposure: Exposure, quat, scales, filtered) -> N
     rest = [a - gy * b for a, b in zip(q, m)]
     length = jnp.sqrt(_positive(dot(rest, rest) / square))
     across = [a - gx * b for a, b in zip(p, m)]
-    k2x = dot(across, rest) / (square * length)
-    k1 = dot(m, cross(p, q)) / (square * jnp.sqrt(square) * length)
+    # One factor after the other: the derivative of x / y has y⁻².
+    k2x = dot(across, rest) / square / length
+    k1 = dot(m, cross(p, q)) / square / (jnp.sqrt(square) * length)
     a, b, c, det, dilation = filtered
 
     def before(x: Array | float, y: Array | float) -> tuple[Array, Array]:
