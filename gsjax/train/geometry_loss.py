@@ -22,7 +22,6 @@ from gsjax.train.models import SceneParams
 Array = jax.Array
 Weight = float | Callable[[Array], Array]
 
-_NEAR, _FAR = 0.2, 100.0  # of the depth map of Huang et al.
 _SMALL = 1e-12
 
 
@@ -92,21 +91,31 @@ def normal_term(weight: Weight = 0.05, start: int = 0) -> LossTerm:
     return LossTerm("normals", function, weight, start, ("normals", "alpha", "depth"))
 
 
-def distortion_term(weight: Weight = 100.0, start: int = 0) -> LossTerm:
-    """Return the mean depth distortion of the views of a step as a loss term.
+def relative_distortion(distortion: Array, depth: Array) -> Array:
+    """Return Σ w w′ (1 − z / z′)² of the pairs of each pixel [...], about.
 
-    That of Huang et al. with each pair once: depths are mapped to far (z − near) /
-    ((far − near) z) with near 0.2 and far 100, so the weight depends on the scale of
-    the scene.
+    Each pair counts once. In the square, z is the expected depth of the pixel, through
+    which no derivative passes: the distortion of Huang et al. is of near / z, so that
+    its weight depends on the size of the scene.
+
+    Args:
+      distortion: [...] `Render.distortion`.
+      depth: [...] expected depth of the same render.
     """
-    scale = (_NEAR * _FAR / (_FAR - _NEAR)) ** 2
+    return distortion * jnp.square(lax.stop_gradient(depth))
+
+
+def distortion_term(weight: Weight = 10.0, start: int = 0) -> LossTerm:
+    """Return the mean `relative_distortion` of the views of a step as a loss term."""
 
     def function(render: Render, batch: Batch, params: SceneParams) -> Array:
         del batch, params
-        assert render.distortion is not None
-        return scale * jnp.mean(render.distortion)
+        distortion, depth = render.distortion, render.depth
+        assert distortion is not None
+        assert depth is not None
+        return jnp.mean(relative_distortion(distortion, depth))
 
-    return LossTerm("distortion", function, weight, start, ("distortion",))
+    return LossTerm("distortion", function, weight, start, ("distortion", "depth"))
 
 
 def opacity_entropy(opacity: Array, active: Array) -> Array:

@@ -16,6 +16,13 @@ from gsjax.train.geometry_loss import (
     normal_consistency,
     normals_of_depth,
     opacity_entropy,
+    relative_distortion,
+)
+from gsjax.train.geometry_priors import (
+    given_normals_loss,
+    given_normals_term,
+    monocular_depth_loss,
+    monocular_depth_term,
 )
 
 WIDTH, HEIGHT = 41, 30
@@ -81,6 +88,17 @@ def test_gradients_are_finite(value):
     gradient = jax.grad(normal_consistency, (0, 1, 2))
     for leaf in gradient(normals, jnp.zeros_like(depth), depth, CAMERA):
         assert np.isfinite(leaf).all()
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_distortion_by_hand(unit):
+    """Of two surfaces; in any unit of length."""
+    near, far, weights = 2.0 * unit, 2.1 * unit, (0.5, 0.25)
+    distortion = jnp.asarray(weights[0] * weights[1] * (1 / near - 1 / far) ** 2)
+    depth = jnp.asarray((0.5 * near + 0.25 * far) / 0.75)
+    value, slope = jax.value_and_grad(relative_distortion, 1)(distortion, depth)
+    assert value == pytest.approx(0.125 * (1 - near / far) ** 2, rel=0.05)
+    assert slope == 0
 
 
 def test_entropy_by_hand():
@@ -164,3 +182,47 @@ def test_settings_of_geometry():
     assert precise.raster.draws_surfels
     with pytest.raises(InputError, match="primitive"):
         default.replace(primitive="disc")
+
+
+def test_given_normals():
+    """Zero on the target, 2 against it; pixels without a target do not count."""
+    target = np.broadcast_to(PLANE, (HEIGHT, WIDTH, 3)).copy()
+    alpha = jnp.full((HEIGHT, WIDTH), 0.5)
+    normals = jnp.asarray(0.5 * target)
+    target *= 3  # any length
+    target[:10] = 0
+    target[10] = np.nan
+    loss, slope = jax.value_and_grad(given_normals_loss)(normals, alpha, target)
+    assert loss == pytest.approx(0, abs=1e-12)
+    assert np.isfinite(slope).all()
+    assert not slope[:11].any()
+    assert given_normals_loss(-normals, alpha, target) == pytest.approx(1.0)
+    valid = jnp.zeros((HEIGHT, WIDTH))
+    assert given_normals_loss(-normals, alpha, target, valid) == 0
+
+
+def test_monocular_depth():
+    """Scale and shift do not matter, noise does; holes have no derivative."""
+    depth = jnp.asarray(3 * PLANE[2] / (rays(CAMERA) @ PLANE))
+    alpha = jnp.ones_like(depth).at[:5].set(0.2)
+    target = np.array(7 / depth - 0.4)
+    target[:, :4] = np.nan
+    assert monocular_depth_loss(depth, alpha, target) < 1e-12
+    noise = 0.1 * np.random.default_rng(0).normal(size=depth.shape)
+    noisy = target * (1 + noise)
+    loss, slope = jax.value_and_grad(monocular_depth_loss)(depth, alpha, noisy)
+    assert 0.01 < loss < 0.2
+    assert np.isfinite(slope).all()
+    assert not slope[:5].any()
+    assert not slope[:, :4].any()
+    assert monocular_depth_loss(depth, 0 * alpha, target) == 0
+
+
+def test_priors_in_a_step():
+    """Terms ask for what they need; images of another shape are refused."""
+    with pytest.raises(InputError, match=r"targets\[0\].*\[H, W, 3\]"):
+        given_normals_term([np.zeros((4, 4))])
+    normals = given_normals_term([np.zeros((HEIGHT, WIDTH, 3))] * 2)
+    depth = monocular_depth_term([np.zeros((HEIGHT, WIDTH))] * 2)
+    assert normals.outputs == ("normals", "alpha")
+    assert depth.outputs == ("depth", "alpha")
