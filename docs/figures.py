@@ -1,14 +1,20 @@
-"""Draw the pictures of these pages: ``python docs/figures.py``."""
+"""Draw the pictures of these pages: ``python -P docs/figures.py``.
 
+``python -P docs/figures.py RUN/mesh.ply X Y Z`` draws that mesh, with (X, Y, Z) upwards.
+"""
+
+import sys
 from pathlib import Path
 
 import cv2
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import gsjax
 from gsjax.cameras.lenses import panorama_intrinsics
 from gsjax.math.sh import rgb_to_dc
+from gsjax.mesh import read_mesh, simplified
 from gsjax.plots import figures
 from gsjax.plots.contact_sheets import depth_colors
 from gsjax.raster.lists import binning
@@ -38,6 +44,34 @@ def knot() -> None:
     alpha = np.asarray(view.alpha)[..., None]
     depth = depth * alpha + behind * (1 - alpha)
     write("knot.webp", np.concatenate([np.asarray(view.rgb), depth], axis=1))
+
+
+def mesh(path: Path, up: list[float]) -> None:
+    """Draw a mesh from five sides, in its colours under a light of the viewer."""
+    import matplotlib.pyplot as plt
+
+    given = simplified(read_mesh(path), 150_000)
+    turn, _ = Rotation.align_vectors([[0, 0, 1]], [up])
+    vertices = turn.apply(given.vertices - given.vertices.mean(0))
+    corners = vertices[given.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    across = across / np.maximum(length, 1e-30)
+    assert given.colors is not None
+    colors = given.colors[given.faces].mean(1)
+    figure = plt.figure(figsize=(14, 3.2))
+    for index in range(5):
+        azimuth, height = np.radians(72 * index), np.radians(35)
+        eye = np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth)
+        shade = 0.6 + 0.6 * np.clip(across @ [*eye, np.sin(height)], 0, 1)
+        axis = figure.add_axes((0.2 * index, 0, 0.2, 1), projection="3d")
+        drawn = axis.plot_trisurf(*vertices.T, triangles=given.faces, linewidth=0)
+        drawn.set_facecolor(np.clip(colors * shade[:, None], 0, 1))
+        axis.view_init(35, 72 * index)
+        axis.set_box_aspect(np.ptp(vertices, axis=0), zoom=2.1)
+        axis.set_axis_off()
+    figure.canvas.draw()
+    write("mesh.webp", np.asarray(figure.canvas.buffer_rgba())[..., :3] / 255)
 
 
 def order() -> None:
@@ -192,8 +226,11 @@ def _lengths(footprint, picture: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    gsjax.use_all_cores()
-    knot()
-    lenses()
-    order()
-    pipeline()
+    if len(sys.argv) == 5:
+        mesh(Path(sys.argv[1]), [float(word) for word in sys.argv[2:]])
+    else:
+        gsjax.use_all_cores()
+        knot()
+        lenses()
+        order()
+        pipeline()
