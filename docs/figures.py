@@ -1,6 +1,6 @@
 """Draw the pictures of these pages: ``python -P docs/figures.py``.
 
-``python -P docs/figures.py RUN/mesh.ply X Y Z`` draws that mesh, with (X, Y, Z) upwards.
+``python -P docs/figures.py MESH X Y Z`` draws a mesh, with (X, Y, Z) upwards.
 """
 
 import sys
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import gsjax
 from gsjax.cameras.lenses import panorama_intrinsics
 from gsjax.math.sh import rgb_to_dc
-from gsjax.mesh import read_mesh, simplified
+from gsjax.mesh import read_mesh
 from gsjax.plots import figures
 from gsjax.plots.contact_sheets import depth_colors
 from gsjax.raster.lists import binning
@@ -47,31 +47,36 @@ def knot() -> None:
 
 
 def mesh(path: Path, up: list[float]) -> None:
-    """Draw a mesh from five sides, in its colours under a light of the viewer."""
-    import matplotlib.pyplot as plt
-
-    given = simplified(read_mesh(path), 150_000)
-    turn, _ = Rotation.align_vectors([[0, 0, 1]], [up])
-    vertices = turn.apply(given.vertices - given.vertices.mean(0))
-    corners = vertices[given.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(across, axis=1, keepdims=True)
-    across = across / np.maximum(length, 1e-30)
+    """Draw a mesh from five sides, as points under a light of the viewer."""
+    given = read_mesh(path)
     assert given.colors is not None
-    colors = given.colors[given.faces].mean(1)
-    figure = plt.figure(figsize=(14, 3.2))
-    for index in range(5):
-        azimuth, height = np.radians(72 * index), np.radians(35)
-        eye = np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth)
-        shade = 0.6 + 0.6 * np.clip(across @ [*eye, np.sin(height)], 0, 1)
-        axis = figure.add_axes((0.2 * index, 0, 0.2, 1), projection="3d")
-        drawn = axis.plot_trisurf(*vertices.T, triangles=given.faces, linewidth=0)
-        drawn.set_facecolor(np.clip(colors * shade[:, None], 0, 1))
-        axis.view_init(35, 72 * index)
-        axis.set_box_aspect(np.ptp(vertices, axis=0), zoom=2.1)
-        axis.set_axis_off()
-    figure.canvas.draw()
-    write("mesh.webp", np.asarray(figure.canvas.buffer_rgba())[..., :3] / 255)
+    turn, _ = Rotation.align_vectors([[0, 0, 1]], [up])
+    corners = turn.apply(given.vertices - given.vertices.mean(0))[given.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(across, axis=1)
+    rng = np.random.default_rng(0)
+    which = rng.choice(len(area), 4_000_000, p=area / area.sum())
+    weights = rng.dirichlet(np.ones(3), len(which))[..., None]
+    points = np.sum(weights * corners[which], 1)
+    colors = np.sum(weights * given.colors[given.faces[which]], 1)
+    normals = across[which] / area[which, None]
+    pages, size = [], 560
+    for azimuth in np.radians(72) * np.arange(5):
+        view = Rotation.from_euler("zx", [-azimuth, np.radians(-55)]).as_matrix()
+        x, y, z = view @ points.T  # z towards the viewer
+        scale = size / np.ptp(points[:, :2], axis=0).max()
+        column = (size / 2 + scale * x).astype(int)
+        row = (0.45 * size - scale * y).astype(int)
+        inside = (column >= 0) & (column < size) & (row >= 0) & (row < 0.9 * size)
+        front = np.argsort(z)
+        front = front[inside[front]]
+        shade = 0.9 + 0.5 * np.abs(normals[front] @ view[2])
+        page = np.ones((int(0.9 * size), size, 3))
+        page[row[front], column[front]] = colors[front] * shade[:, None]
+        pages.append(
+            cv2.resize(page, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        )
+    write("mesh.webp", np.concatenate(pages, axis=1))
 
 
 def order() -> None:

@@ -23,11 +23,11 @@
 # gsjax view run --mesh
 # ```
 #
-# `sfm` finds the cameras, `train` fits surfels (2D Gaussian splatting), `mesh` fuses the
-# depth of the views to a watertight solid, and `view` shows it; without `-o` the mesh
-# is written where `view` finds it. This notebook takes the last three steps in memory,
-# on photographs of a still life that are computed, so that depth and normals can be
-# compared with the truth. It is small: half a minute on two cores.
+# `sfm` finds the cameras, `train` fits surfels (2D Gaussian splatting), and `mesh` fuses
+# the depth of the views to a watertight solid. `view` shows a mesh that was written
+# without `-o`. This notebook takes training and mesh in memory, on photographs of a
+# still life that are computed, so that depth and normals can be compared with the
+# truth. It takes about a minute on two cores.
 
 # %%
 import tempfile
@@ -100,7 +100,8 @@ print(f"median error of normals: {np.median(angle[there]):.1f} degrees")
 figure, axes = plt.subplots(1, 4, figsize=(12, 2.6))
 hit = np.asarray(view.alpha) > 0.5
 depth = np.where(hit, view.median_depth, np.nan)
-shown = view.rgb, depth, 0.5 - 0.5 * ours, np.where(there, np.minimum(angle, 45), np.nan)
+wrong = np.where(there, np.minimum(angle, 45), np.nan)
+shown = view.rgb, depth, 0.5 - 0.5 * ours, wrong
 titles = "render", "median depth", "normals", "error of normals, degrees"
 for axis, image, title in zip(axes, shown, titles):
     drawn = axis.imshow(np.clip(image, 0, 1) if np.ndim(image) == 3 else image)
