@@ -23,8 +23,8 @@
 # gsjax view run --mesh
 # ```
 #
-# `sfm` finds the cameras, `train` fits surfels (2D Gaussian splatting), and `mesh` fuses
-# the depth of the views to a watertight solid. `view` shows a mesh that was written
+# `sfm` finds the cameras, `train` fits surfels (2D Gaussian splatting), `mesh` fuses
+# the depth of the views to a watertight solid, and `view` shows a mesh that was written
 # without `-o`. This notebook takes training and mesh in memory, on photographs of a
 # still life that are computed, so that depth and normals can be compared with the
 # truth. It takes about a minute on two cores.
