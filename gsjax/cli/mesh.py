@@ -35,7 +35,7 @@ class MeshCommand(HeavyCommand):
     depth: Literal["median", "expected"] | None = None
     """Depth of a pixel: where half of the light has been blocked, or the mean. Default:
     median, or expected with --unbounded."""
-    truncation: Annotated[float, real(1, 100)] = 6.0
+    truncation: Annotated[float, real(1, 100)] = 4.0
     """Depth behind the surface, in voxels, to which an image counts: more for noisy
     depth, less for thin objects."""
     parts: Annotated[int | None, integer(0)] = None

@@ -138,7 +138,7 @@ def _places(coordinates, inner):
     return world, half * xp.where(outside, far * far, 1)
 
 
-def fuse(images: Iterable[DepthImage], grid: Grid, *, truncation: float = 6.0) -> Field:
+def fuse(images: Iterable[DepthImage], grid: Grid, *, truncation: float = 4.0) -> Field:
     """Return the distance field of depth images.
 
     A voxel takes the mean over the images of (depth − its depth) over the truncation,

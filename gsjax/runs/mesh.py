@@ -66,7 +66,7 @@ class MeshSettings(NamedTuple):
     unbounded: bool = False
     sphere: int = 0
     depth: str | None = None
-    truncation: float = 6.0
+    truncation: float = 4.0
     parts: int | None = None
     closed: bool = False
     fill_holes: bool = False
