@@ -71,7 +71,7 @@ class TrainCommand(HeavyCommand):
     0.05 for surfels, else 0."""
     distortion_weight: float = 0.0
     """Weight of the loss of depth distortion, which draws the surfels of a pixel
-    together; 10 is a moderate weight. Default: 0."""
+    together. Default: 0."""
     refine_poses: bool = False
     """Optimise the camera poses together with the scene, with accurate render
     thresholds."""

@@ -84,9 +84,10 @@ class MeshReport(NamedTuple):
 
     Attributes:
       mesh: the mesh, in the coordinates of the dataset's files.
-      voxel: side of a voxel, world units; without limits, that of the finest.
-      parts: numbers of connected parts, that are kept and before.
-      watertight: whether each edge belongs to two triangles.
+      voxel: side of a voxel, or of the finest one if unbounded, world units.
+      parts: numbers of connected parts: of the mesh, and of the surface before the
+        small ones were left out.
+      watertight: see `gsjax.mesh.is_watertight`.
       seconds: time taken.
     """
 

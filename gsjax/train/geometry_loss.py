@@ -92,11 +92,11 @@ def normal_term(weight: Weight = 0.05, start: int = 0) -> LossTerm:
 
 
 def relative_distortion(distortion: Array, depth: Array) -> Array:
-    """Return Σ w w′ (1 − z / z′)² of the pairs of each pixel [...], about.
+    """Return Σ w w′ (z̄ / z − z̄ / z′)² over the pairs of each pixel [...].
 
-    Each pair counts once. In the square, z is the expected depth of the pixel, through
-    which no derivative passes: the distortion of Huang et al. is of near / z, so that
-    its weight depends on the size of the scene.
+    Each pair counts once. z̄ is the expected depth of the pixel; no derivative passes
+    through it. Huang et al. have a constant in its place, so that the effect of their
+    weight depends on the size of the scene.
 
     Args:
       distortion: [...] `Render.distortion`.

@@ -11,6 +11,7 @@ import gsjax
 from gsjax.errors import InputError
 from gsjax.init.surfels import flattened, laid_on_points
 from gsjax.math.rotations import covariance, quaternion_to_matrix
+from gsjax.train.frames import Batch
 from gsjax.train.geometry_loss import (
     geometry_terms,
     normal_consistency,
@@ -219,10 +220,25 @@ def test_monocular_depth():
 
 
 def test_priors_in_a_step():
-    """Terms ask for what they need; images of another shape are refused."""
+    """Terms take the view's image; images of another shape are refused."""
     with pytest.raises(InputError, match=r"targets\[0\].*\[H, W, 3\]"):
         given_normals_term([np.zeros((4, 4))])
-    normals = given_normals_term([np.zeros((HEIGHT, WIDTH, 3))] * 2)
-    depth = monocular_depth_term([np.zeros((HEIGHT, WIDTH))] * 2)
+    facing = np.broadcast_to(PLANE, (HEIGHT, WIDTH, 3))
+    normals = given_normals_term([0 * facing, -facing])
     assert normals.outputs == ("normals", "alpha")
-    assert depth.outputs == ("depth", "alpha")
+    depth = 3 * PLANE[2] / (rays(CAMERA) @ PLANE)
+    noise = 1 + 0.1 * np.random.default_rng(0).normal(size=depth.shape)
+    monocular = monocular_depth_term([1 / depth, noise / depth])
+    assert monocular.outputs == ("depth", "alpha")
+    none = gsjax.Render(**dict.fromkeys(gsjax.Render._fields))
+    view = none._replace(
+        alpha=jnp.ones((1, HEIGHT, WIDTH)),
+        normals=jnp.asarray(facing)[None],
+        depth=jnp.asarray(depth)[None],
+    )
+    for index, least in enumerate([0.0, 0.01]):
+        batch = Batch(None, None, CAMERA, jnp.array([index]))
+        assert normals.function(view, batch, None) == pytest.approx(2.0 * index)
+        assert (
+            least <= monocular.function(view, batch, None) < least + 0.2 * index + 1e-6
+        )

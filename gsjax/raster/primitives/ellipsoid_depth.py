@@ -15,6 +15,8 @@ The image of an ellipsoid is dilated. So an offset d of a pixel stands for the o
 (1 − s Σ'⁻¹) d before the dilation by s, its expectation given d: a ray that passes
 beside a thin ellipsoid shows it where it is, not where it would be extended to.
 
+A point that is behind the camera, or much nearer than the mean, gives way to the mean.
+
 Nothing is divided by a scale: all are taken relative to the smallest one, so flat
 ellipsoids and needles keep their digits.
 """
