@@ -228,7 +228,7 @@ def reference(gaussians, camera, config, background=None, features=None) -> dict
     """`gsjax.reference_render`, jitted, of scenes without inactive slots."""
     if config is not None:  # only these matter; the rest would compile it again
         names = ("alpha_min", "alpha_max", "transmittance_min", "stop_rule")
-        names += ("dilation", "antialias")
+        names += ("dilation", "antialias", "order")
         config = RasterConfig(**{name: getattr(config, name) for name in names})
     return _reference(gaussians, camera, config, background, features)
 

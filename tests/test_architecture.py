@@ -154,6 +154,8 @@ MANY_PARAMETERS = {"gsjax.train.loop.fit"}
 LONG = {
     "gsjax.raster.compositing.fused.composite_fused",
     "gsjax.raster.compositing.fused_vjp.backward",
+    "gsjax.raster.compositing.fused_window.composite_window",
+    "gsjax.raster.compositing.fused_window_vjp.backward",
 }
 
 

@@ -14,6 +14,7 @@ PRIMITIVES = ("ellipsoid", "surfel", "surfel_area")
 STOP_RULES = ("before", "after")
 OVERFLOW_RULES = ("flag", "nan")
 PROJECTIONS = ("ewa", "unscented")
+ORDERS = ("center", "window", "pixel")
 
 
 def _sigma_weights(values) -> bool:
@@ -54,6 +55,14 @@ class RasterConfig:
         shutter at its mean; "unscented" sends seven sigma points through them, for wide
         lenses and large Gaussians. Where a sigma point has no image, EWA is used.
       unscented: α, β, κ of the sigma points (Julier and Uhlmann 1997), β ≥ α².
+      order: by which Gaussians are blended front to back. "center": the depth of their
+        means, the same for all pixels; an image then pops when the camera turns.
+        "pixel": the depth of the point that each pixel shows, the densest along its ray
+        (Radl et al. 2024, StopThePop), sorted exactly; the reference, and slow.
+        "window": by the same depths, in a buffer of ``order_window`` Gaussians for
+        each pixel, through which the list of a tile runs; `Render.misordered` counts
+        those that come too late.
+      order_window: Gaussians that wait in the buffer of each pixel.
 
     Size and speed. None of these changes the image beyond rounding.
 
@@ -96,6 +105,8 @@ class RasterConfig:
     primitive: Any = None
     projection: str = "ewa"
     unscented: tuple[float, float, float] = (1.0, 2.0, 0.0)
+    order: str = "center"
+    order_window: int = 2
     tile_size: int = 8
     chunk_size: int = 32
     tiles_per_step: int | None = None
@@ -128,6 +139,13 @@ class RasterConfig:
                 _sigma_weights(self.unscented),
                 "(α, β, κ): 0 < α² ≤ β, κ > −3",
             ),
+            "order": ORDERS,
+            "order_window": "[1, 64]",
+            "occlusion": (
+                not (self.occlusion and self.sorts_pixels),
+                'False with order "window" and "pixel": what is behind one pixel may '
+                "be in front of the next",
+            ),
             "tile_size": "[1, inf)",
             "chunk_size": "[1, inf)",
             "tiles_per_step": "[1, inf)",
@@ -144,6 +162,11 @@ class RasterConfig:
         """True if the Gaussians are drawn as surfels."""
         name = getattr(self.primitive, "name", self.primitive)
         return f"{name}".startswith("surfel")
+
+    @property
+    def sorts_pixels(self) -> bool:
+        """True if each pixel blends in an order of its own."""
+        return self.order != "center"
 
     @property
     def blends_ray_depth(self) -> bool:

@@ -18,6 +18,7 @@ from gsjax.runtime.memory import require
 
 _FEWEST_SLOTS = 1024
 _MOST_PAIRS = 2**30 - 1
+_WIDEST = 8  # window that `render_exact` tries before it sorts exactly
 
 
 @requires_concrete_values()
@@ -28,6 +29,7 @@ def render_exact(
     background: Array | None = None,
     *,
     max_capacity: int = _MOST_PAIRS,
+    mend_order: bool = False,
     **kwargs,
 ) -> Render:
     """Render with capacities that grow until nothing overflows.
@@ -38,6 +40,9 @@ def render_exact(
     Args:
       gaussians, camera, config, background: as for `render`.
       max_capacity: upper limit of the pair capacity.
+      mend_order: with ``order="window"``, widen the window until nothing is misordered,
+        and beyond 8 places sort exactly (``order="pixel"``). Each is a program of its
+        own.
       **kwargs: mask, features, probe and alpha_min of `render`.
 
     Raises:
@@ -47,7 +52,19 @@ def render_exact(
     """
     check_types(gaussians, camera, config)
     draw = partial(render, background=background, **kwargs)
-    return _grow_until_fit(draw, gaussians, camera, config, max_capacity)
+    while True:
+        result = _grow_until_fit(draw, gaussians, camera, config, max_capacity)
+        if not mend_order or not int(result.misordered or 0):
+            return result
+        config = _mended(config)
+
+
+def _mended(config: RasterConfig) -> RasterConfig:
+    """Return ``config`` with twice the window, or with the exact order."""
+    wider = 2 * config.order_window
+    if wider > _WIDEST:
+        return config.replace(order="pixel")
+    return config.replace(order_window=wider)
 
 
 def _grow_until_fit(

@@ -1,8 +1,8 @@
 """Dense reference: every Gaussian at every pixel, without tiles or capacities.
 
-Slow and simple; run it in float64. The limits of a `RasterConfig` apply only if one is
-given. It shares only the parameters and the lens with the renderer: it uses matrices
-instead of components, and an inverse instead of factors.
+Slow and simple; run it in float64. The limits and the order of a `RasterConfig` apply
+only if one is given. It shares only the parameters and the lens with the renderer: it
+uses matrices instead of components, and an inverse instead of factors.
 """
 
 import jax
@@ -44,6 +44,60 @@ def reference_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.
     return jax.vmap(lens)(points), points[:, 2], cov2d, ratio, seen
 
 
+def reference_ray_depths(gaussians: Gaussians, camera: Camera) -> Array:
+    """Return the depth [N, H W] at which the ray of each pixel is densest.
+
+    For pinholes; negative behind the camera. Scales below 1e-5 of the largest count as
+    that.
+    """
+    p = gaussians.params
+    least = jnp.max(p.log_scales, axis=1, keepdims=True) + jnp.log(1e-5)
+    scales = jnp.exp(jnp.maximum(p.log_scales, least))
+    rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    means = p.means @ rotation.T + translation
+    inverse = jnp.linalg.inv(covariance(p.quats, scales))
+    inverse = jnp.einsum("ij,njk,lk->nil", rotation, inverse, rotation)
+    ys, xs = jnp.mgrid[: camera.height, : camera.width] + 0.5
+    x = (xs.ravel() - camera.K[0, 2]) / camera.K[0, 0]
+    y = (ys.ravel() - camera.K[1, 2]) / camera.K[1, 1]
+    rays = jnp.stack([x, y, jnp.ones_like(x)], -1)
+    along = jnp.einsum("pi,nij,nj->np", rays, inverse, means)
+    return along / jnp.einsum("pi,nij,pj->np", rays, inverse, rays)
+
+
+def ordered_weights(
+    alpha: Array, config: RasterConfig | None, keys: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """Return weights [N, P], where T falls through 1/2 [N, P], and a margin [P].
+
+    The margin is the smallest relative distance of T from ``transmittance_min``.
+
+    Args:
+      alpha: [N, P] in the order of the means.
+      config: its rule to stop applies; None for none.
+      keys: [N, P] depths by which each pixel sorts; None for the order of ``alpha``.
+    """
+    if keys is not None:
+        order = jnp.argsort(keys, axis=0, stable=True)
+        alpha = jnp.take_along_axis(alpha, order, 0)
+    after = jnp.cumprod(1 - alpha, axis=0)
+    before = jnp.concatenate([jnp.ones_like(after[:1]), after[:-1]])
+    blended, margin = jnp.ones_like(after, bool), jnp.full(alpha.shape[1], jnp.inf)
+    if config is not None:
+        tested = after if config.stop_rule == "before" else before
+        blended = tested > config.transmittance_min
+        if config.transmittance_min > 0:
+            near_stop = jnp.abs(tested / config.transmittance_min - 1)
+            margin = jnp.min(near_stop, axis=0, initial=jnp.inf)
+    weight = jnp.where(blended, alpha * before, 0)
+    half = (before > 0.5) & (after <= 0.5) & blended
+    if keys is not None:
+        back = jnp.argsort(order, axis=0)
+        weight = jnp.take_along_axis(weight, back, 0)
+        half = jnp.take_along_axis(half, back, 0)
+    return weight, half, margin
+
+
 def reference_colors(gaussians: Gaussians, camera: Camera) -> Array:
     """Return the SH colour [N, 3] of each Gaussian seen from the camera.
 
@@ -71,8 +125,8 @@ def reference_render(
     Args:
       gaussians: the active mask must be concrete (not traced).
       camera: a single camera; near and far cull.
-      config: its limits and its dilation apply; None means no limits, with
-        ``dilation`` and ``antialias`` as given.
+      config: its limits, its dilation and the order "pixel" apply; None means no
+        limits, with ``dilation`` and ``antialias`` as given.
       background: [C], default black.
       features: [N, C] in place of the SH colour.
 
@@ -110,23 +164,15 @@ def reference_render(
         margin = jnp.min(from_limit, axis=0, initial=jnp.inf)
         alpha = jnp.where(alpha < config.alpha_max, alpha, config.alpha_max)
         alpha = jnp.where(alpha >= config.alpha_min, alpha, 0)
-    after = jnp.cumprod(1 - alpha, axis=0)
-    before = jnp.concatenate([jnp.ones_like(after[:1]), after[:-1]])
-    if config is not None:
-        tested = after if config.stop_rule == "before" else before
-        blended = tested > config.transmittance_min
-        if config.transmittance_min > 0:
-            near_stop = jnp.abs(tested / config.transmittance_min - 1)
-            nearest = jnp.min(near_stop, axis=0, initial=jnp.inf)
-            margin = jnp.minimum(margin, nearest)
-    else:
-        blended = jnp.ones_like(after, bool)
-    weight = jnp.where(blended, alpha * before, 0)
+    keys = None
+    if config is not None and config.order == "pixel":
+        keys = reference_ray_depths(gaussians, camera)[order]
+    weight, half, near_stop = ordered_weights(alpha, config, keys)
+    margin = jnp.minimum(margin, near_stop)
     total = jnp.sum(weight, axis=0)
     rgb = jnp.einsum("np,nc->pc", weight, colors, precision="highest")
     if background is not None:
         rgb = rgb + (1 - total)[:, None] * jnp.asarray(background)
-    half = (before > 0.5) & (after <= 0.5) & blended
     shape = (camera.height, camera.width)
     expected = depth @ weight / jnp.where(total > 1e-10, total, 1)
     return {

@@ -115,6 +115,7 @@ def _render(
         features=images.get("features"),
         normals=images.get("normals"),
         distortion=images.get("distortion"),
+        misordered=_total(sums.get("misordered")),
         radii=radii,
         demand=Demand(
             visible=jnp.max(demands.visible),
@@ -123,6 +124,13 @@ def _render(
         ),
         overflowed=jnp.any(flags),
     )
+
+
+def _total(counts: Array | None) -> Array | None:
+    """Return the sum of counts [B, H, W] as a saturating int32; None of None."""
+    if counts is None:
+        return None
+    return total_count(lax.stop_gradient(counts).astype(jnp.int32).ravel())[0]
 
 
 # XLA inlines it into the program of a caller that is traced. (With ``inline=True`` an

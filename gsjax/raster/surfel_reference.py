@@ -14,7 +14,11 @@ import numpy as np
 from gsjax.cameras.camera import Camera
 from gsjax.gaussians import Gaussians
 from gsjax.math.rotations import covariance, quaternion_to_matrix
-from gsjax.raster.reference import reference_colors, reference_project
+from gsjax.raster.reference import (
+    ordered_weights,
+    reference_colors,
+    reference_project,
+)
 from gsjax.raster.types import Array, RasterConfig
 
 
@@ -178,18 +182,14 @@ def dense_geometry(
     limits = jnp.abs(alpha / config.alpha_min - 1)
     alpha = jnp.where(alpha < config.alpha_max, alpha, config.alpha_max)
     alpha = jnp.where(alpha >= config.alpha_min, alpha, 0)
-    after = jnp.cumprod(1 - alpha, axis=0)
-    before = jnp.concatenate([jnp.ones_like(after[:1]), after[:-1]])
-    tested = after if config.stop_rule == "before" else before
-    blended = tested > config.transmittance_min
-    stops = jnp.abs(tested / max(config.transmittance_min, 1e-300) - 1)
-    weight = jnp.where(blended, alpha * before, 0)
+    weight, half, stops = ordered_weights(
+        alpha, config, depth if config.order == "pixel" else None
+    )
     shape = camera.height, camera.width
     total = weight.sum(0)
     inverse = jnp.where(weight > 0, 1 / jnp.where(weight > 0, depth, 1), 0)
     apart = jnp.square(inverse[:, None] - inverse[None])
     pairs = jnp.einsum("ip,jp,ijp->p", weight, weight, apart) / 2
-    half = (before > 0.5) & (after <= 0.5) & blended
     images = {
         "rgb": weight.T @ colors[order],
         "normals": weight.T @ dense.normals[order],
@@ -197,7 +197,7 @@ def dense_geometry(
         "depth": (weight * depth).sum(0) / jnp.where(total > 1e-10, total, 1),
         "median_depth": jnp.where(half, depth, 0).sum(0),
         "distortion": pairs,
-        "margin": jnp.minimum(limits.min(0), stops.min(0)),
+        "margin": jnp.minimum(limits.min(0), stops),
     }
     return {
         name: image.reshape(*shape, *image.shape[1:]) for name, image in images.items()

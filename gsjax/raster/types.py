@@ -59,11 +59,14 @@ class Splat(NamedTuple):
         last. Ellipsoids have inv_sx, slope, inv_sy and opacity, so that with dx, dy the
         offset of a pixel y1 = inv_sx · dx, y2 = inv_sy · (dy − slope · dx),
         Q = y1² + y2² and α = opacity · exp(−Q / 2): the exponent cannot turn positive.
+      key: numbers that `Primitive.key` expects; none with `RasterConfig.order`
+        "center". No derivative is taken of them.
     """
 
     u: Array
     v: Array
     shape: tuple[Array, ...]
+    key: tuple[Array, ...] = ()
 
 
 class Channels(NamedTuple):
@@ -165,6 +168,9 @@ class Primitive(NamedTuple):
         kernels of its own.
       ray_form: the form with `RasterConfig.ray_depth`, if ``form`` is None and depth is
         blended; `project` then returns the numbers for it.
+      key: (numbers of `Splat.key`, offsets dx, dy of a pixel from the centre) → the
+        depth by which the pixel orders its splats, without derivative; None for the
+        depth of ``form``.
     """
 
     name: str
@@ -174,6 +180,7 @@ class Primitive(NamedTuple):
     occluders: Callable[..., Splat] | None = None
     form: Form | None = None
     ray_form: Form | None = None
+    key: Callable[[tuple[Array, ...], Array, Array], Array] | None = None
 
 
 class Demand(NamedTuple):
@@ -206,6 +213,9 @@ class Render(NamedTuple):
       features: [H, W, C] features Σ w f, without background; or None.
       normals: [H, W, 3] Σ w n of unit normals that face the camera, in its coordinates.
         Their length tells how well they agree. Or None.
+      misordered: [] int32, number of times that a pixel blends a Gaussian behind one
+        that it should be in front of, over all cameras; 0 with ``order="pixel"``, None
+        with "center". The image is that of exact order if it is 0.
       distortion: [H, W] Σ_{i<j} w_i w_j (1 / z_i − 1 / z_j)², the depth distortion of
         Huang et al. (2024) over the square of near far / (far − near). Or None.
       radii: [N] half the longer side, in px, of the box that a Gaussian covers; 0 if it
@@ -224,6 +234,7 @@ class Render(NamedTuple):
     features: Array | None = None
     normals: Array | None = None
     distortion: Array | None = None
+    misordered: Array | None = None
 
     @property
     def visible(self) -> Array:

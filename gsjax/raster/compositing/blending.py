@@ -110,12 +110,14 @@ class Parts(NamedTuple):
       channels: [..., C] values that are summed.
       depth: [..., 1], or None unless a median of it is asked for.
       probe: [..., 2] zeros that collect the absolute gradient, or None.
+      keys: [..., K] numbers of `Splat.key`, or None.
     """
 
     splats: Array
     channels: Array
     depth: Array | None = None
     probe: Array | None = None
+    keys: Array | None = None
 
 
 class Chunk(NamedTuple):
@@ -150,6 +152,8 @@ def columns_of(
         columns["depth"] = [depth]
     if channels.probe is not None:
         columns["probe"] = list(channels.probe)
+    if splat.key:
+        columns["keys"] = list(splat.key)
     return columns
 
 

@@ -227,7 +227,7 @@ def _memory(pairs: int, task: Task, gradients: bool) -> tuple[int, int]:
 
 CHUNKED = Compositor(
     name="chunked",
-    suits=lambda task: task.platform == "cpu",
+    suits=lambda task: task.platform == "cpu" and not task.config.sorts_pixels,
     forward=composite_chunks,
     differentiable=composite_steps,
     reverse=None,

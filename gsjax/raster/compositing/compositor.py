@@ -17,13 +17,16 @@ from jax.custom_batching import sequential_vmap
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 
 from gsjax.raster.compositing.chunked import CHUNKED
+from gsjax.raster.compositing.fused_sorted import SORTED
 from gsjax.raster.compositing.fused_vjp import FUSED
+from gsjax.raster.compositing.fused_window_vjp import WINDOWED
+from gsjax.raster.compositing.ordered import ORDERED
 from gsjax.raster.compositing.parallel import PARALLEL
 from gsjax.raster.compositing.types import Compositor, Images, Task, Tiles
 from gsjax.raster.types import Array, Channels, Splat
 from gsjax.runtime.custom_transpose import custom_transpose, jvp_of_active
 
-COMPOSITORS = (FUSED, CHUNKED, PARALLEL)
+COMPOSITORS = (FUSED, CHUNKED, PARALLEL, WINDOWED, SORTED, ORDERED)
 
 # Under `jax.vmap`, side by side, each element would wait for the longest, and every
 # turn of a loop would copy the images of all.

@@ -52,7 +52,7 @@ class Reading(NamedTuple):
     Attributes:
       rows: [R + 1, columns] the Gaussians; the last is empty.
       widths: numbers of columns of the splat (u, v and `Splat.shape`), of the channels,
-        and of the depth if its median is asked for.
+        of the depth if its median is asked for, and of `Splat.key`, if there are any.
       ranks: the lists, one behind the other.
       start, end: [T] where each begins and ends.
       left, top: [T] corners of the tiles, px.
@@ -112,6 +112,7 @@ def suits(task: Task) -> bool:
     touched = task.itemsize * pixels * (_ARRAYS + _PER_CHANNEL * channels)
     fits = pixels >= _FEWEST and touched <= KERNEL_BYTES
     on_cpu = task.platform == "cpu"
+    on_cpu &= not task.config.sorts_pixels
     return on_cpu and fits and loops.large_loops_are_kernels()
 
 
@@ -217,7 +218,7 @@ def composite_fused(
         if kept is not None:
             made = (place - start + BLOCK - 1) // BLOCK
             kept = kept._replace(blocks=with_part(kept.blocks, made, (tile,)))
-        images = {name: _with_image(images[name], image[name], tile) for name in images}
+        images = {name: with_image(images[name], image[name], tile) for name in images}
         return images, kept
 
     zero, count = jnp.int32(0), jnp.int32(grid.tiles)
@@ -227,6 +228,12 @@ def composite_fused(
 def number_at(values: Array, tile: Array) -> Array:
     """Return the number [1] of a tile [] in ``values`` [T]."""
     return part_at(values, (tile,), (1,))
+
+
+def image_at(images: Array, tile: Array) -> Array:
+    """Return the image of a tile [] in ``images`` [T, …]."""
+    start = tile, *(jnp.int32(0) for _ in images.shape[1:])
+    return part_at(images, start, (1, *images.shape[1:]))[0]
 
 
 def _no_residuals(read: Reading, empty: Array, grid: Grid) -> Residuals:
@@ -239,7 +246,7 @@ def _no_residuals(read: Reading, empty: Array, grid: Grid) -> Residuals:
     )
 
 
-def _with_image(images: Array, image: Array, tile: Array) -> Array:
+def with_image(images: Array, image: Array, tile: Array) -> Array:
     """Return ``images`` [T, …] with that of one tile replaced."""
     start = tile, *(jnp.int32(0) for _ in image.shape)
     return with_part(images, image[None], start)

@@ -29,10 +29,11 @@ from gsjax.raster.compositing.fused import (
     Residuals,
     block_capacity,
     composite_fused,
+    image_at,
     number_at,
     reading_of,
 )
-from gsjax.raster.compositing.fused_moments import reduction_of
+from gsjax.raster.compositing.fused_moments import Reduction, reduction_of
 from gsjax.raster.compositing.types import (
     Compositor,
     Images,
@@ -83,17 +84,13 @@ def backward(
     empty = jnp.zeros_like(read.ones)
     zero, width = jnp.int32(0), read.widths[0]
 
-    def of(tile, images):
-        start = tile, *(zero,) * (images.ndim - 1)
-        return part_at(images, start, (1, *images.shape[1:]))
-
     def blended(on, values):
         return jnp.where(on, values, 0) if config.stop_rule == "before" else values
 
     def of_tile(tile, sums):
         start, end = number_at(read.start, tile), number_at(read.end, tile)
         first = number_at(residuals.first, tile)
-        image = {name: of(tile, all_)[0] for name, all_ in cotangents.items()}
+        image = {name: image_at(all_, tile) for name, all_ in cotangents.items()}
         corner = number_at(read.left, tile), number_at(read.top, tile)
         at_tile = partial(reduction.at, corner, read.ones)
 
@@ -139,7 +136,7 @@ def backward(
         def block(state):
             number, gained, alphas, reached, sums = state
             base = start + number * BLOCK
-            carried = of((first + number)[0], residuals.carried)[0]
+            carried = image_at(residuals.carried, (first + number)[0])
             begun = jnp.zeros(1, jnp.int32), base, carried, alphas, reached
             at, _, behind, alphas, reached = lax.while_loop(
                 lambda state: state[0][0] < BLOCK, ahead, begun
@@ -158,11 +155,34 @@ def backward(
     columns = ("splats" in kinds) * moments + ("channels" in kinds) * channels
     sums = jnp.zeros((ranks, columns), read.rows.dtype)
     sums = lax.fori_loop(zero, jnp.int32(grid.tiles), of_tile, sums)[:-1].T
+    return by_tables(tiles, sums, reduction, kinds, config)
+
+
+def by_tables(
+    tiles: Tiles,
+    sums: Array,
+    reduction: Reduction,
+    kinds: frozenset[str],
+    config: RasterConfig,
+) -> tuple[Splat, Channels]:
+    """Return the cotangents of splats and channels from sums over all tiles.
+
+    Args:
+      tiles: what was composited.
+      sums: [M + C, R] moments of each splat and Σ α T ∂L/∂C of its channels; without
+        those of a kind that is not in ``kinds``.
+      reduction: of the splats.
+      kinds: as of `ReversePass.backward`.
+      config: static settings.
+    """
+    moments = reduction.size(tiles.splat)
+    channels = sum(summed_channels(config, len(tiles.channels.colors)).values())
     if "splats" not in kinds:
         sums = jnp.pad(sums, ((moments, 0), (0, 0)))
     if "channels" not in kinds:
         sums = jnp.pad(sums, ((0, channels), (0, 0)))
     by_splat = reduction.cotangent(tiles.splat, sums[:moments])
+    by_splat = by_splat._replace(key=tuple(map(jnp.zeros_like, tiles.splat.key)))
     return by_splat, _by_channels(tiles.channels, sums[moments:], config)
 
 

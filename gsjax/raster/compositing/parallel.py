@@ -276,7 +276,7 @@ def _memory(pairs: int, task: Task, gradients: bool) -> tuple[int, int]:
 
 PARALLEL = Compositor(
     name="parallel",
-    suits=lambda _: True,
+    suits=lambda task: not task.config.sorts_pixels,
     forward=composite_parallel,
     differentiable=composite_parallel,
     reverse=None,

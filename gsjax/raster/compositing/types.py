@@ -74,7 +74,8 @@ def pixel_channels(config: RasterConfig) -> tuple[str, ...]:
 def single_images(config: RasterConfig) -> tuple[str, ...]:
     """Return the names of the images beside "sums", [T, P] each."""
     median = ("median",) if "median_depth" in config.outputs else ()
-    return (*pixel_channels(config), *median)
+    late = ("misordered",) if config.sorts_pixels else ()
+    return (*pixel_channels(config), *median, *late)
 
 
 class Task(NamedTuple):
@@ -124,8 +125,9 @@ class Compositor(NamedTuple):
     """A compositing kernel.
 
     Images are {"sums": [T, C, P], see `summed_channels`; "depth" and the like [T, P],
-    see `pixel_channels`; "median": [T, P] if asked for}, before the background, T in
-    the order of the grid.
+    see `pixel_channels`; "median": [T, P] if asked for; "misordered": [T, P] counts
+    for `Render.misordered`, if each pixel has an order of its own}, before the
+    background, T in the order of the grid.
 
     Attributes:
       name: for messages.

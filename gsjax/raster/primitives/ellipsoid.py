@@ -11,9 +11,12 @@ from jax import lax
 
 from gsjax.cameras.camera import Camera
 from gsjax.cameras.shutter import Exposure, expose, image_rows
+from gsjax.errors import InputError
 from gsjax.math.numerics import exp_log_scale, materialize, materialize_mask, near_one
 from gsjax.raster.primitives.ellipsoid_depth import (
     RAY_FORM,
+    key_numbers,
+    ray_key,
     ray_normals,
     ray_numbers,
 )
@@ -126,7 +129,16 @@ def project(
       inputs: Gaussians, camera, features and probe.
       config: dilation, antialias, alpha_min, outputs and num_size_buckets are used.
       order, count: from `gsjax.raster.lists.depth_order`.
+
+    Raises:
+      InputError: if each pixel is to sort and rays are parallel.
     """
+    if config.sorts_pixels and inputs.camera.lens.name == "orthographic":
+        raise InputError(
+            f'RasterConfig.order: expected "center" for an orthographic lens, got '
+            f'"{config.order}"; move a pinhole camera far away and lengthen its focal '
+            "length"
+        )
     return project_rows(_project_components, _footprint, inputs, config, order, count)
 
 
@@ -205,7 +217,10 @@ def _project_components(
         filtered = a, b, c, det, config.dilation
         numbers = ray_numbers(camera, exposure, quat, scales, filtered)
         shape = (*shape, *(jnp.where(live, number, 1) for number in numbers))
-    normals = None
+    key, normals = (), None
+    if config.sorts_pixels:
+        key = key_numbers(camera, exposure, quat, scales)
+        key = tuple(jnp.where(live, number, 1) for number in key)
     if "normals" in config.outputs:
         normals = ray_normals(exposure, quat, scales)
         normals = tuple(jnp.where(live, n, 0) for n in normals)
@@ -218,6 +233,7 @@ def _project_components(
         reach=reach,
         colors=colors,
         normals=normals,
+        key=key,
     )
 
 
@@ -234,4 +250,5 @@ ELLIPSOID = Primitive(
     project=project,
     occluders=occluders,
     ray_form=RAY_FORM,
+    key=ray_key,
 )

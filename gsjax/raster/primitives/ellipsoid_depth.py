@@ -23,6 +23,7 @@ ellipsoids and needles keep their digits.
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from gsjax.cameras.camera import Camera
 from gsjax.cameras.shutter import Exposure, entry, image_rows
@@ -126,6 +127,42 @@ def ray_numbers(camera: Camera, exposure: Exposure, quat, scales, filtered) -> N
       filtered: a, b, c and the determinant of the dilated covariance, and the px² by
         which it was dilated.
     """
+    *steps, depth = _ray_steps(camera, exposure, quat, scales)
+    gx, gy, k1, k2x, k2y = steps
+    a, b, c, det, dilation = filtered
+
+    def before(x: Array | float, y: Array | float) -> tuple[Array, Array]:
+        """Return a row times 1 − s Σ'⁻¹."""
+        share = dilation / det
+        return x - share * (c * x - b * y), y - share * (a * y - b * x)
+
+    rows = before(gx, gy), before(k1, 0.0), before(k2x, k2y)
+    return *(number for row in rows for number in row), depth
+
+
+def key_numbers(camera: Camera, exposure: Exposure, quat, scales) -> Numbers:
+    """Return the numbers of `ray_key`, [R] each; arguments as of `ray_numbers`."""
+    return lax.stop_gradient(_ray_steps(camera, exposure, quat, scales))
+
+
+def ray_key(numbers: Numbers, dx: Array, dy: Array) -> Array:
+    """Return the depth of the densest point along the ray of a pixel.
+
+    It is that of the ray itself, whatever the dilation, so it does not change if the
+    camera turns. It is negative where that point is behind the camera.
+
+    Args:
+      numbers: from `key_numbers`.
+      dx, dy: offset of the pixel from the centre, px.
+    """
+    gx, gy, k1, k2x, k2y, depth = numbers
+    e, k2 = 1 + gx * dx + gy * dy, k2x * dx + k2y * dy
+    below = e * e + (k1 * dx) * (k1 * dx) + k2 * k2
+    return depth * (e / jnp.maximum(below, _SMALL))
+
+
+def _ray_steps(camera: Camera, exposure: Exposure, quat, scales) -> Numbers:
+    """Return g, k₁ (along x) and k₂ of the module's head, and z₀."""
     scales = _limited(scales)
     depth = camera.lens.depth(exposure.point)
     u, v = image_rows(camera, exposure, lens_jacobian(camera, exposure.point))
@@ -143,15 +180,7 @@ def ray_numbers(camera: Camera, exposure: Exposure, quat, scales, filtered) -> N
     # One factor after the other: the derivative of x / y has y⁻².
     k2x = dot(across, rest) / square / length
     k1 = dot(m, cross(p, q)) / square / (jnp.sqrt(square) * length)
-    a, b, c, det, dilation = filtered
-
-    def before(x: Array | float, y: Array | float) -> tuple[Array, Array]:
-        """Return a row times 1 − s Σ'⁻¹."""
-        share = dilation / det
-        return x - share * (c * x - b * y), y - share * (a * y - b * x)
-
-    rows = before(gx, gy), before(k1, 0.0), before(k2x, length)
-    return *(number for row in rows for number in row), depth
+    return gx, gy, k1, k2x, length, depth
 
 
 def ray_normals(exposure: Exposure, quat, scales) -> tuple[Array, ...]:

@@ -252,7 +252,7 @@ class Projected(NamedTuple):
     """Results of the arithmetic of a primitive, [R] each.
 
     Attributes:
-      u, v, shape: see `Splat`.
+      u, v, shape, key: see `Splat`.
       depth: see `Channels`.
       outline: further numbers from which the primitive makes the `Footprint`.
       reach: see `Footprint`.
@@ -268,6 +268,7 @@ class Projected(NamedTuple):
     reach: Array
     colors: Array
     normals: tuple[Array, ...] | None = None
+    key: tuple[Array, ...] = ()
 
 
 Arithmetic = Callable[[Components, Camera, RasterConfig, Array], Projected]
@@ -328,7 +329,7 @@ def project_rows(
     absolute = probe if config.absgrad else None
     return Projection(
         footprint=footprint(out),
-        splat=Splat(out.u, out.v, out.shape),
+        splat=Splat(out.u, out.v, out.shape, lax.stop_gradient(out.key)),
         channels=Channels(
             colors=out.colors,
             depth=out.depth,

@@ -16,6 +16,7 @@ def with_primitive(config: RasterConfig) -> RasterConfig:
     primitive = config.primitive
     if isinstance(primitive, Primitive):
         return config
-    plain = primitive in (None, ELLIPSOID.name) and not config.blends_ray_depth
+    plain = primitive in (None, ELLIPSOID.name)
+    plain &= not config.blends_ray_depth and not config.sorts_pixels
     named = None if plain else _NAMED[primitive or ELLIPSOID.name]
     return config.replace(primitive=named)
