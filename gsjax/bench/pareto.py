@@ -1,6 +1,7 @@
 """Run time against error: one setting of accuracy or size changes at a time.
 
-The exact image and gradient are the renderer's in float64 with cutoffs of 1e-9. At some
+The exact image and gradient are the renderer's in float64 with cutoffs of 1e-9; orders
+are compared with the exact order of each pixel. At some
 pixels, including the worst of every point, the error is compared with its bound
 (`gsjax.bench.pixelwise`), and the exact image with a dense one. Capacities are fitted.
 """
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.bench import pixelwise
+from gsjax.bench.popping import ORDERS
 from gsjax.gaussians import Gaussians, with_sh_degree
 from gsjax.math.numerics import in_float64
 from gsjax.planning.types import Plan
@@ -30,6 +32,7 @@ from gsjax.synthetic.stress_scenes import StressScene
 _CUTOFFS = {"alpha_min": 1e-9, "alpha_max": 1 - 1e-12, "transmittance_min": 1e-9}
 _COMMON: dict[str, Any] = {"outputs": ("rgb",), "num_size_buckets": 1}
 _EXACT = RasterConfig.accurate(**_CUTOFFS, **_COMMON, devices=1)
+_SORTED = _EXACT.replace(order="pixel")
 _CAPACITIES = ("pair_capacity", "visible_capacity")
 _PIXELS = 48  # random pixels to compare with bounds
 _LEAST = 1e-30
@@ -38,7 +41,8 @@ _LEAST = 1e-30
 class Point(NamedTuple):
     """One point of the plot: the setting that changes, and its value as text.
 
-    A ``degree`` of None keeps the SH degree of the scene; ``double`` uses float64.
+    A ``degree`` of None keeps the SH degree of the scene; ``double`` uses float64. The
+    exact image has the order of centres, or with ``sorted`` that of each pixel.
     """
 
     knob: str
@@ -46,6 +50,7 @@ class Point(NamedTuple):
     config: RasterConfig
     degree: int | None = None
     double: bool = False
+    sorted: bool = False
 
 
 class _Program(NamedTuple):
@@ -80,6 +85,10 @@ def make_points(gaussians: Gaussians, plan: Plan | None = None) -> list[Point]:
         Point("stop before", "1e-4", before),
         *(Point("SH degree", str(d), base, d) for d in range(gaussians.sh_degree)),
         Point("dtype", "float64", base, double=True),
+        *(
+            Point("order", name, base.replace(**change), sorted=True)
+            for name, change in ORDERS.items()
+        ),
     ]
     if plan is not None:
         config = plan.config.replace(**_COMMON, **dict.fromkeys(_CAPACITIES))
@@ -100,19 +109,21 @@ def measure_points(
     rng = np.random.default_rng(0)
     shape = (scene.camera.height, scene.camera.width, 3)
     weights = rng.normal(size=shape)
-    exact, *programs = _compile_all(scene, points, weights)
-    errors = [np.abs(each.rgb - exact.rgb).max(axis=-1) for each in programs]
+    *exact, programs = _compile_all(scene, points, weights)
+    whole = [exact[point.sorted] for point in points]
+    pairs = list(zip(programs, whole))
+    errors = [np.abs(each.rgb - true.rgb).max(axis=-1) for each, true in pairs]
     worst = [divmod(int(error.argmax()), shape[1])[::-1] for error in errors]
     others = rng.integers(0, shape[1::-1], (_PIXELS, 2))
     pixels = np.unique(np.concatenate([np.asarray(worst), others]), axis=0)
-    bounds, gap = _bounds(scene, points, pixels, exact.rgb)
+    bounds, gap = _bounds(scene, points, pixels, [each.rgb for each in exact])
     ms = _times(programs, points, repeats)
-    size = max(float(np.linalg.norm(exact.grads)), _LEAST)
     rows = []
-    for index, (point, program) in enumerate(zip(points, programs)):
+    for index, (point, (program, true)) in enumerate(zip(points, pairs)):
+        size = max(float(np.linalg.norm(true.grads)), _LEAST)
         at = errors[index][pixels[:, 1], pixels[:, 0]]
         nearest = int(np.argmax(at / np.maximum(bounds[index], _LEAST)))
-        mean = float(np.mean((program.rgb - exact.rgb) ** 2))
+        mean = float(np.mean((program.rgb - true.rgb) ** 2))
         rows.append(
             {
                 "scene": scene.name,
@@ -122,7 +133,7 @@ def measure_points(
                 "gradient ms": ms[f"gradient {index}"],
                 "max": float(errors[index].max()),
                 "psnr": -10 * np.log10(max(mean, _LEAST)),
-                "gradient": float(np.linalg.norm(program.grads - exact.grads)) / size,
+                "gradient": float(np.linalg.norm(program.grads - true.grads)) / size,
                 "at worst": float(at[nearest]),
                 "bound": float(bounds[index][nearest]),
                 "inside": bool((at <= bounds[index]).all()) and gap < 1e-5,
@@ -133,15 +144,20 @@ def measure_points(
 
 def _compile_all(
     scene: StressScene, points: Sequence[Point], weights: np.ndarray
-) -> list[_Program]:
-    """Return the program of the exact image and that of each point, all compiled."""
+) -> tuple[_Program, _Program, list[_Program]]:
+    """Return programs, all compiled: of the exact images in both orders, of points."""
     ready = partial(_compile, scene, weights, {})
-    every = [Point("exact", "", _EXACT, double=True), *points]
+    exact = [Point("exact", "", config, double=True) for config in (_EXACT, _SORTED)]
+    if not any(point.sorted for point in points):
+        exact[1] = exact[0]
+    every = [*exact, *points]
     if on_cpu():
         # Compilations and programs would compete for the cores.
-        return [ready(point) for point in progress(every, "points")]
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        return list(pool.map(ready, every))
+        first, second, *rest = [ready(point) for point in progress(every, "points")]
+    else:
+        with ThreadPoolExecutor(usable_cores()) as pool:
+            first, second, *rest = pool.map(ready, every)
+    return first, second, list(rest)
 
 
 def _compile(
@@ -177,7 +193,7 @@ def _compile(
 
         forward = jax.jit(image)
         gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))
-        if point.config is not _EXACT:  # its time does not count
+        if point.config not in (_EXACT, _SORTED):  # their time does not count
             jax.block_until_ready(forward(params))
         (_, rgb), grads = gradient(params, by_rgb)
         return _Program(
@@ -206,22 +222,32 @@ def _times(
 
 
 def _bounds(
-    scene: StressScene, points: Sequence[Point], pixels: np.ndarray, exact: np.ndarray
+    scene: StressScene, points: Sequence[Point], pixels: np.ndarray, exact: list
 ) -> tuple[list[np.ndarray], float]:
     """Return the error bound of each point at the pixels [P].
 
-    The second result is the difference between the dense and the exact image there.
+    The second result is the difference between the dense and the exact images there.
     """
     with jax.enable_x64(True):
         gaussians, camera = in_float64((scene.gaussians, scene.camera))
         found = pixelwise.composite_dense(gaussians, camera, scene.background, pixels)
-        gap = np.abs(found.rgb - exact[pixels[:, 1], pixels[:, 0]]).max()
-        bounds = [
-            pixelwise.error_bound(
+        dense, keys = [found.rgb], None
+        if any(point.sorted for point in points):
+            keys = pixelwise.ray_depths(found, gaussians, camera, pixels)
+            dense.append(pixelwise.in_ray_order(found, keys, scene.background))
+        images = [image[pixels[:, 1], pixels[:, 0]] for image in exact]
+        gap = max(np.abs(a - b).max() for a, b in zip(dense, images))
+        bounds = []
+        for point in points:
+            bound = pixelwise.error_bound(
                 found, gaussians, camera, point.config, point.degree, point.double
             )
-            for point in points
-        ]
+            if point.sorted:
+                assert keys is not None
+                bound = bound + pixelwise.order_bound(
+                    found, keys, point.config, point.double
+                )
+            bounds.append(bound)
     return bounds, float(gap)
 
 

@@ -6,6 +6,7 @@ known: dense, so for a few pixels only.
 Axis legend: N Gaussians, front to back, P pixels.
 """
 
+import heapq
 from typing import NamedTuple
 
 import jax
@@ -14,7 +15,11 @@ from scipy.special import expit
 
 from gsjax.cameras.camera import Camera
 from gsjax.gaussians import Gaussians, with_sh_degree
-from gsjax.raster.reference import reference_colors, reference_project
+from gsjax.raster.reference import (
+    reference_colors,
+    reference_project,
+    reference_ray_depths,
+)
 from gsjax.raster.types import RasterConfig
 
 # Largest rounding error relative to the largest colour, by the use of float64.
@@ -112,3 +117,64 @@ def error_bound(
     fewer = jax.jit(reference_colors)(with_sh_degree(gaussians, degree), camera)
     change = np.abs(np.asarray(fewer)[found.order] - found.colors)
     return total + (_weights(alpha)[0].T @ change).max(axis=1)
+
+
+def ray_depths(
+    found: Dense, gaussians: Gaussians, camera: Camera, pixels: np.ndarray
+) -> np.ndarray:
+    """Return the depths [N, P] along the rays of pixels [P, 2], in the order of Dense.
+
+    For pinholes, with float64 enabled.
+    """
+    depths = jax.jit(reference_ray_depths)(gaussians, camera, np.asarray(pixels) + 0.5)
+    return np.asarray(depths)[found.order]
+
+
+def in_ray_order(found: Dense, keys: np.ndarray, background) -> np.ndarray:
+    """Return the colours [P, 3] if each pixel sorts by ``keys`` [N, P]."""
+    rgb = []
+    for alpha, key in zip(found.alpha.T, keys.T):
+        order = np.argsort(key, kind="stable")
+        weight, left = _weights(alpha[order, None])
+        rgb.append(weight.T @ found.colors[order] + left[:, None] * background)
+    return np.concatenate(rgb)
+
+
+def order_bound(
+    found: Dense, keys: np.ndarray, config: RasterConfig, double: bool = True
+) -> np.ndarray:
+    """Bound the error of a channel by blending in the order of ``config``, [P].
+
+    Exchanging two neighbours i and j of an order changes a channel by at most D α_i α_j
+    (see `gsjax.planning.bounds` for D). So an order costs at most D Σ α_i α_j over the
+    pairs that it has the wrong way round, or whose depths rounding may exchange.
+
+    Args:
+      found: result of `composite_dense`.
+      keys: [N, P] from `ray_depths`.
+      config: order, order_window and alpha_min count.
+      double: rendered in float64.
+    """
+    close, sums = (1e-12 if double else 1e-5), []
+    for alpha, key in zip(found.alpha.T, keys.T):
+        seen = np.flatnonzero(alpha >= config.alpha_min * (1 - 1e-3))
+        order = seen[_emitted(key[seen], config)]
+        deeper = key[order][:, None] > key[order][None] * (1 - close)
+        pairs = alpha[order][:, None] * alpha[order][None]
+        sums.append(np.sum(np.triu(deeper * pairs, 1)))
+    return found.spread * np.minimum(sums, 1)
+
+
+def _emitted(keys: np.ndarray, config: RasterConfig) -> np.ndarray:
+    """Return the order [N] in which a pixel blends splats of depths [N]."""
+    if config.order == "pixel":
+        return np.argsort(keys, kind="stable")
+    window = config.order_window if config.order == "window" else 0
+    waiting: list[tuple[float, int]] = []
+    out = []
+    for number, key in enumerate(keys):
+        heapq.heappush(waiting, (key, number))
+        if len(waiting) > window:
+            out.append(heapq.heappop(waiting)[1])
+    out += [heapq.heappop(waiting)[1] for _ in range(len(waiting))]
+    return np.asarray(out, int)

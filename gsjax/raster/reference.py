@@ -44,11 +44,18 @@ def reference_project(gaussians: Gaussians, camera: Camera, dilation: float = 0.
     return jax.vmap(lens)(points), points[:, 2], cov2d, ratio, seen
 
 
-def reference_ray_depths(gaussians: Gaussians, camera: Camera) -> Array:
-    """Return the depth [N, H W] at which the ray of each pixel is densest.
+def reference_ray_depths(
+    gaussians: Gaussians, camera: Camera, places: Array | None = None
+) -> Array:
+    """Return the depth [N, P] at which the ray of each place is densest.
 
     For pinholes; negative behind the camera. Scales below 1e-5 of the largest count as
     that.
+
+    Args:
+      gaussians: N slots.
+      camera: a single camera.
+      places: [P, 2] in px; None for the centres of all pixels, row by row.
     """
     p = gaussians.params
     least = jnp.max(p.log_scales, axis=1, keepdims=True) + jnp.log(1e-5)
@@ -57,9 +64,11 @@ def reference_ray_depths(gaussians: Gaussians, camera: Camera) -> Array:
     means = p.means @ rotation.T + translation
     inverse = jnp.linalg.inv(covariance(p.quats, scales))
     inverse = jnp.einsum("ij,njk,lk->nil", rotation, inverse, rotation)
-    ys, xs = jnp.mgrid[: camera.height, : camera.width] + 0.5
-    x = (xs.ravel() - camera.K[0, 2]) / camera.K[0, 0]
-    y = (ys.ravel() - camera.K[1, 2]) / camera.K[1, 1]
+    if places is None:
+        ys, xs = jnp.mgrid[: camera.height, : camera.width] + 0.5
+        places = jnp.stack([xs.ravel(), ys.ravel()], -1)
+    x = (places[:, 0] - camera.K[0, 2]) / camera.K[0, 0]
+    y = (places[:, 1] - camera.K[1, 2]) / camera.K[1, 1]
     rays = jnp.stack([x, y, jnp.ones_like(x)], -1)
     along = jnp.einsum("pi,nij,nj->np", rays, inverse, means)
     return along / jnp.einsum("pi,nij,pj->np", rays, inverse, rays)

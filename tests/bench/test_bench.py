@@ -11,7 +11,14 @@ from conftest import camera_of, frustum_points, gaussians_at
 import gsjax
 from gsjax import RasterConfig
 from gsjax.bench.pareto import Point, front, make_points, measure_points
-from gsjax.bench.pixelwise import Dense, composite_dense, error_bound
+from gsjax.bench.pixelwise import (
+    Dense,
+    composite_dense,
+    error_bound,
+    in_ray_order,
+    order_bound,
+    ray_depths,
+)
 from gsjax.bench.report import front_figure, front_picture, table
 from gsjax.bench.scenes import facing_camera, open_bench_scene
 from gsjax.errors import InputError
@@ -85,6 +92,21 @@ def test_the_bound_of_bands_holds(view):
     error = np.abs(without - found.rgb).max(axis=1)
     assert (error <= bound_of(view, EXACT, degree=0)).all()
     assert error.max() > 0.005
+
+
+def test_the_bound_of_orders_holds(view):
+    scene, camera, found = view
+    keys = ray_depths(found, scene, camera, PIXELS)
+    exact = in_ray_order(found, keys, BEHIND)
+    assert order_bound(found, keys, EXACT.replace(order="pixel")).max() == 0
+    for order in ("center", "window"):
+        config = EXACT.replace(order=order)
+        rgb = gsjax.render(scene, camera, config, jnp.asarray(BEHIND)).rgb
+        error = np.abs(np.asarray(rgb).reshape(-1, 3) - exact).max(axis=1)
+        bound = order_bound(found, keys, config) + 1e-12
+        assert (error <= bound).all()
+        assert error.max() > 0.005
+        assert (error / bound).max() > 0.1, "the bound is not loose"
 
 
 @pytest.mark.parametrize("behind", [BEHIND, np.zeros(3)])
@@ -161,9 +183,13 @@ def test_a_point_is_measured(view):
     small = StressScene("small", scene, camera, tuple(BEHIND))
     sizes = {"num_size_buckets": 1, "devices": 1, "pair_capacity": 2048}
     config = RasterConfig.compat(outputs=("rgb",), **sizes)
+    sorts = config.replace(order="window")
     points = [Point("compat", "", config, double=True)]
-    (found,) = measure_points(small, points, repeats=1)
+    points.append(Point("order", "window 2", sorts, double=True, sorted=True))
+    found, by_window = measure_points(small, points, repeats=1)
     assert found["inside"]
+    assert by_window["inside"]
+    assert by_window["max"] > 1e-3
     assert 1e-5 < found["max"] < 0.05
     assert found["at worst"] <= found["bound"]
     assert 1e-6 < found["gradient"] < 0.1

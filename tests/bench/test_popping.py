@@ -1,0 +1,82 @@
+"""Popping, against the references' figures, and single places against pictures."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import COMPAT, DATA, render, scene_of
+
+import gsjax
+from gsjax.bench.popping import popping, same_rays, sample, turned
+
+
+def test_figures_of_the_references():
+    """`pop_exact`: the order of centres, and the floor that EWA has by itself."""
+    path = DATA / "methods" / "order.npz"
+    if not path.exists():
+        pytest.skip("order.npz is not there (../shared/data/methods)")
+    data = dict(np.load(path, allow_pickle=False))
+    logits = np.log(data["opacities"]) - np.log1p(-data["opacities"])
+    gaussians = gsjax.make_gaussians(
+        means=data["means"],
+        quats=data["quats"],
+        log_scales=np.log(data["scales"]),
+        logit_opacities=logits,
+        sh=np.zeros((len(logits), 1, 3)),
+    )
+    views = np.tile(np.eye(4), (2, 1, 1))
+    views[:, :3, :3], views[:, :3, 3] = data["R_frames"][:2], data["t_frames"][:2]
+    size = {"width": int(data["width"]), "height": int(data["height"])}
+    cameras = [
+        gsjax.make_camera(viewmat=v, K=data["K"], near=1e-3, **size) for v in views
+    ]
+    config = COMPAT.replace(
+        alpha_min=1e-300, alpha_max=1.0, transmittance_min=0.0, stop_rule="after"
+    )
+    colors = jnp.asarray(data["colours"])
+    for order, name in (("center", "centre"), ("pixel", "tstar")):
+        found = popping(
+            gaussians, cameras, config.replace(order=order), features=colors
+        )
+        assert found[0] == pytest.approx(data[f"pop_exact_{name}"][0], abs=1e-9)
+
+
+def test_places_are_pixels_of_the_picture():
+    gaussians, camera = scene_of("random")
+    points = np.random.default_rng(0).integers(0, (45, 29), (70, 2))
+    for order in ("center", "window", "pixel"):
+        config = COMPAT.replace(order=order)
+        rgb = np.asarray(render(gaussians, camera, config).rgb)
+        found = sample(gaussians, camera, points + 0.5, config)
+        np.testing.assert_allclose(found, rgb[points[:, 1], points[:, 0]], atol=1e-12)
+        assert found.std() > 0.05
+
+
+def test_a_turn_shows_the_same_rays():
+    _, camera = scene_of("random")
+    first, *_, last = turned(camera, 4, 2.0, axis=(0.3, 1.0, 0.1))
+    points = np.random.default_rng(0).uniform(0, 29, (50, 2))
+    places = same_rays(first, last, points)
+    assert np.abs(places - points).max() > 2
+    # The camera's matrix is rounded to float32.
+    np.testing.assert_allclose(same_rays(last, first, places), points, atol=1e-5)
+    # A point of space on a ray of one is at these places in both pictures.
+    world = [np.linalg.inv(np.asarray(c.viewmat)) for c in (first, last)]
+    np.testing.assert_allclose(world[0][:3, 3], world[1][:3, 3], atol=1e-5)
+    K = np.asarray(camera.K)
+    rays = np.column_stack([points, np.ones(50)]) @ np.linalg.inv(K).T * 3.0
+    space = rays @ world[1][:3, :3].T + world[1][:3, 3]
+    seen = (space - world[0][:3, 3]) @ world[0][:3, :3] @ K.T
+    np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], places, atol=1e-5)
+
+
+def test_other_cameras_are_refused():
+    gaussians, camera = scene_of("random")
+    moved = camera.replace(viewmat=camera.viewmat.at[0, 3].add(0.1))
+    with pytest.raises(gsjax.InputError, match="at one place"):
+        popping(gaussians, [camera, moved], COMPAT)
+    fisheye = gsjax.make_camera(
+        viewmat=camera.viewmat, K=camera.K, width=45, height=29, lens="fisheye",
+        coefficients=(0.0, 0.0, 0.0, 0.0),
+    )  # fmt: skip
+    with pytest.raises(gsjax.InputError, match="pinhole"):
+        popping(gaussians, [camera, fisheye], COMPAT)
