@@ -100,3 +100,38 @@ def _points(rows: Sequence[dict], time: str, error: str) -> np.ndarray:
     """Return times and errors to draw, [2, P]."""
     points = np.reshape([(row[time], row[error]) for row in rows], (-1, 2))
     return np.maximum(points, (0, _LEAST)).T
+
+
+def popping_table(rows: Sequence[dict]) -> str:
+    """Return lines of the rows of `gsjax.bench.popping.measure_popping`."""
+    lines = [
+        f"{'':<12}{'forward ms':>11}{'popping /255':>14}{'of center':>11}{'late':>12}"
+    ]
+    for row in rows:
+        ms, late = row["forward ms"], row["misordered"]
+        time = f"{'':>11}" if ms is None else f"{ms:11.1f}"
+        count = f"{'':>12}" if late is None else f"{late:12,}"
+        lines.append(
+            f"{row['order']:<12}{time}{row['popping']:14.4g}{row['of center']:11.3f}"
+            f"{count}"
+        )
+    lines.append(
+        "popping: mean change between frames, beside the turn; late: misordered"
+    )
+    return "\n".join(lines)
+
+
+def popping_picture(rows: Sequence[dict], name: str) -> np.ndarray:
+    """Return a plot of popping against forward time as pixels [H, W, 3] uint8."""
+    figure, (axes,) = new_chart((720, 480))
+    timed = [row for row in rows if row["forward ms"] is not None]
+    for index, row in enumerate(timed):
+        at = row["forward ms"], row["popping"]
+        axes.scatter(*at, color=f"C{index % 10}")
+        axes.annotate(
+            plain(row["order"]), at, textcoords="offset points", xytext=(6, 4)
+        )
+    axes.set(xscale="log", yscale="log", xlabel="forward ms", ylabel="popping, of 255")
+    axes.margins(0.15)
+    axes.set_title(f"{plain(name)}: popping against run time")
+    return figure_pixels(figure)

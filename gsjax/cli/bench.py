@@ -28,6 +28,8 @@ class BenchCommand(HeavyCommand):
     """Size of the image; default: that of the camera, or 400x300 for a .ply."""
     budget: Budget = None
     """Also measure the plan for this maximum error of a colour, e.g. 1/255."""
+    popping: bool = False
+    """Measure how much each order of blending pops when the camera turns, instead."""
     repeats: Annotated[int, integer(1, 1000)] = 5
     """Number of timings of each setting; the median is reported."""
     json: Path | None = None
@@ -50,6 +52,8 @@ class BenchCommand(HeavyCommand):
         from gsjax.runtime.timing import machine
 
         scene = open_bench_scene(self.scene, cameras=self.cameras, size=self.size)
+        if self.popping:
+            return self._pop(scene)
         planned = None
         if self.budget is not None:
             behind = scene.background
@@ -78,3 +82,22 @@ class BenchCommand(HeavyCommand):
         within = f"all {len(rows)} errors are within the theoretical bound"
         note(f"errors above the theoretical bound: {', '.join(bad)}" if bad else within)
         return 1 if bad else 0
+
+    def _pop(self, scene) -> int:
+        from gsjax.bench.popping import measure_popping
+        from gsjax.bench.report import popping_picture, popping_table
+        from gsjax.io import images
+        from gsjax.runtime import files
+        from gsjax.runtime.timing import machine
+
+        rows = measure_popping(scene, repeats=self.repeats)
+        say(f"{scene.name}, {scene.camera.width} × {scene.camera.height}")
+        say(popping_table(rows))
+        if self.json is not None:
+            files.make_folder(self.json.parent)
+            files.write_json(self.json, {"machine": machine(), "rows": rows})
+        if self.plot is not None:
+            files.make_folder(self.plot.parent)
+            picture = popping_picture(rows, scene.name)
+            files.write_file(self.plot, images.encode_png(picture))
+        return 0

@@ -60,6 +60,9 @@ class TrainCommand(HeavyCommand):
     antialias: bool = False
     """Compensate the opacity of splats smaller than a pixel, for renders at other
     sizes."""
+    order: Literal["center", "window"] = "center"
+    """Order in which a pixel blends, see `gsjax render`: a window costs about twice the
+    time."""
     absgrad: bool = False
     """Split by absolute gradients in the adaptive strategy: sharper, with more
     Gaussians."""
@@ -298,6 +301,8 @@ class TrainCommand(HeavyCommand):
         )
         if self.antialias:  # after refine_poses, which chooses the default
             config = config.replace(raster=config.raster.replace(antialias=True))
+        if self.order != "center":
+            config = config.replace(raster=config.raster.replace(order=self.order))
         if self.max_gaussians is not None:
             config = config.replace(max_gaussians=self.max_gaussians)
         if self.absgrad:

@@ -16,6 +16,7 @@ from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, select, with_sh_degree
 from gsjax.planning import bounds
 from gsjax.planning.accuracy import ROUNDING, fit_budget
+from gsjax.planning.order import choose_order
 from gsjax.planning.sizes import drop_faint, fit_capacities, tune_sizes
 from gsjax.planning.types import Plan, Reason
 from gsjax.raster.argument_checks import requires_concrete_values
@@ -48,6 +49,7 @@ def plan(
       cameras: one, a batch, or several; at most 12, evenly spaced, are measured. Other
         cameras should be similar.
       budget: largest error of a channel of rgb against the exact image, e.g. 1 / 255.
+        That image has the order of ``config``, or for a window that of each pixel.
         None keeps the accuracy of ``config`` and leaves out only what is invisible.
       config: other settings, such as dilation and antialiasing, are kept.
       background: [3] colour behind the views.
@@ -74,6 +76,8 @@ def plan(
     ]
     slots = gaussians.capacity
     gaussians, reason = _choose_sh_degree(_drop_invalid(gaussians), budget)
+    reasons.append(reason)
+    config, reason = choose_order(gaussians, views, config, background, budget)
     reasons.append(reason)
     measured = None
     if budget is not None and bool(np.any(np.asarray(gaussians.active))):

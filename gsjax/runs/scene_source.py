@@ -41,7 +41,7 @@ def free_view_config(trained: RasterConfig) -> RasterConfig:
 
     A free view may be filled by Gaussians right before the camera, where it pays.
     """
-    return trained.replace(occlusion=True)
+    return trained.replace(occlusion=not trained.sorts_pixels)
 
 
 def is_run(path: Path) -> bool:

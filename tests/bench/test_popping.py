@@ -7,6 +7,7 @@ from conftest import COMPAT, DATA, render, scene_of
 
 import gsjax
 from gsjax.bench.popping import popping, same_rays, sample, turned
+from gsjax.bench.report import popping_picture, popping_table
 
 
 def test_figures_of_the_references():
@@ -67,6 +68,20 @@ def test_a_turn_shows_the_same_rays():
     space = rays @ world[1][:3, :3].T + world[1][:3, 3]
     seen = (space - world[0][:3, 3]) @ world[0][:3, :3] @ K.T
     np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], places, atol=1e-5)
+
+
+def test_rows_reach_table_and_plot():
+    rows = [
+        {"order": "center", "forward ms": 3.0, "popping": 0.2, "of center": 1.0,
+         "misordered": None},
+        {"order": "window 64", "forward ms": None, "popping": 0.1, "of center": 0.5,
+         "misordered": 1234},
+    ]  # fmt: skip
+    text = popping_table(rows)
+    assert "1,234" in text
+    assert text.count("0.500") == 1
+    picture = popping_picture(rows, "$x")
+    assert picture.shape == (480, 720, 3)
 
 
 def test_other_cameras_are_refused():

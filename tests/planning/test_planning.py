@@ -251,3 +251,21 @@ def test_budgets_are_parsed():
     for bad in ("", "0", "-1", "1/0", "1/", "a", "nan", "1e999/1"):
         with pytest.raises(ValueError, match="above 0"):
             parse_budget(bad)
+
+
+def test_a_window_is_widened_or_sorted_exactly():
+    """Large Gaussians that cut each other: a budget decides."""
+    rng, views = np.random.default_rng(3), cameras(1, 0)
+    gaussians = gaussians_at(
+        frustum_points(rng, 40), rng.uniform(0.3, 1.5, (40, 3)), 0.6,
+        viewmat=np.eye(4), degree=0,
+    )  # fmt: skip
+    config = CONFIG.replace(order="window", order_window=1)
+    loose = gsjax.plan(gaussians, views, budget=0.9, config=config)
+    assert loose.config.order_window == 1
+    assert 0 < reason(loose, "order").error < 0.45
+    exact = gsjax.plan(gaussians, views, budget=BUDGET, config=config)
+    assert exact.config.order == "pixel"
+    assert "errs by" in reason(exact, "order").why
+    plain = gsjax.plan(gaussians, views, config=config)
+    assert plain.config.order_window == 1
