@@ -50,10 +50,10 @@ def filter_radii(
     Returns:
       [N] radii in world units; 0 if no camera samples any Gaussian.
     """
-    means = lax.stop_gradient(means)
+    points = tuple(lax.stop_gradient(means).T)
 
     def visit(least: Array, camera: Camera) -> tuple[Array, None]:
-        interval = _sampling_interval(means, camera, nearest)
+        interval = _sampling_interval(points, camera, nearest)
         return jnp.minimum(least, interval.astype(least.dtype)), None
 
     unseen = jnp.full(means.shape[0], jnp.inf, means.dtype)
@@ -63,11 +63,13 @@ def filter_radii(
     return math.sqrt(_VARIANCE) * jnp.where(seen, least, largest)
 
 
-def _sampling_interval(means: Array, camera: Camera, nearest: float) -> Array:
-    """Return the distance [N] between samples at the means; inf if not in view."""
-    rotation, shift = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    # A sum instead of a product of matrices, whose precision depends on the platform.
-    x, y, z = (jnp.sum(means * rotation[i], -1) + shift[i] for i in range(3))
+def _sampling_interval(
+    points: tuple[Array, ...], camera: Camera, nearest: float
+) -> Array:
+    """Return the distance [N] between samples at points; inf if not in view."""
+    # Sums instead of a product of matrices, whose precision depends on the platform.
+    rows = camera.viewmat[:3]
+    x, y, z = (sum(r[i] * points[i] for i in range(3)) + r[3] for r in rows)
     depth = camera.lens.depth((x, y, z))
     seen = (depth > nearest) & camera.lens.valid(
         camera.K, camera.coefficients, (x, y, z)
