@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from gsjax.cli.common import HeavyCommand, check_output, start_jax
+from gsjax.cli.common import HeavyCommand, UsageError, check_output, start_jax
 from gsjax.cli.options import Budget, OptionalSize, integer
 from gsjax.runtime.console import note, say
 
@@ -28,6 +28,9 @@ class BenchCommand(HeavyCommand):
     """Size of the image; default: that of the camera, or 400x300 for a .ply."""
     budget: Budget = None
     """Also measure the plan for this maximum error of a colour, e.g. 1/255."""
+    scales: bool = False
+    """Compare the filters of the image at 1/8 to 8 times the resolution with the mean
+    over each pixel, instead."""
     repeats: Annotated[int, integer(1, 1000)] = 5
     """Number of timings of each setting; the median is reported."""
     json: Path | None = None
@@ -38,6 +41,8 @@ class BenchCommand(HeavyCommand):
     """Replace existing files."""
 
     def run(self) -> int:
+        if self.scales and self.budget is not None:
+            raise UsageError("--scales and --budget exclude each other")
         check_output("--plot", self.plot, self.overwrite, ".png")
         check_output("--json", self.json, self.overwrite)
         start_jax()
@@ -51,6 +56,8 @@ class BenchCommand(HeavyCommand):
 
         scene = open_bench_scene(self.scene, cameras=self.cameras, size=self.size)
         planned = None
+        if self.scales:
+            return self._sweep(scene)
         if self.budget is not None:
             behind = scene.background
             planned = plan(
@@ -78,3 +85,20 @@ class BenchCommand(HeavyCommand):
         within = f"all {len(rows)} errors are within the theoretical bound"
         note(f"errors above the theoretical bound: {', '.join(bad)}" if bad else within)
         return 1 if bad else 0
+
+    def _sweep(self, scene) -> int:
+        from gsjax.bench.scales import measure_scales, scales_picture, scales_table
+        from gsjax.io import images
+        from gsjax.runtime import files
+
+        rows = measure_scales(scene)
+        say(f"{scene.name}, {scene.camera.width} × {scene.camera.height}")
+        say(scales_table(rows))
+        if self.json is not None:
+            files.make_folder(self.json.parent)
+            files.write_json(self.json, {"rows": [row._asdict() for row in rows]})
+        if self.plot is not None:
+            files.make_folder(self.plot.parent)
+            picture = scales_picture(rows, scene.name)
+            files.write_file(self.plot, images.encode_png(picture))
+        return 0
