@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from gsjax.cameras.camera import Camera
@@ -26,7 +27,6 @@ from gsjax.raster.exact import render_exact
 from gsjax.raster.types import RasterConfig
 from gsjax.synthetic.stress_scenes import StressScene
 from gsjax.train.config import mip_raster
-from gsjax.train.metrics import psnr
 
 if typing.TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -91,7 +91,7 @@ def scaled_camera(camera: Camera, scale: float, samples: int = 1) -> Camera:
 
 def _image(scene: StressScene, camera: Camera, config: RasterConfig) -> np.ndarray:
     """Return the part of an image that is drawn, [h, w, 3]."""
-    behind = np.asarray(scene.background, np.float32)
+    behind = jnp.asarray(scene.background, jnp.float32)
     view = render_exact(scene.gaussians, camera, config, behind)
     width, height = (int(n) for n in np.asarray(camera.visible_size))
     return np.asarray(view.rgb, np.float64)[:height, :width]
@@ -103,6 +103,10 @@ def true_image(scene: StressScene, scale: float, samples: int = _SAMPLES) -> np.
     height, width = (n // samples for n in found.shape[:2])
     blocks = found.reshape(height, samples, width, samples, 3)
     return blocks.mean((1, 3))
+
+
+def _decibels(image: np.ndarray, truth: np.ndarray) -> float:
+    return float(-10 * np.log10(max(np.mean((image - truth) ** 2), 1e-30)))
 
 
 def measure_scales(
@@ -120,17 +124,17 @@ def measure_scales(
     rows = []
     for scale in scales:
         truth = true_image(scene, scale)
-        apart = psnr(true_image(scene, scale, _SAMPLES // 2), truth)
+        apart = _decibels(true_image(scene, scale, _SAMPLES // 2), truth)
         camera = scaled_camera(scene.camera, scale)
         for name, config in FILTERS.items():
             found = _image(scene, camera, config)
             row = ScaleRow(
                 scale=scale,
                 filter=name,
-                psnr=float(psnr(found, truth)),
+                psnr=_decibels(found, truth),
                 max=float(np.abs(found - truth).max()),
                 brightness=float(found.mean() / max(truth.mean(), 1e-9)),
-                truth=float(apart),
+                truth=apart,
             )
             rows.append(row)
     return rows
@@ -176,7 +180,7 @@ def scales_figure(rows: Sequence[ScaleRow], name: str) -> Figure:
     for index, kind in enumerate(dict.fromkeys(row.filter for row in rows)):
         some = sorted(row for row in rows if row.filter == kind)
         at = [row.scale for row in some]
-        options = {"marker": "os^Dv"[index % 5], "color": f"C{index % 10}"}
+        options: Any = {"marker": "os^Dv"[index % 5], "color": f"C{index % 10}"}
         axes[0].plot(at, [row.psnr for row in some], label=plain(kind), **options)
         axes[1].plot(at, [row.brightness for row in some], **options)
     for each, label in zip(axes, ("PSNR, dB", "brightness, relative")):

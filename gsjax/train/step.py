@@ -105,7 +105,7 @@ def make_train_step(
         )
 
     def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
-        refresh = stages.refresh
+        refresh: Any = stages.refresh
         if refresh is not None:
             due = jnp.asarray(table)[jnp.clip(state.step, 0, len(table) - 1)]
             state = lax.cond(due, lambda s: refresh(s, cameras), lambda s: s, state)
@@ -128,7 +128,7 @@ def refresh_table(setup: Setup) -> np.ndarray:
     See `gsjax.train.models.Refresh`; all False if the model has none.
     """
     config, refresh = setup.config, setup.model.refresh
-    step = np.arange(config.steps + 1)
+    step: Any = np.arange(config.steps + 1)
     if refresh is None:
         return np.zeros(step.shape, bool)
     due = np.broadcast_to(np.asarray(setup.strategy.due(step)), step.shape)

@@ -179,8 +179,8 @@ def live(
         if step % every and len(steps) > 1:
             return
         # One program for any number of Gaussians.
-        config = fixed.replace(visible_capacity=state.gaussians.capacity)
         scene = scene_of(model, state.params)
+        config = fixed.replace(visible_capacity=scene.capacity)
         view = render_exact(scene, camera, config, behind)
         preview = _preview(view, photo, f"step {step}")
         title = f"PSNR, dB; {int(metrics.gaussians):,} Gaussians"
