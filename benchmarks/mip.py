@@ -126,9 +126,8 @@ def compared(
                 overwrite=True,
                 mode=ply_mode(mine.raster),
             )
-    for name, ms in step_times(dataset, photos, config, results).items():
-        for row in rows:
-            row[name] = ms if row["training"] == "mip" else 1.0
+    rows[-1] |= step_times(dataset, photos, config, results)
+    rows[0] |= {name: 1.0 for name in rows[-1] if name.startswith("step")}
     return rows
 
 
