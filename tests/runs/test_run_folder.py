@@ -408,10 +408,11 @@ def started(monkeypatch):
     return scenes
 
 
-def test_a_run_is_resumed_with_its_own_options_only(made, started, capsys):
+@pytest.mark.parametrize("filters", ["--antialias", "--mip"])
+def test_a_run_is_resumed_with_its_own_options_only(made, started, capsys, filters):
     """Options that are not given are those of the run."""
     data, run = made / "data", made / "again"
-    options = "--preset fast --steps 2 --max-gaussians 40 --antialias --test-images"
+    options = f"--preset fast --steps 2 --max-gaussians 40 {filters} --test-images"
     options = [*options.split(), "0.png"]
     for more in (options, [*options, "--resume"], ["--resume"]):
         assert train(data, run, *more) == 130
@@ -420,6 +421,10 @@ def test_a_run_is_resumed_with_its_own_options_only(made, started, capsys):
         capsys.readouterr()
         assert train(data, run, *option, "--resume") == 2
         assert f"leave out {option[0]}" in capsys.readouterr().err
+    config = load_settings(run).config
+    dilation = 0.1 if filters == "--mip" else 0.3
+    assert (config.mip, config.raster.antialias) == (filters == "--mip", True)
+    assert config.raster.dilation == dilation
     change(run / "config.json", every=8)
     assert train(data, run, *options, "--resume") == 130
     settings = json.loads((run / "config.json").read_text())["train"]
