@@ -4,7 +4,8 @@
 the files in GaussianSplats3D (Kellogg, MIT; WebGL) with the camera of a photograph, and
 renders the same view with gsjax. It saves both side by side, of the PLY of the last
 run, and their difference. (That viewer has 8-bit colours, cuts splats at √8 standard
-deviations, and drops α below 1/255.) Scenes of ``--mip`` are drawn with the viewer's
+deviations, drops α below 1/255, and reads SPZ of version 2, as which the file is
+rewritten.) Scenes of ``--mip`` are drawn with the viewer's
 own antialiasing and a kernel of 0.1 px². It needs ``npm``, which downloads the viewer,
 and Chromium.
 """
@@ -14,8 +15,10 @@ from __future__ import annotations
 import argparse
 import base64
 import functools
+import gzip
 import http.server
 import json
+import struct
 import subprocess
 import tempfile
 import threading
@@ -116,6 +119,8 @@ def theirs(
     pose = np.linalg.inv(viewmat)
     pose[:3, 3] += origin
     pose[:3, 1:3] *= -1  # y up, looking along −z
+    if splat.suffix == ".spz":  # whose axes are ours after half a turn about x
+        pose = np.diag([1.0, -1.0, -1.0, 1.0]) @ pose
     near, far = 0.01, 1000.0
     (fx, cx), (fy, cy) = (K[0, 0], K[0, 2]), (K[1, 1], K[1, 2])
     width, height = camera.width, camera.height
@@ -155,6 +160,19 @@ def theirs(
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
+def as_version_2(path: Path) -> None:
+    """Rewrite an SPZ file for readers of version 2: rotations of 24 bits, in place."""
+    raw = bytearray(gzip.decompress(path.read_bytes()))
+    (count,) = struct.unpack_from("<I", raw, 8)
+    quats = np.asarray(gsjax.load(path).params.quats, np.float64)
+    xyz = quats[:, 1:] * [1, -1, -1] * np.where(quats[:, :1] < 0, -1, 1)
+    start = 16 + 16 * count  # after means, opacities, colours and scales
+    packed = np.clip(np.rint(127.5 * (1 + xyz)), 0, 255).astype(np.uint8)
+    raw[start : start + 4 * count] = packed.tobytes()
+    struct.pack_into("<I", raw, 4, 2)
+    path.write_bytes(gzip.compress(raw))
+
+
 def compared(run: Path, suffix: str) -> tuple[dict, np.ndarray]:
     """Return how far both are apart, and both images side by side."""
     settings = load_settings(run)
@@ -165,6 +183,8 @@ def compared(run: Path, suffix: str) -> tuple[dict, np.ndarray]:
         folder = Path(name)
         file = folder / f"splat{suffix}"
         export_scene(run, file)
+        if suffix == ".spz":
+            as_version_2(file)
         raster = file_raster(file)
         gaussians = gsjax.load(file)
         degree, origin = gaussians.sh_degree, split.dataset.origin
