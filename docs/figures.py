@@ -1,6 +1,8 @@
 """Draw the pictures of these pages: ``python -P docs/figures.py``.
 
-``python -P docs/figures.py MESH X Y Z`` draws a mesh, with (X, Y, Z) upwards.
+``python -P docs/figures.py MESH X Y Z`` draws a mesh, with (X, Y, Z) upwards, and
+``python -P docs/figures.py FOLDER`` the scenes that ``benchmarks/mip.py --keep FOLDER``
+has trained.
 """
 
 import sys
@@ -21,6 +23,8 @@ from gsjax.raster.lists import binning
 from gsjax.raster.primitives.ellipsoid import ELLIPSOID
 from gsjax.raster.render_camera import visible_order
 from gsjax.raster.types import Inputs
+from gsjax.runs.scene_source import file_raster
+from gsjax.synthetic import raycaster
 from gsjax.synthetic.torus_knot import torus_knot_scene
 
 ASSETS = Path(__file__).parent / "assets"
@@ -77,6 +81,29 @@ def mesh(path: Path, up: list[float]) -> None:
             cv2.resize(page, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         )
     write("mesh.webp", np.concatenate(pages, axis=1))
+
+
+def aliasing(folder: Path) -> None:
+    """Draw the still life trained without and with filters, beside the truth."""
+    viewmats, K = raycaster.demo_cameras(40, 320, 240)
+    viewmat, rows = viewmats[8], []
+    for scale, divisor in ((4, 1), (0.25, 4)):
+        size = 320 // divisor, 240 // divisor
+        zoomed = np.diag([scale, scale, 1]) @ K
+        if scale > 1:
+            zoomed[:2, 2] -= (scale - 1) * np.asarray(size) / 2
+        cells = []
+        for name in ("demo-plain.ply", "demo-mip.ply"):
+            camera = gsjax.make_camera(
+                viewmat=viewmat, K=zoomed, width=size[0], height=size[1]
+            )
+            scene, config = gsjax.load(folder / name), file_raster(folder / name)
+            view = gsjax.render_exact(scene, camera, config)
+            cells.append(np.asarray(view.rgb))
+        cells.append(raycaster.cast(viewmat, zoomed, *size, 3 * divisor)[0])
+        wide = [np.repeat(np.repeat(c, divisor, 0), divisor, 1) for c in cells]
+        rows.append(np.concatenate(wide, axis=1))
+    write("aliasing.webp", np.concatenate(rows, axis=0))
 
 
 def order() -> None:
@@ -233,6 +260,8 @@ def _lengths(footprint, picture: np.ndarray) -> np.ndarray:
 if __name__ == "__main__":
     if len(sys.argv) == 5:
         mesh(Path(sys.argv[1]), [float(word) for word in sys.argv[2:]])
+    elif len(sys.argv) == 2:
+        aliasing(Path(sys.argv[1]))
     else:
         gsjax.use_all_cores()
         knot()

@@ -63,6 +63,10 @@ class TrainCommand(HeavyCommand):
     order: Literal["center", "window"] = "center"
     """Order in which a pixel blends, see `gsjax render`: a window costs about twice the
     time."""
+    mip: bool = False
+    """Train with the filters of Mip-Splatting, for renders at other sizes and
+    distances: a 3D filter by the resolution of the photographs, and a smaller filter of
+    the image that keeps the brightness."""
     absgrad: bool = False
     """Split by absolute gradients in the adaptive strategy: sharper, with more
     Gaussians."""
@@ -130,6 +134,9 @@ class TrainCommand(HeavyCommand):
             raise UsageError("--test-images: expected the name of at least one view")
         if self.test_images and self.test_every is not None:
             raise UsageError("--test-every and --test-images exclude each other")
+        if self.mip and (self.antialias or self.primitive != "ellipsoid"):
+            other = "--antialias" if self.antialias else "--primitive"
+            raise UsageError(f"--mip and {other} exclude each other")
         if self.viewer_port is not None and not self.viewer:
             raise UsageError("--viewer-port goes with --viewer")
         start_jax()
@@ -234,14 +241,22 @@ class TrainCommand(HeavyCommand):
             raise UsageError(f"--initial {given}: {fault}")
         if not is_run(given):
             return splat
-        if load_settings(given).config.raster.antialias != self.antialias:
-            change = f"{'leave out' if self.antialias else 'pass'} --antialias"
-            fault = f"--antialias differs from that run; {change}"
-            raise UsageError(f"--initial {given}: {fault}")
+        self._check_same_filter(given, load_settings(given).config)
         if run_files(given).cameras.exists():
             text = "has refined cameras; this run starts from those of the dataset"
             note(f"warning: {given} {text}")
         return splat
+
+    def _check_same_filter(self, given: Path, config) -> None:
+        """Raise if the scene that --initial names was trained for other filters."""
+        for name, trained in (
+            ("mip", config.mip),
+            ("antialias", config.raster.antialias and not config.mip),
+        ):
+            if trained != getattr(self, name):
+                change = f"{'pass' if trained else 'leave out'} --{name}"
+                fault = f"--{name} differs from that run; {change}"
+                raise UsageError(f"--initial {given}: {fault}")
 
     def _settings(self, start: Path | None):
         from gsjax.runs.folder import RunSettings
@@ -296,6 +311,7 @@ class TrainCommand(HeavyCommand):
             refine_shutter=self.refine_shutter,
             undistort=self.undistort,
             exposure=self.exposure,
+            mip=self.mip,
             **self._geometry(),
             prune_invisible=not self.keep_unseen,
         )

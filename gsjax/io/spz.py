@@ -9,6 +9,8 @@ and 3 are read, 3 is written.
 import gzip
 import math
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from struct import Struct
@@ -40,11 +42,44 @@ _HALF_TURN = np.array([1.0, -1.0, -1.0])
 _MIN_OPACITY = 0.25 / 255  # rounds to 0
 
 
+def is_antialiased(path: str | PathLike[str]) -> bool:
+    """Return whether an SPZ file says that its scene was trained with antialiasing.
+
+    The flag does not tell the size of the filter; gsjax draws such files with that of
+    Mip-Splatting.
+
+    Raises:
+      InputError: as `read_spz`, from the header alone.
+    """
+    path = Path(path)
+    with _opened(path) as (stream, _):
+        return bool(_read_header(stream, path)[-1] & _ANTIALIASED)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[BinaryIO, int]]:
+    """Yield the inflated stream of a file, and the size of the file."""
+    with opened(path, "an .spz file") as file:
+        size = file.seek(0, 2)
+        file.seek(0)
+        if file.read(4) == _MAGIC:
+            what = "expected SPZ of version 2 or 3, got 4 or later"
+            raise InputError(f"{path}: {what}; convert it, for example with SuperSplat")
+        file.seek(0)
+        try:
+            with gzip.GzipFile(fileobj=file) as stream:
+                yield cast(BinaryIO, stream), size
+        except (gzip.BadGzipFile, zlib.error, EOFError) as error:
+            what = f"not an SPZ file, or damaged or truncated: {error}"
+            raise InputError(f"{path}: {what}; {_REMEDY}") from error
+
+
 def read_spz(path: str | PathLike[str]) -> Gaussians:
     """Read an SPZ file of version 2 or 3 and SH degree 0 to 4.
 
     Trailing bytes and extensions are ignored with a warning. A file that was trained
-    with antialiasing is warned about: `RasterConfig` must be told.
+    with antialiasing is warned about: `RasterConfig` must be told. See
+    `is_antialiased`.
 
     Returns:
       Gaussians with capacity max(N, 1), in the order of the file.
@@ -55,19 +90,8 @@ def read_spz(path: str | PathLike[str]) -> Gaussians:
       CapacityError: if memory is too small; raised before the body is read.
     """
     path = Path(path)
-    with opened(path, "an .spz file") as file:
-        size = file.seek(0, 2)
-        file.seek(0)
-        if file.read(4) == _MAGIC:
-            what = "expected SPZ of version 2 or 3, got 4 or later"
-            raise InputError(f"{path}: {what}; convert it, for example with SuperSplat")
-        file.seek(0)
-        try:
-            with gzip.GzipFile(fileobj=file) as stream:
-                return _read(cast(BinaryIO, stream), path, size)
-        except (gzip.BadGzipFile, zlib.error, EOFError) as error:
-            what = f"not an SPZ file, or damaged or truncated: {error}"
-            raise InputError(f"{path}: {what}; {_REMEDY}") from error
+    with _opened(path) as (stream, size):
+        return _read(stream, path, size)
 
 
 def _read(stream: BinaryIO, path: Path, size: int) -> Gaussians:
@@ -99,7 +123,7 @@ def _read(stream: BinaryIO, path: Path, size: int) -> Gaussians:
             what = "extensions are ignored, and may change colours"
         common.warn(f"{path}: {what}")
     if flags & _ANTIALIASED:
-        remedy = "render it with RasterConfig(antialias=True)"
+        remedy = "render it with RasterConfig(antialias=True, dilation=0.1)"
         common.warn(f"{path}: the scene was trained with antialiasing; {remedy}")
     sh = np.zeros((count, bases, 3), np.float32)
     sh[:, 0] = (parts["colors"] / 255 - 0.5) / _COLOR

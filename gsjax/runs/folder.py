@@ -36,7 +36,7 @@ from gsjax.runs.config_json import check_types, config_from_json
 from gsjax.runs.history import read_metrics
 from gsjax.runs.refined_cameras import load_cameras
 from gsjax.runtime.files import read_json, write_json
-from gsjax.train.config import TrainConfig
+from gsjax.train.config import TrainConfig, is_mip_raster
 
 _FORMAT = 1
 
@@ -246,8 +246,13 @@ def save_scene(
 
 
 def ply_mode(raster: RasterConfig) -> str | None:
-    """Return the render mode that a PLY file of a scene is marked with."""
-    return "2dgs" if raster.draws_surfels else None
+    """Return the render mode that a PLY file of a scene is marked with.
+
+    See `gsjax.io.ply.render_mode`.
+    """
+    if raster.draws_surfels:
+        return "2dgs"
+    return "mip" if is_mip_raster(raster) else None
 
 
 def _moved(gaussians: Gaussians, offset: np.ndarray) -> Gaussians:

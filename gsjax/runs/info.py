@@ -51,6 +51,7 @@ def describe_run(folder: Path) -> dict[str, Any]:
         "max_size": config.max_size,
         "background": config.background,
         "shutter": config.shutter,
+        "mip": config.mip,
         "undistort": config.undistort,
         "evaluation": _evaluation(files.eval),
     }
@@ -81,6 +82,8 @@ def run_text(path: str, facts: dict[str, Any]) -> str:
     }
     if facts["shutter"] != "global":
         rows["shutter"] = facts["shutter"].replace("_", " ")
+    if facts["mip"]:
+        rows["filters"] = "Mip-Splatting"
     quality = facts["evaluation"]
     if quality is not None:
         views = f"{quality['views']} {_VIEWS[quality['which']]} views"

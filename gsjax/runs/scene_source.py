@@ -9,8 +9,10 @@ import numpy as np
 
 from gsjax.gaussians import Gaussians
 from gsjax.io.ply import render_mode
+from gsjax.io.spz import is_antialiased
 from gsjax.raster.types import RasterConfig
 from gsjax.runs import folder as run_folder
+from gsjax.train.config import mip_raster
 
 # Render settings by their names on the command line.
 RASTER_PRESETS = {
@@ -61,6 +63,24 @@ def splat_file(path: Path) -> Path:
     return run_folder.require_splat(path)
 
 
+def file_raster(path: Path) -> RasterConfig:
+    """Return the render settings of a file of Gaussians: `RasterConfig.compat`.
+
+    They draw surfels if it is a PLY of surfels, and have the filter of Mip-Splatting if
+    its comment or the flag of an SPZ says so.
+
+    Raises:
+      InputError: if the file cannot be read.
+    """
+    config, suffix = RasterConfig.compat(), path.suffix.lower()
+    mode = render_mode(path) if suffix == ".ply" else None
+    if mode == "2dgs":
+        return config.replace(primitive="surfel")
+    if mode == "mip" or (suffix == ".spz" and is_antialiased(path)):
+        return mip_raster(config)
+    return config
+
+
 def open_scene_source(
     path: Path,
     *,
@@ -74,8 +94,9 @@ def open_scene_source(
       path: a .ply or .spz file, or the folder of a run.
       origin: [3] to subtract from the file's coordinates, as `load_dataset` and
         `load_near_transforms` do from those of the cameras.
-      raster: render settings, except ``antialias`` and ``primitive``, which are those
-        of the scene; None for `free_view_config` of the run, or "compat" for a file.
+      raster: render settings, except ``dilation``, ``antialias`` and ``primitive``,
+        which are those of the scene; None for `free_view_config` of the run, or
+        "compat" for a file.
       background: RGB; None for that of the run, or black for a file.
 
     Raises:
@@ -86,11 +107,11 @@ def open_scene_source(
         trained = run_folder.load_settings(path).config
         config, behind = trained.raster, run_folder.background_color(trained)
         config = free_view_config(config)
-    elif path.suffix.lower() == ".ply" and render_mode(path) == "2dgs":
-        config = config.replace(primitive="surfel")
+    else:
+        config = file_raster(path)
     if raster is not None:  # a scene is learnt for one way of drawing
-        same = {"antialias": config.antialias, "primitive": config.primitive}
-        config = raster.replace(**same)
+        names = "dilation", "antialias", "primitive"
+        config = raster.replace(**{name: getattr(config, name) for name in names})
     splat = splat_file(path)
     origin = np.zeros(3) if origin is None else origin
     reader = partial(run_folder.load_scene, splat, origin)

@@ -28,7 +28,7 @@ from gsjax.train.config import TrainConfig
 from gsjax.train.evaluation import Summary, summarise
 from gsjax.train.health import has_valid_pixels
 from gsjax.train.loop import FitResult, Hooks, Progress, subset
-from gsjax.train.state import TrainState
+from gsjax.train.state import TrainState, shown_gaussians
 
 
 class ResumePoint(NamedTuple):
@@ -117,7 +117,8 @@ class Session:
     def save_result(self, state: TrainState) -> None:
         """Write the current scene, and its cameras if they are refined."""
         files, dataset = self.files, self.split.dataset
-        save_scene(files.splat, state.gaussians, dataset, self.config)
+        scene = shown_gaussians(state, self.config)
+        save_scene(files.splat, scene, dataset, self.config)
         if (cameras := self.cameras(state)) is not dataset:
             save_cameras(files.cameras, cameras)
 
@@ -165,7 +166,8 @@ class Session:
         def measure(state: TrainState, progress: Progress) -> None:
             dataset, photos = self.held_out(self.cameras(state))
             if any(map(has_valid_pixels, photos)):
-                results = evaluate_views(state.gaussians, dataset, photos, self.config)
+                scene = shown_gaussians(state, self.config)
+                results = evaluate_views(scene, dataset, photos, self.config)
                 summary = summarise(list(results))
                 self.log_held_out(state, summary, self.seconds(progress))
                 quality = f"PSNR {decibels(summary.psnr)}, SSIM {summary.ssim:.4f}"

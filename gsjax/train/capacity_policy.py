@@ -223,7 +223,10 @@ def grow_state(state: TrainState, capacity: int) -> TrainState:
 
     return state.replace(
         gaussians=grow(state.gaussians, capacity),
-        model=state.model._replace(slots=jax.tree.map(pad, state.model.slots)),
+        model=state.model._replace(
+            slots=jax.tree.map(pad, state.model.slots),
+            buffers=jax.tree.map(pad, state.model.buffers),
+        ),
         moments=jax.tree.map(pad, state.moments),
         stats=jax.tree.map(pad, state.stats),
     )

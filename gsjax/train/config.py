@@ -53,6 +53,22 @@ _DEFAULTS = {
     for primitive in (None, *PRIMITIVES)
     for precise, raster in ((False, _RASTER), (True, _ACCURATE))
 }
+# The 2D filter of Mip-Splatting: σ² of a box of one pixel is 1/12; the paper takes 0.1.
+_MIP = {"dilation": 0.1, "antialias": True}
+_MIP_DEFAULTS = {key: raster.replace(**_MIP) for key, raster in _DEFAULTS.items()}
+
+
+def mip_raster(raster: RasterConfig) -> RasterConfig:
+    """Return render settings with the 2D filter of Mip-Splatting.
+
+    It replaces the dilation: 0.1 px² with compensated opacities (Yu et al. 2024).
+    """
+    return raster.replace(**_MIP)
+
+
+def is_mip_raster(raster: RasterConfig) -> bool:
+    """Return whether render settings have the 2D filter of Mip-Splatting."""
+    return not raster.draws_surfels and mip_raster(raster) == raster
 
 
 @dataclass(frozen=True)
@@ -90,6 +106,8 @@ class TrainConfig:
         rolling ``shutter``.
       primitive: kind of Gaussian, see `RasterConfig.primitive`; None for that of
         ``raster``. Surfels start in the planes of neighbouring points.
+      mip: train with the filters of Mip-Splatting against aliasing: the 3D filter of
+        `gsjax.train.mip`, and `mip_raster` in place of the dilation. For ellipsoids.
       normal_weight, distortion_weight, entropy_weight: weights of
         `gsjax.train.geometry_loss`: of `normal_consistency`, of `distortion_term`, and
         of `opacity_entropy`; 0 leaves a term out.
@@ -137,6 +155,7 @@ class TrainConfig:
     refine_shutter: bool = False
     exposure: bool = False
     primitive: str | None = None
+    mip: bool = False
     normal_weight: float = 0.0
     normal_from: float = 0.25
     distortion_weight: float = 0.0
@@ -174,6 +193,7 @@ class TrainConfig:
             "normal_weight", "distortion_weight", "entropy_weight",
         )  # fmt: skip
         rolling = not self.refine_shutter or SHUTTERS[self.shutter].rolling
+        surfels = self.mip and self.raster.draws_surfels
         opacity, scale = 0 < settings.initial_opacity < 1, settings.initial_scale > 0
         checks = {
             "steps": f"[1, {2**31 - 1})",
@@ -182,6 +202,7 @@ class TrainConfig:
             "levels": (levels, "increasing starts from 0 and divisors ≥ 1"),
             "sh_degree": "[0, 4]",
             "refine_shutter": (rolling, "False for a global shutter"),
+            "mip": (not surfels, "False for surfels"),
             "ssim_weight": "[0, 1]",
             "rates' means": (means, "two positive numbers, or equal ones"),
             "rates' cooling": (0 < rates.cooling <= 1, "cooling in (0, 1]"),
@@ -199,12 +220,13 @@ class TrainConfig:
     def _own_raster(self) -> RasterConfig:
         """Return the render settings: the default, or those of the user."""
         raster = self.raster
-        if any(raster is some for some in _DEFAULTS.values()):
+        defaults = (*_DEFAULTS.values(), *_MIP_DEFAULTS.values())
+        if any(raster is some for some in defaults):
             precise = self.refine_poses or self.refine_shutter
-            raster = _DEFAULTS[self.primitive, precise]
-        elif self.primitive is not None:
+            return (_MIP_DEFAULTS if self.mip else _DEFAULTS)[self.primitive, precise]
+        if self.primitive is not None:
             raster = raster.replace(primitive=self.primitive)
-        return raster
+        return mip_raster(raster) if self.mip else raster
 
     def replace(self, **changes) -> "TrainConfig":
         """Return a copy with some settings changed.

@@ -27,8 +27,9 @@ from gsjax.train.frames import Frames, make_frames, views_of_step
 from gsjax.train.health import Health, check_photos
 from gsjax.train.initialisation import add_dense_points, initial_state
 from gsjax.train.losses import LossTerm
-from gsjax.train.models import Model
+from gsjax.train.models import Model, scene_of
 from gsjax.train.state import Metrics, Setup, TrainState, make_setup
+from gsjax.train.step import refresh_table
 from gsjax.train.step_compiler import CompiledStep, StepCompiler
 from gsjax.train.visibility_pruning import prune_invisible
 
@@ -96,17 +97,20 @@ class FitResult:
       pair_capacity: pair capacity of the last step.
       progress: of the last step; None if no step was made.
       dropped: number of Gaussians removed afterwards by `TrainConfig.prune_invisible`.
+      scene: the Gaussians to render, if a scene model makes them from the canonical
+        ones of the state.
     """
 
     state: TrainState
     pair_capacity: int
     progress: Progress | None = None
     dropped: int = 0
+    scene: Gaussians | None = None
 
     @property
     def gaussians(self) -> Gaussians:
-        """The scene; with a scene model, its canonical Gaussians."""
-        return self.state.gaussians
+        """The scene to render; with a model that depends on the view, canonical."""
+        return self.state.gaussians if self.scene is None else self.scene
 
 
 def fit(
@@ -184,6 +188,7 @@ class _Run:
         self.config = self.setup.config
         self.health = Health(self.config.steps)
         self.compiler = StepCompiler(self.setup, self.hooks.phase)
+        self.refreshes = refresh_table(self.setup)
 
     def loop(self, state: TrainState, pair_capacity: int | None) -> FitResult:
         """Run all remaining steps."""
@@ -207,8 +212,11 @@ class _Run:
                 if finer:
                     state = with_slots_ahead(state, config, schedule)
                 begun = time.perf_counter()
+                if self.refreshes[step]:
+                    state = self.compiler.refresh(state, frames)
                 if pairs is None or finer:
-                    pairs = pairs_for(state, frames, config, schedule)
+                    shown = state.replace(gaussians=self.scene(state))
+                    pairs = pairs_for(shown, frames, config, schedule)
                 raster = config.raster.replace(pair_capacity=pairs)
                 program = self.program(state, frames, raster)
                 self.compile_seconds += time.perf_counter() - begun
@@ -246,7 +254,12 @@ class _Run:
         dropped = 0
         if step >= config.steps and frames is not None and config.prune_invisible:
             state, dropped = prune_invisible(state, frames, self.setup)
-        return FitResult(state, pairs or 0, progress, dropped)
+        scene = self.scene(state)
+        return FitResult(state, pairs or 0, progress, dropped, scene)
+
+    def scene(self, state: TrainState) -> Gaussians:
+        """Return the Gaussians that files and viewers show."""
+        return scene_of(self.setup.model, state.params)
 
     def report(self, state: TrainState, pairs: int, progress: Progress) -> None:
         """Call the hooks that are due after a step; the caller handles the last one."""

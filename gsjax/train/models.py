@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 
+from gsjax.cameras.camera import Camera
 from gsjax.errors import InputError
 from gsjax.gaussians import GaussianParams, Gaussians
 from gsjax.train.camera_refinement import CameraRefinement
@@ -25,10 +26,13 @@ class ModelParams(NamedTuple):
       slots: arrays [N, …], one row per Gaussian. Density control copies the rows along
         with the Gaussians.
       shared: all other arrays.
+      buffers: arrays [N, …] that follow the Gaussians as ``slots`` do, but are not
+        trained: `Refresh.update` recomputes them.
     """
 
     slots: Any = None
     shared: Any = None
+    buffers: Any = None
 
 
 class SceneParams(NamedTuple):
@@ -59,6 +63,21 @@ class ViewInfo:
     time: Array
 
 
+class Refresh(NamedTuple):
+    """Values of a model that are recomputed from the scene now and then.
+
+    Attributes:
+      update: ``(SceneParams, batch of V cameras) → ModelParams.buffers``. The cameras
+        are those of all training views, as refined so far.
+      every: interval in steps. It is also called before the first step, after each
+        edit of the slots and when the resolution changes; otherwise not in the last
+        ``every`` steps.
+    """
+
+    update: Callable[[SceneParams, Camera], Any]
+    every: int = 100
+
+
 class Model(NamedTuple):
     """A scene model, as pure functions that are traced under jit.
 
@@ -69,15 +88,33 @@ class Model(NamedTuple):
       rates: learning rate of each parameter, by its name at the top level of
         `ModelParams.slots` or `.shared` (dicts, NamedTuples): a constant, or a function
         of the completed fraction of the run.
+      scene: ``SceneParams → Gaussians`` of all views, for models whose ``apply`` does
+        not depend on the view, or None. Views of a step are then rendered together, and
+        files and viewers show these Gaussians instead of the canonical ones.
+      refresh: how ``ModelParams.buffers`` are recomputed, or None.
     """
 
     init: Callable[[Gaussians], ModelParams]
     apply: Callable[[SceneParams, ViewInfo], Gaussians]
     rates: Mapping[str, Rate] = MappingProxyType({})
+    scene: Callable[[SceneParams], Gaussians] | None = None
+    refresh: Refresh | None = None
 
 
 # Renders the Gaussians as they are.
-IDENTITY = Model(init=lambda _: ModelParams(), apply=lambda params, _: params.gaussians)
+IDENTITY = Model(
+    init=lambda _: ModelParams(),
+    apply=lambda params, _: params.gaussians,
+    scene=lambda params: params.gaussians,
+)
+
+
+def scene_of(model: Model, params: SceneParams) -> Gaussians:
+    """Return the Gaussians that files and viewers show; N slots.
+
+    They are the canonical ones if the model depends on the view.
+    """
+    return params.gaussians if model.scene is None else model.scene(params)
 
 
 class SlotParams(NamedTuple):
@@ -98,14 +135,17 @@ def init_model(model: Model, gaussians: Gaussians) -> ModelParams:
     """Return the initial parameters of a model.
 
     Raises:
-      InputError: if an array of ``slots`` does not have one row per slot.
+      InputError: if an array of ``slots`` or ``buffers`` does not have one row per
+        slot.
     """
     params = model.init(gaussians)
-    for path, leaf in jax.tree_util.tree_flatten_with_path(params.slots)[0]:
-        if leaf.shape[:1] != (gaussians.capacity,):
-            raise InputError(
-                f"model: expected slots{jax.tree_util.keystr(path)} of shape "
-                f"[{gaussians.capacity}, …], got {leaf.shape}; put arrays without a "
-                "row per Gaussian into ModelParams.shared"
-            )
+    rows = {"slots": params.slots, "buffers": params.buffers}
+    for name, tree in rows.items():
+        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+            if leaf.shape[:1] != (gaussians.capacity,):
+                raise InputError(
+                    f"model: expected {name}{jax.tree_util.keystr(path)} of shape "
+                    f"[{gaussians.capacity}, …], got {leaf.shape}; put arrays without "
+                    "a row per Gaussian into ModelParams.shared"
+                )
     return params

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from gsjax.cameras.camera import USUAL_EXTENT
 from gsjax.densify.schedule import EditSchedule, schedule_of
 from gsjax.densify.types import Strategy
 from gsjax.errors import InputError
@@ -26,6 +27,7 @@ from gsjax.train.camera_refinement import CameraRefinement, init_refinement
 from gsjax.train.config import TrainConfig
 from gsjax.train.geometry_loss import geometry_terms
 from gsjax.train.losses import LossTerm
+from gsjax.train.mip import mip_model
 from gsjax.train.models import (
     IDENTITY,
     Model,
@@ -34,6 +36,7 @@ from gsjax.train.models import (
     SharedParams,
     SlotParams,
     init_model,
+    scene_of,
 )
 from gsjax.train.optimiser import (
     Rate,
@@ -97,7 +100,8 @@ class TrainState:
     def with_params(self, slots: SlotParams, shared: SharedParams) -> "TrainState":
         """Return a copy with other parameters."""
         gaussians = self.gaussians.replace(params=slots.gaussians)  # pyright: ignore
-        model, refinement = ModelParams(slots.model, shared.model), shared.refinement
+        model = self.model._replace(slots=slots.model, shared=shared.model)
+        refinement = shared.refinement
         return self.replace(gaussians=gaussians, model=model, refinement=refinement)
 
 
@@ -134,9 +138,18 @@ def make_setup(
     loss_terms: Sequence[LossTerm] = (),
     model: Model | None = None,
 ) -> Setup:
-    """Return the parts of a training step; arguments as `make_train_step`."""
+    """Return the parts of a training step; arguments as `make_train_step`.
+
+    Raises:
+      InputError: if there is a ``model`` beside that of `TrainConfig.mip`.
+    """
     strategy = strategy or config.make_strategy(extent)
-    model = model or IDENTITY
+    if config.mip and model is not None:
+        raise InputError(
+            "model: expected None with TrainConfig.mip, which is a model itself; call "
+            "gsjax.train.mip.smoothed in the model, or leave out mip"
+        )
+    model = model or model_of(config, extent)
     rates: dict[str, Rate] = {
         "turns": config.pose_rate,
         "shifts": config.pose_rate,
@@ -157,6 +170,16 @@ def make_setup(
         optimiser=make_optimiser(table),
         schedule=strategy.schedule or schedule_of(strategy.due, config.steps),
     )
+
+
+def model_of(config: TrainConfig, extent: float) -> Model:
+    """Return the scene model of settings, for a scene extent in world units."""
+    return mip_model(extent) if config.mip else IDENTITY
+
+
+def shown_gaussians(state: TrainState, config: TrainConfig) -> Gaussians:
+    """Return the Gaussians of a run of `TrainConfig` as files and viewers show them."""
+    return scene_of(model_of(config, USUAL_EXTENT), state.params)
 
 
 def init_state(

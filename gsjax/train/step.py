@@ -11,11 +11,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax import lax
 
 from gsjax.cameras.camera import Camera
 from gsjax.densify.types import Observation, Strategy, apply_edit, copy_rows
+from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, num_active
 from gsjax.math.numerics import all_within
 from gsjax.raster.render import render
@@ -26,7 +28,7 @@ from gsjax.train.config import TrainConfig
 from gsjax.train.frames import Batch, targets
 from gsjax.train.losses import LossTerm, evaluate_terms, photometric_term
 from gsjax.train.metrics import psnr
-from gsjax.train.models import IDENTITY, Model, SceneParams, ViewInfo
+from gsjax.train.models import Model, SceneParams, ViewInfo
 from gsjax.train.optimiser import means_rate
 from gsjax.train.state import (
     Gradients,
@@ -52,11 +54,14 @@ class Stages(NamedTuple):
       advance: optimiser update, noise and statistics of the strategy; the third result
         is [] bool, whether an edit is due.
       edit: edit of the slots, to be applied after a step at which it is due.
+      refresh: recomputes the buffers of the model from the cameras of all V views; None
+        if it has none. To be applied before the steps of `refresh_table`.
     """
 
     differentiate: Callable[[TrainState, Batch], Gradients]
     advance: Callable[[TrainState, Gradients], tuple[TrainState, Metrics, Array]]
     edit: Callable[[TrainState, Metrics], tuple[TrainState, Metrics]]
+    refresh: Callable[[TrainState, Camera], TrainState] | None = None
 
 
 TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
@@ -70,6 +75,7 @@ def make_train_step(
     loss_terms: Sequence[LossTerm] = (),
     model: Model | None = None,
     raster: RasterConfig | None = None,
+    cameras: Camera | None = None,
 ) -> TrainStep:
     """Return a training step, to be jitted, scanned or vmapped over seeds.
 
@@ -79,16 +85,30 @@ def make_train_step(
       strategy, loss_terms, model: as `gsjax.fit` takes them.
       raster: render settings with a sufficient `pair_capacity`; default
         ``config.raster``. Its ``visible_capacity`` is ignored.
+      cameras: batch of the cameras of all V views, for models with `Model.refresh`.
 
     Returns:
       Function (`TrainState`, `Batch` of B views) → (`TrainState`, `Metrics`). The state
       is that of `init_state` with the same strategy and model. If
       ``Metrics.overflowed``, the state is unchanged.
+
+    Raises:
+      InputError: if the model needs ``cameras``, and there are none.
     """
     parts = {"strategy": strategy, "loss_terms": loss_terms, "model": model}
-    stages = make_stages(make_setup(config, extent, **parts), raster)
+    setup = make_setup(config, extent, **parts)
+    stages, table = make_stages(setup, raster), refresh_table(setup)
+    if stages.refresh is not None and cameras is None:
+        raise InputError(
+            "make_train_step: the model recomputes values from all cameras; pass "
+            "cameras=frames.camera"
+        )
 
     def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
+        refresh: Any = stages.refresh
+        if refresh is not None:
+            due = jnp.asarray(table)[jnp.clip(state.step, 0, len(table) - 1)]
+            state = lax.cond(due, lambda s: refresh(s, cameras), lambda s: s, state)
         gradients = stages.differentiate(state, batch)
         state, metrics, due = stages.advance(state, gradients)
         return lax.cond(due, stages.edit, lambda *same: same, state, metrics)
@@ -98,7 +118,24 @@ def make_train_step(
 
 def make_stages(setup: Setup, raster: RasterConfig | None = None) -> Stages:
     """Return the stages of a step from `make_setup`; arguments as `make_train_step`."""
-    return Stages(_differentiate(setup, raster), _advance(setup), _edit(setup))
+    stages = _differentiate(setup, raster), _advance(setup), _edit(setup)
+    return Stages(*stages, _refresh(setup))
+
+
+def refresh_table(setup: Setup) -> np.ndarray:
+    """Return [steps + 1] bool by completed steps: `Stages.refresh` precedes the next.
+
+    See `gsjax.train.models.Refresh`; all False if the model has none.
+    """
+    config, refresh = setup.config, setup.model.refresh
+    step: Any = np.arange(config.steps + 1)
+    if refresh is None:
+        return np.zeros(step.shape, bool)
+    due = np.broadcast_to(np.asarray(setup.strategy.due(step)), step.shape)
+    divisors = np.asarray([config.divisor(s) for s in step])
+    due = due | (np.diff(divisors, prepend=divisors[0]) != 0)
+    regular = (step % refresh.every == 0) & (step <= config.steps - refresh.every)
+    return (due | regular | (step == 0)) & (step < config.steps)
 
 
 def step_raster(setup: Setup, raster: RasterConfig | None = None) -> RasterConfig:
@@ -201,8 +238,8 @@ def _render_model(
         return render(gaussians, camera, raster, behind, mask=mask, probe=probe)
 
     arguments = batch.camera, batch.valid, probe
-    if setup.model is IDENTITY:
-        return draw(params.gaussians, *arguments)
+    if setup.model.scene is not None:
+        return draw(setup.model.scene(params), *arguments)
     count = batch.view.shape[0]
     time = jnp.zeros(count) if batch.time is None else batch.time
 
@@ -267,7 +304,9 @@ def _edit(setup: Setup):
         *_, key = _keys(state.key, state.step - 1)
         plan, stats = setup.strategy.plan(key, state.step, state.gaussians, state.stats)
         gaussians, moments = apply_edit(plan, state.moments)
-        model = state.model._replace(slots=copy_rows(plan, state.model.slots))
+        rows = state.model.slots, state.model.buffers
+        slots, buffers = copy_rows(plan, rows)
+        model = state.model._replace(slots=slots, buffers=buffers)
         state = state.replace(
             gaussians=gaussians, model=model, moments=moments, stats=stats
         )
@@ -276,6 +315,22 @@ def _edit(setup: Setup):
         return state, metrics._replace(gaussians=count, wanted=wanted)
 
     return edit
+
+
+def _refresh(setup: Setup):
+    refresh = setup.model.refresh
+    if refresh is None:
+        return None
+
+    def recompute(state: TrainState, cameras: Camera) -> TrainState:
+        index = jnp.arange(cameras.viewmat.shape[0])
+        cameras = refine_camera(cameras, state.refinement, index, setup.extent)
+        found = refresh.update(state.params, cameras)
+        like = state.model.buffers
+        buffers = jax.tree.map(lambda a, b: a.astype(b.dtype), found, like)
+        return state.replace(model=state.model._replace(buffers=buffers))
+
+    return recompute
 
 
 def _keys(key: Array, step: Array) -> Array:

@@ -37,6 +37,8 @@ class StepCompiler:
         self._setup, self._phase = setup, phase
         self._sharding = replicated_sharding(device_count(setup.config.raster))
         self._worker = ThreadPoolExecutor(1)
+        refresh = make_stages(setup).refresh
+        self._refresh = None if refresh is None else self._jit(refresh)
         self.by_sizes: dict[Any, Any] = {}
         self.by_slots: dict[int, tuple[Future, Future | None]] = {}
 
@@ -47,6 +49,12 @@ class StepCompiler:
     def place(self, tree: Any) -> Any:
         """Return ``tree`` on all devices that the programs run on."""
         return tree if self._sharding is None else jax.device_put(tree, self._sharding)
+
+    def refresh(self, state: TrainState, frames: Frames) -> TrainState:
+        """Return the state after `Stages.refresh`, or unchanged without one."""
+        if self._refresh is None:
+            return state
+        return self._refresh(state, frames.camera.replace(visible_size=frames.size))
 
     def step(
         self, state: TrainState, frames: Frames, raster: RasterConfig

@@ -36,6 +36,7 @@ from gsjax.raster.exact import render_exact
 from gsjax.raster.types import RasterConfig, Render
 from gsjax.runtime.settings import as_int
 from gsjax.train.loop import Progress
+from gsjax.train.models import IDENTITY, Model, scene_of
 from gsjax.train.state import TrainState
 from gsjax.viewer.pictures import MIME_TYPES, MIN_SIZE, Movie, Picture
 
@@ -141,6 +142,7 @@ def live(
     every: int = 25,
     config: RasterConfig | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
+    model: Model = IDENTITY,
 ) -> Callable[[TrainState, Progress], None]:
     """Return a hook that updates a preview of a training in one place.
 
@@ -153,6 +155,7 @@ def live(
       every: steps between two drawings; the first step is drawn too.
       config: render settings.
       background: RGB behind the scene.
+      model: scene model of the training, such as `gsjax.train.state.model_of` returns.
 
     Returns:
       The hook for `gsjax.Hooks.state`.
@@ -176,8 +179,9 @@ def live(
         if step % every and len(steps) > 1:
             return
         # One program for any number of Gaussians.
-        config = fixed.replace(visible_capacity=state.gaussians.capacity)
-        view = render_exact(state.gaussians, camera, config, behind)
+        scene = scene_of(model, state.params)
+        config = fixed.replace(visible_capacity=scene.capacity)
+        view = render_exact(scene, camera, config, behind)
         preview = _preview(view, photo, f"step {step}")
         title = f"PSNR, dB; {int(metrics.gaussians):,} Gaussians"
         size = (max(preview.shape[1], 400), 300)

@@ -19,7 +19,7 @@ from gsjax.gaussians import Gaussians
 from gsjax.runtime.console import note, one_line
 from gsjax.train.config import TrainConfig
 from gsjax.train.loop import Progress
-from gsjax.train.state import TrainState
+from gsjax.train.state import TrainState, shown_gaussians
 from gsjax.viewer import viser_server
 from gsjax.viewer.cameras import Frustum, set_viewpoint
 from gsjax.viewer.opening import training_content
@@ -121,7 +121,7 @@ class LiveViewer:
             early = server is not None and (now < self.due or server.busy)
             if early and step != config.steps:
                 return
-            gaussians = copy_to_one_device(state.gaussians)
+            gaussians = copy_to_one_device(shown_gaussians(state, config))
             jax.block_until_ready(gaussians)
             if server is None:
                 content = training_content(gaussians, dataset, photos, config)

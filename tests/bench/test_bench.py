@@ -20,6 +20,14 @@ from gsjax.bench.pixelwise import (
     ray_depths,
 )
 from gsjax.bench.report import front_figure, front_picture, table
+from gsjax.bench.scales import (
+    FILTERS,
+    ScaleRow,
+    scaled_camera,
+    scales_figure,
+    scales_table,
+    true_image,
+)
 from gsjax.bench.scenes import facing_camera, open_bench_scene
 from gsjax.errors import InputError
 from gsjax.synthetic.stress_scenes import STRESS_SCENES, StressScene
@@ -163,6 +171,43 @@ def test_built_in_scenes(name):
     assert (sized.width, sized.height) == (40, 30)
     knobs = {point.knob for point in make_points(scene.gaussians)}
     assert knobs >= {"cut", "tile", "dtype"}
+
+
+def test_scaled_cameras_show_the_same_scene(view):
+    """Below 1 the whole view in a corner, above 1 its middle; the size is the same."""
+    _, camera, _ = view
+    x, y, z = 0.02, -0.03, 1.0
+    u, v = (float(a) for a in camera.project((x, y, z)))
+    for scale, shift in ((0.5, 0), (1.0, 0), (4.0, 24)):
+        found = scaled_camera(camera, scale, samples=3)
+        assert (found.width, found.height) == (3 * SIZE, 3 * SIZE)
+        assert [*found.visible_size] == [3 * SIZE * min(scale, 1)] * 2
+        at = np.asarray(found.project((x, y, z)))
+        np.testing.assert_allclose(at, 3 * (scale * np.asarray([u, v]) - shift), 1e-9)
+
+
+def test_the_truth_of_a_scale_is_the_mean_over_each_pixel(view):
+    """Against 20 × 20 samples of the dense reference, without any filter."""
+    gaussians, camera, _ = view
+    scene = StressScene("some", gaussians, camera, tuple(BEHIND))
+    K = np.diag([10, 10, 1]) @ camera.K
+    fine = camera.replace(K=K, width=10 * SIZE, height=10 * SIZE)
+    image = gsjax.reference_render(gaussians, fine, None, BEHIND, dilation=1e-6)
+    blocks = np.asarray(image["rgb"]).reshape(SIZE // 2, 20, SIZE // 2, 20, 3)
+    found = true_image(scene, 0.5)
+    np.testing.assert_allclose(found, blocks.mean((1, 3)), atol=3e-3)
+
+
+def test_rows_of_scales_reach_table_and_figure():
+    rows = [
+        ScaleRow(scale, name, 30 + scale, 0.1, 1.0, 60.0)
+        for scale in (0.25, 4.0)
+        for name in FILTERS
+    ]
+    assert "1/4" in scales_table(rows)
+    above, _ = scales_figure(rows, "a $ name").axes
+    assert [line.get_label() for line in above.lines] == [*FILTERS]
+    np.testing.assert_array_equal(above.lines[0].get_ydata(), [30.25, 34])
 
 
 def test_a_facing_camera_looks_at_the_scene(view):

@@ -169,6 +169,7 @@ ERRORS = [
     (2, "bench --repeats 0", "--repeats"),
     (2, "bench --budget x", "--budget"),
     (2, "bench --budget 2", "--budget"),
+    (2, "bench --scales --budget 0.1", "exclude each other"),
     (3, "bench --plot TMP/a.png", "a.png: exists"),
     (2, "bench --plot a.jpg", ".png"),
     (3, "info SCENE/scene.ply --plot TMP/a.png", "a.png: exists"),

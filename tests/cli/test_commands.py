@@ -292,6 +292,8 @@ ERRORS = [
     (2, "train DEMO/dataset -o DEMO/run --initial DEMO/run", "another folder with -o"),
     (3, "train DEMO/dataset -o TMP/o --initial TMP/none.ply", "none.ply"),
     (2, "train DEMO/dataset -o TMP/o --initial DEMO/run --antialias", "--antialias"),
+    (2, "train DEMO/dataset -o TMP/o --initial DEMO/run --mip", "leave out --mip"),
+    (2, "train DEMO/dataset -o TMP/o --mip --antialias", "exclude each other"),
     (3, "info DEMO", "is not a run, but "),
     (3, "train DEMO/dataset -o DEMO/run/splat.ply", "is a file; pass a folder with -o"),
     (3, "train DEMO/dataset -o DEMO/dataset", "is the dataset's own folder"),

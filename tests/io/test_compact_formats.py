@@ -203,7 +203,7 @@ def test_files_of_another_program_are_read(tmp_path):
     [
         (0, b"more", "bytes after the last Gaussian"),
         (2, b"more", "extensions are ignored"),
-        (1, b"", r"render it with RasterConfig\(antialias=True"),
+        (1, b"", r"render it with RasterConfig\(antialias=True, dilation=0.1"),
     ],
 )
 def test_flags_and_trailing_bytes_are_warned_about(tmp_path, flags, tail, message):

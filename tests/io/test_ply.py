@@ -18,6 +18,8 @@ from gsjax.gaussians import Gaussians, grow, make_gaussians, select
 from gsjax.io.formats import load, save
 from gsjax.io.numerals import BLOCK, find_words, parse_number, parse_numbers
 from gsjax.io.ply import read_ply, render_mode, write_ply
+from gsjax.io.spz import is_antialiased, write_spz
+from gsjax.raster.types import RasterConfig
 from gsjax.runs.export import export_scene
 from gsjax.runs.scene_source import open_scene_source
 
@@ -369,7 +371,32 @@ def test_files_of_surfels(tmp_path, third):
 def test_files_of_ellipsoids_have_no_render_mode(tmp_path):
     path = put(tmp_path, standard(random_fields(5, 1)))
     assert render_mode(path) is None
-    assert open_scene_source(path).config.primitive is None
+    assert open_scene_source(path).config == RasterConfig.compat()
+
+
+@pytest.mark.filterwarnings("ignore:.*trained with antialiasing")
+@pytest.mark.filterwarnings("ignore:.*Gaussians have")
+@pytest.mark.parametrize("first", [".ply", ".spz"])
+def test_the_mark_of_mip_splatting_is_kept_by_exports(tmp_path, first):
+    """A comment of PLY, a flag of SPZ: drawn with the filter, and passed on."""
+    plain, source = tmp_path / "plain.ply", tmp_path / f"source{first}"
+    gaussians = load(put(tmp_path, standard(random_fields(5, 1))))
+    if first == ".ply":
+        write_ply(source, gaussians, mode="mip")
+    else:
+        write_spz(source, gaussians, antialias=True)
+    write_ply(plain, gaussians)
+    mip = RasterConfig(dilation=0.1, antialias=True)
+    for suffix in (".ply", ".spz"):
+        for start, config in ((source, mip), (plain, RasterConfig.compat())):
+            out = tmp_path / f"{start.stem}-out{suffix}"
+            export_scene(start, out)
+            assert open_scene_source(out).config == config
+            if suffix == ".spz":
+                assert is_antialiased(out) == (config == mip)
+            fast = open_scene_source(out, raster=RasterConfig.fast()).config
+            assert fast.dilation == config.dilation
+            assert fast.alpha_max == RasterConfig.fast().alpha_max
 
 
 def zero_quaternion(fields):

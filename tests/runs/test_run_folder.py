@@ -21,10 +21,12 @@ from gsjax.cli.main import main
 from gsjax.data.dataset import load_dataset
 from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import InputError
+from gsjax.io.ply import render_mode
 from gsjax.raster.types import RasterConfig
 from gsjax.runs import folder as run_folder
 from gsjax.runs import initialisation, report
 from gsjax.runs import run as run_module
+from gsjax.runs.checkpoint import load_latest
 from gsjax.runs.config_json import config_from_json
 from gsjax.runs.evaluation import evaluate_run
 from gsjax.runs.folder import RunSettings, load_settings, load_split
@@ -222,6 +224,31 @@ def test_a_dataset_without_points_starts_at_random(whole, tmp_path, capsys):
     assert "--initial" not in capsys.readouterr().err
 
 
+def test_a_mip_run_is_resumed_and_drawn_by_its_filters(whole, tmp_path):
+    """Its file holds the smoothed Gaussians; a kill before the edit changes no bit."""
+    edits = McmcSettings(start=0, stop=3, every=2, max_gaussians=60)
+    config = CONFIG.replace(mip=True, mcmc=edits, every_checkpoint=2)
+    run, files = tmp_path / "run", run_folder.run_files(tmp_path / "run")
+    assert start_run(RunSettings(whole / "data", config), run).finished
+    arrays = load_latest(files.checkpoints).arrays
+    active = arrays[".gaussians.active"]
+    radii = arrays[".model.buffers['radii']"][active]
+    assert (radii > 0).all()
+    sharp = np.exp(arrays[".gaussians.params.log_scales"][active])
+    wide = np.exp(np.asarray(gsjax.load(files.splat).params.log_scales))
+    np.testing.assert_allclose(wide**2, sharp**2 + radii[:, None] ** 2, rtol=1e-5)
+    assert render_mode(files.splat) == "mip"
+    for source in (run, files.splat):
+        found = open_scene_source(source, raster=RasterConfig.accurate()).config
+        assert (found.dilation, found.antialias) == (0.1, True)
+    before = files.splat.read_bytes()
+    (files.checkpoints / "step_000000004.npz").unlink()
+    files.splat.unlink()
+    assert resume_run(run).finished
+    assert files.splat.read_bytes() == before
+    repeat(run)
+
+
 @pytest.mark.parametrize("degree", [0, 2])
 def test_initial_gaussians_are_kept_bit_by_bit(whole, degree):
     """Except for bands that are dropped or added."""
@@ -381,10 +408,11 @@ def started(monkeypatch):
     return scenes
 
 
-def test_a_run_is_resumed_with_its_own_options_only(made, started, capsys):
+@pytest.mark.parametrize("filters", ["--antialias", "--mip"])
+def test_a_run_is_resumed_with_its_own_options_only(made, started, capsys, filters):
     """Options that are not given are those of the run."""
     data, run = made / "data", made / "again"
-    options = "--preset fast --steps 2 --max-gaussians 40 --antialias --test-images"
+    options = f"--preset fast --steps 2 --max-gaussians 40 {filters} --test-images"
     options = [*options.split(), "0.png"]
     for more in (options, [*options, "--resume"], ["--resume"]):
         assert train(data, run, *more) == 130
@@ -393,6 +421,10 @@ def test_a_run_is_resumed_with_its_own_options_only(made, started, capsys):
         capsys.readouterr()
         assert train(data, run, *option, "--resume") == 2
         assert f"leave out {option[0]}" in capsys.readouterr().err
+    config = load_settings(run).config
+    dilation = 0.1 if filters == "--mip" else 0.3
+    assert (config.mip, config.raster.antialias) == (filters == "--mip", True)
+    assert config.raster.dilation == dilation
     change(run / "config.json", every=8)
     assert train(data, run, *options, "--resume") == 130
     settings = json.loads((run / "config.json").read_text())["train"]

@@ -175,7 +175,9 @@ def test_live_updates_one_display(monkeypatch):
         hook = live("camera", photo, every=3, background=[0, 0, 1])
         for step in range(1, 8):
             metrics = Mock(step=step, psnr=20.0 + step, gaussians=7)
-            hook(Mock(**{"gaussians.capacity": 100 + step}), Mock(metrics=metrics))
+            hook(
+                Mock(**{"params.gaussians.capacity": 100 + step}), Mock(metrics=metrics)
+            )
         drawn = [call.args for call in render_exact.call_args_list]
         assert [scene.capacity for scene, *_ in drawn] == [101, 103, 106]
         for scene, _, config, background in drawn:
