@@ -14,7 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import gsjax
+from gsjax.bench.popping import turned
 from gsjax.cameras.lenses import panorama_intrinsics
+from gsjax.io import images
 from gsjax.math.sh import rgb_to_dc
 from gsjax.mesh import read_mesh
 from gsjax.plots import figures
@@ -122,6 +124,34 @@ def order() -> None:
         view = gsjax.render_exact(pair, camera, background=np.ones(3))
         pictures.append(np.asarray(view.rgb))
     write("order.webp", np.concatenate(pictures, axis=1))
+
+
+def popping() -> None:
+    """Film a turning camera, with the order of centres and that of each pixel."""
+    rng = np.random.default_rng(11)
+    count, size = 40, (176, 132)
+    scene = gsjax.make_gaussians(
+        means=rng.uniform((-1.6, -1.2, 3), (1.6, 1.2, 5), (count, 3)),
+        quats=rng.normal(size=(count, 4)),
+        log_scales=np.log(rng.uniform((0.25, 0.25, 0.1), (0.5, 0.5, 0.2), (count, 3))),
+        logit_opacities=np.full(count, 5.0),
+        sh=rgb_to_dc(rng.uniform(0.05, 0.95, (count, 1, 3))),
+    )
+    K = [[152, 0, size[0] / 2], [0, 152, size[1] / 2], [0, 0, 1]]
+    camera = gsjax.make_camera(viewmat=np.eye(4), K=K, width=size[0], height=size[1])
+    config = gsjax.RasterConfig(outputs=("rgb",))
+    behind, frames = np.ones(3), []
+    for turn in turned(camera, 20, 0.8):
+        orders = (config.replace(order=name) for name in ("center", "pixel"))
+        both = [gsjax.render_exact(scene, turn, mine, behind).rgb for mine in orders]
+        frames.append(images.to_8_bit(np.concatenate(both, axis=1)))
+    movie = cv2.Animation()
+    movie.frames = [np.ascontiguousarray(frame[..., ::-1]) for frame in frames]
+    movie.durations = [150] * len(frames)
+    # Less quality shows blocks where the picture is smooth.
+    quality = [cv2.IMWRITE_WEBP_QUALITY, 92]
+    _, encoded = cv2.imencodeanimation(".webp", movie, quality)
+    (ASSETS / "popping.webp").write_bytes(encoded.tobytes())
 
 
 def lenses() -> None:
@@ -268,3 +298,4 @@ if __name__ == "__main__":
         lenses()
         order()
         pipeline()
+        popping()

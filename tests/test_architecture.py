@@ -176,6 +176,7 @@ def test_functions_are_short_and_take_few_parameters():
 def test_the_rasteriser_has_few_doors():
     doors = {"render", "exact", "types", "reference", "memory_estimate"}
     doors |= {"argument_checks", "tile_render"}  # messages; `device_count`
+    doors |= {"sampling"}  # places between pixels, for `gsjax bench`
     inside = ("gsjax.raster", "gsjax.stress")  # the latter examines every stage
     used = {b for a, b in imports() if not a.startswith(inside)}
     used = {name for name in used if name.startswith("gsjax.raster.")}

@@ -6,8 +6,9 @@ import pytest
 from conftest import COMPAT, DATA, render, scene_of
 
 import gsjax
-from gsjax.bench.popping import popping, same_rays, sample, turned
+from gsjax.bench.popping import popping, same_rays, turned
 from gsjax.bench.report import popping_picture, popping_table
+from gsjax.raster.sampling import sample
 
 
 def test_figures_of_the_references():
