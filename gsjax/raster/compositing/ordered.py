@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_batching import sequential_vmap
 
 from gsjax.raster.compositing import schedules
 from gsjax.raster.compositing.alpha import Evaluated, pixel_centres
@@ -27,6 +28,7 @@ from gsjax.raster.compositing.blending import (
     tables_of,
 )
 from gsjax.raster.compositing.chunked import take_rows
+from gsjax.raster.compositing.fused_sorted import merge_exchange, suits
 from gsjax.raster.compositing.types import (
     Compositor,
     Images,
@@ -42,7 +44,7 @@ from gsjax.raster.types import Array, RasterConfig
 from gsjax.raster.vmap_branching import any_in_batch
 
 _TOGETHER = 2**22  # splats at pixels that are sorted together; 16 MB an array
-_SIZES = 5  # of lists, each a quarter of the one before
+_SIZES, _STEP = 4, 5  # of lists, and the ratio of one to the next
 # Numbers of a splat at a pixel while a list is blended, and with gradients.
 _IN_LIST, _IN_LIST_BACKWARD = 12, 24
 
@@ -55,7 +57,7 @@ def composite_ordered(tiles: Tiles, task: Task) -> Images:
     group = schedules.tiles_per_step(config, grid)
     schedule = schedules.make_schedule(lists, grid, group, 1, 2**30)
     longest = _longest(lists.ranks.shape[0], none)
-    pixels = pixel_centres(grid.tile, tables.splats.dtype)
+    pixels, in_loops = pixel_centres(grid.tile, tables.splats.dtype), suits(task)
 
     def of_tiles(size: int, tile: Array) -> Images:
         ranks = schedules.ranks_at(lists, tile, jnp.int32(0), size, none)
@@ -63,7 +65,8 @@ def composite_ordered(tiles: Tiles, task: Task) -> Images:
         chunk = Chunk(take_rows(tables, ranks), corner)
         at = evaluated(chunk, pixels, config, tiles.channels.alpha_min)
         keys = keys_at(chunk, at, pixels, config)
-        return blend_ordered(at, chunk.parts, lax.stop_gradient(keys), config)
+        keys = lax.stop_gradient(keys)
+        return blend_ordered(at, chunk.parts, keys, config, in_loops)
 
     def of_size(tile: Array, size: int) -> Images:
         together = max(1, _TOGETHER // (size * pixels.shape[1]))
@@ -76,7 +79,7 @@ def composite_ordered(tiles: Tiles, task: Task) -> Images:
     def of_block(_, block) -> tuple[None, Images]:
         tile, length = block
         run = partial(of_size, tile)
-        return None, run_at_bucket(length, longest, _SIZES, run)
+        return None, run_at_bucket(length, longest, _SIZES, run, _STEP)
 
     def if_any(_, block) -> tuple[None, Images]:
         def skip(block) -> tuple[None, Images]:
@@ -126,7 +129,9 @@ class Order(NamedTuple):
     inverse: Array
 
 
-def order_of(alpha: Array, keys: Array, config: RasterConfig) -> Order:
+def order_of(
+    alpha: Array, keys: Array, config: RasterConfig, in_loops: bool = False
+) -> Order:
     """Return the order in which pixels blend the splats of a list.
 
     Equal depths keep the order of the list: by the depth of the means, then by slot.
@@ -135,15 +140,35 @@ def order_of(alpha: Array, keys: Array, config: RasterConfig) -> Order:
       alpha: [G, L, P]; splats with 0 are in any place.
       keys: [G, L, P].
       config: order and order_window are used.
+      in_loops: sort by loops that are kernels, as on CPUs, instead of `lax.sort`.
     """
-    number = lax.broadcasted_iota(jnp.int32, alpha.shape, 1)
+    groups, number, pixels = (
+        lax.broadcasted_iota(jnp.int32, alpha.shape, axis) for axis in range(3)
+    )
     if config.order == "pixel":
         keys = jnp.where(alpha > 0, keys, jnp.inf)
-        _, order = lax.sort((keys, number), dimension=1, is_stable=True, num_keys=1)
+        if in_loops:
+            order = _by_exchange(keys)
+        else:
+            both = keys, number
+            _, order = lax.sort(both, dimension=1, is_stable=True, num_keys=1)
     else:
         order = _through_window(alpha, keys, config.order_window)
-    _, inverse = lax.sort((order, number), dimension=1, is_stable=False, num_keys=1)
+    places = jnp.zeros_like(order).at[groups, order, pixels]
+    inverse = places.set(number, mode="promise_in_bounds", unique_indices=True)
     return Order(order, inverse)
+
+
+@sequential_vmap
+def _by_exchange(keys: Array) -> Array:
+    """Return the places [G, L, P] in the order of keys, by `merge_exchange`."""
+    groups, size, pixels = keys.shape
+    number = lax.broadcasted_iota(keys.dtype, keys.shape, 1)
+    rows = jnp.stack([keys, number], 2).reshape(groups, 2 * size, pixels)
+    ones = lax.optimization_barrier(jnp.ones(pixels, keys.dtype))
+    length = jnp.full(1, size, jnp.int32)
+    rows = lax.map(lambda some: merge_exchange(some, length, ones), rows)
+    return rows[:, 1::2].astype(jnp.int32)
 
 
 def _through_window(alpha: Array, keys: Array, window: int) -> Array:
@@ -196,7 +221,11 @@ def _to(values: Array, places: Array) -> Array:
 
 
 def blend_ordered(
-    at: Evaluated, parts: Parts, keys: Array, config: RasterConfig
+    at: Evaluated,
+    parts: Parts,
+    keys: Array,
+    config: RasterConfig,
+    in_loops: bool = False,
 ) -> Images:
     """Blend whole lists in the order of each pixel.
 
@@ -205,8 +234,10 @@ def blend_ordered(
       parts: their channels and depth.
       keys: [G, L, P] depths, without derivative.
       config: static settings.
+      in_loops: as of `order_of`.
     """
-    order, inverse = order_of(lax.stop_gradient(at.alpha), keys, config)
+    alpha = lax.stop_gradient(at.alpha)
+    order, inverse = order_of(alpha, keys, config, in_loops)
     alpha = _to(at.alpha, order)
     behind = lax.cumprod(1 - alpha, axis=1)
     before = jnp.concatenate([jnp.ones_like(behind[:, :1]), behind[:, :-1]], 1)
