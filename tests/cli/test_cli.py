@@ -73,6 +73,18 @@ def test_render_writes_the_pixels_of_render_exact(scene, tmp_path, capsys):
         np.testing.assert_array_equal(pixels, np.rint(np.clip(found, 0, 1) * 255))
 
 
+def test_render_in_the_order_of_each_pixel(scene, tmp_path):
+    assert main(render_args(scene, tmp_path, "--npy", "--order", "pixel")) == 0
+    gaussians = gsjax.load(scene / "scene.ply")
+    name, camera = load_transforms(scene / "cameras.json")[0]
+    config = CONFIG.replace(order="pixel", occlusion=False)
+    wanted = np.asarray(gsjax.render_exact(gaussians, camera, config).rgb)
+    found = np.load(tmp_path / f"{name}.npy")
+    np.testing.assert_array_equal(found, wanted.astype(np.float32))
+    by_mean = gsjax.render_exact(gaussians, camera, CONFIG).rgb
+    assert np.abs(found - by_mean).max() > 1e-3
+
+
 def test_kinds_size_preset_and_background(scene, tmp_path, capsys):
     more = ["--what", "depth,alpha,rgb", "--npy", "--size", "20x10"]
     more += ["--preset", "fast", "--background", "0.25,.5,1"]
