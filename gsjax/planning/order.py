@@ -54,7 +54,7 @@ def choose_order(
 
     # As for the α cutoff: other cameras may have more error than these.
     margin, exact = 1.5 + 2 / np.sqrt(len(views)), draw(order="pixel")
-    window = config.order_window
+    window, error = config.order_window, float("inf")
     while window <= max(_WIDEST, config.order_window):
         pictures = zip(draw(order_window=window), exact)
         error = margin * max(float(np.abs(a - b).max()) for a, b in pictures)

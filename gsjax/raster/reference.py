@@ -86,8 +86,8 @@ def ordered_weights(
       config: its rule to stop applies; None for none.
       keys: [N, P] depths by which each pixel sorts; None for the order of ``alpha``.
     """
-    if keys is not None:
-        order = jnp.argsort(keys, axis=0, stable=True)
+    order = None if keys is None else jnp.argsort(keys, axis=0, stable=True)
+    if order is not None:
         alpha = jnp.take_along_axis(alpha, order, 0)
     after = jnp.cumprod(1 - alpha, axis=0)
     before = jnp.concatenate([jnp.ones_like(after[:1]), after[:-1]])
@@ -100,7 +100,7 @@ def ordered_weights(
             margin = jnp.min(near_stop, axis=0, initial=jnp.inf)
     weight = jnp.where(blended, alpha * before, 0)
     half = (before > 0.5) & (after <= 0.5) & blended
-    if keys is not None:
+    if order is not None:
         back = jnp.argsort(order, axis=0)
         weight = jnp.take_along_axis(weight, back, 0)
         half = jnp.take_along_axis(half, back, 0)

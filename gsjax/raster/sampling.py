@@ -36,7 +36,7 @@ def _alphas(projection: Projection, points: Array, config: RasterConfig) -> Arra
     """Return α [R, M]."""
     splat = projection.splat
     columns = tuple(a[None] for a in (*splat.shape, splat.u, splat.v))
-    return evaluate(columns, points.T, config).alpha[0]
+    return evaluate(columns, points.T, config).alpha[0]  # pyright: ignore
 
 
 @partial(jax.jit, static_argnames="config")
@@ -53,13 +53,15 @@ def _blended(
     dx, dy = (points[:, i, None] - some(a) for i, a in enumerate((splat.u, splat.v)))
     # A pixel of its own for each point, at the origin.
     at = evaluate((*columns, -dx, -dy), np.zeros((2, 1)), config)
-    keys = at.depth
     if not config.sorts_pixels:
         # All are equal, so the order of the list stays.
         keys, config = jnp.zeros_like(at.alpha), config.replace(order="pixel")
     elif splat.key:
         numbers = tuple(some(a)[..., None] for a in splat.key)
         keys = config.primitive.key(numbers, dx[..., None], dy[..., None])
+    else:
+        assert at.depth is not None
+        keys = at.depth
     values = some(colors)
     channels = jnp.concatenate([values, jnp.ones_like(values[..., :1])], -1)
     parts = Parts(columns[0][..., None], channels)

@@ -113,7 +113,7 @@ def backward(
         value, _ = reduction.at(corner, read.ones, splat, value, image)
         brought = at.alpha, value / read.ones
         _, (alpha, value), waiting, before = arrive(passing.waiting, key, brought)
-        taken = sum(jnp.where(some, 0, 1.0) for some in before)
+        taken = sum((jnp.where(some, 0, 1.0) for some in before), start=0 * alpha)
         passed = pass_through(passing.carried, alpha)
         carried = jnp.where(passed > config.transmittance_min, passed, 0)
         left = alpha, passing.carried, value, taken.astype(empty.dtype)
