@@ -70,9 +70,10 @@ TUNED = TrainConfig(
 
 def by_stages(config):
     """Return the compiled differentiation, and the step; it donates the state."""
-    differentiate, *rest = make_stages(make_setup(config, EXTENT))
-    differentiate = jax.jit(differentiate)
-    advance, edit = (jax.jit(stage, donate_argnums=0) for stage in rest)
+    stages = make_stages(make_setup(config, EXTENT))
+    differentiate = jax.jit(stages.differentiate)
+    advance = jax.jit(stages.advance, donate_argnums=0)
+    edit = jax.jit(stages.edit, donate_argnums=0)
 
     def step(state, batch):
         state, metrics, due = advance(state, differentiate(state, batch))
