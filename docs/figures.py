@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import gsjax
+from gsjax.bench import popping
 from gsjax.bench.popping import turned
 from gsjax.cameras.lenses import panorama_intrinsics
 from gsjax.io import images
@@ -126,7 +127,7 @@ def order() -> None:
     write("order.webp", np.concatenate(pictures, axis=1))
 
 
-def popping() -> None:
+def turning() -> None:
     """Film a turning camera, with the order of centres and that of each pixel."""
     rng = np.random.default_rng(11)
     count, size = 40, (176, 132)
@@ -140,8 +141,12 @@ def popping() -> None:
     K = [[152, 0, size[0] / 2], [0, 152, size[1] / 2], [0, 0, 1]]
     camera = gsjax.make_camera(viewmat=np.eye(4), K=K, width=size[0], height=size[1])
     config = gsjax.RasterConfig(outputs=("rgb",))
-    behind, frames = np.ones(3), []
-    for turn in turned(camera, 20, 0.8):
+    behind, frames, cameras = np.ones(3), [], turned(camera, 20, 0.8)
+    places = np.random.default_rng(0).uniform(0, 1, (400, 2)) * size
+    for name in ("center", "pixel"):
+        mine = config.replace(order=name)
+        print(name, 255 * popping.popping(scene, cameras, mine, points=places))
+    for turn in cameras:
         orders = (config.replace(order=name) for name in ("center", "pixel"))
         both = [gsjax.render_exact(scene, turn, mine, behind).rgb for mine in orders]
         frames.append(images.to_8_bit(np.concatenate(both, axis=1)))
@@ -298,4 +303,4 @@ if __name__ == "__main__":
         lenses()
         order()
         pipeline()
-        popping()
+        turning()

@@ -3,7 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from conftest import ALL, BACKGROUND, WHOLE, assert_not_empty, cast, render
+import pytest
+from conftest import ALL, BACKGROUND, DATA, WHOLE, assert_not_empty, cast, render
+
+import gsjax
 
 KINDS = ("random", "wall", "equal_depths")
 
@@ -54,3 +57,30 @@ def assert_close(report, name, found, wanted, bar, least=1e-30):
         error = np.linalg.norm(a - b) / max(np.linalg.norm(b), least)
         report(f"{name}, {np.shape(b)}", error, bar)
         assert error <= bar, (name, np.shape(b))
+
+
+def order_data() -> dict[str, np.ndarray]:
+    """Return the references of the order of a pixel, or skip."""
+    path = DATA / "methods" / "order.npz"
+    if not path.exists():
+        pytest.skip(f"{path.name} is absent (../shared/data/methods)")
+    return dict(np.load(path, allow_pickle=False))
+
+
+def order_scene(data, frames: int) -> tuple[gsjax.Gaussians, list[gsjax.Camera]]:
+    """Return the scene of `order_data`, and its first cameras."""
+    logits = np.log(data["opacities"]) - np.log1p(-data["opacities"])
+    gaussians = gsjax.make_gaussians(
+        means=data["means"],
+        quats=data["quats"],
+        log_scales=np.log(data["scales"]),
+        logit_opacities=logits,
+        sh=np.zeros((len(logits), 1, 3)),
+    )
+    views = np.tile(np.eye(4), (frames, 1, 1))
+    views[:, :3, :3], views[:, :3, 3] = (
+        data[name][:frames] for name in ("R_frames", "t_frames")
+    )
+    size = {name: int(data[name]) for name in ("width", "height")}
+    given = {"K": data["K"], "near": 1e-3, **size}
+    return gaussians, [gsjax.make_camera(viewmat=view, **given) for view in views]

@@ -38,7 +38,8 @@ def table(rows: Sequence[dict], on_front: Sequence[int]) -> str:
         )
     lines += [
         "  * on the front of forward time and largest error",
-        "  max, PSNR, gradient: against the exact image in float64, without cutoffs",
+        "  max, PSNR, gradient: against the exact image in float64, without cutoffs;",
+        "  of orders, against that in the exact order of each pixel",
         "  of bound: error / proven bound at the pixel where it is largest",
     ]
     return "\n".join(lines)

@@ -15,7 +15,7 @@ from gsjax.runtime.console import note, say
 class BenchCommand(HeavyCommand):
     """Measure run time against error, varying one setting at a time.
 
-    Takes minutes, mostly to compile: about five for the built-in knot on two cores.
+    Takes minutes, mostly to compile.
     The exit code is 1 if an error exceeds its theoretical bound."""
 
     scene: Annotated[Positional[str], arg(metavar="RUN|PLY|NAME")] = "knot"

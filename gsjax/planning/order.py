@@ -7,6 +7,7 @@ import numpy as np
 
 from gsjax.cameras.camera import Camera
 from gsjax.gaussians import Gaussians
+from gsjax.planning.accuracy import margin_for
 from gsjax.planning.types import Reason
 from gsjax.raster.exact import render_exact
 from gsjax.raster.types import RasterConfig
@@ -52,8 +53,7 @@ def choose_order(
             for view in views
         ]
 
-    # As for the α cutoff: other cameras may have more error than these.
-    margin, exact = 1.5 + 2 / np.sqrt(len(views)), draw(order="pixel")
+    margin, exact = margin_for(len(views)), draw(order="pixel")
     window, error = config.order_window, float("inf")
     while window <= max(_WIDEST, config.order_window):
         pictures = zip(draw(order_window=window), exact)

@@ -14,8 +14,9 @@ import numpy as np
 from gsjax.cameras.camera import Camera
 from gsjax.gaussians import Gaussians, capacity_bucket
 from gsjax.raster.compositing.alpha import evaluate
-from gsjax.raster.compositing.blending import Parts
-from gsjax.raster.compositing.ordered import blend_ordered
+from gsjax.raster.compositing.blending import Chunk, evaluated, tables_of
+from gsjax.raster.compositing.chunked import take_rows
+from gsjax.raster.compositing.ordered import blend_ordered, keys_at
 from gsjax.raster.primitives.ellipsoid import ELLIPSOID
 from gsjax.raster.primitives.table import with_primitive
 from gsjax.raster.render_camera import visible_order
@@ -44,28 +45,16 @@ def _blended(
     projection: Projection, ranks: Array, points: Array, config: RasterConfig
 ) -> Array:
     """Return colours [M, C] of the splats ``ranks`` [M, L] at points [M, 2]."""
-    splat, colors = projection.splat, projection.channels.colors.T
-
-    def some(values: Array) -> Array:
-        return values.at[ranks].get(mode="fill", fill_value=0)
-
-    columns = [some(a) for a in splat.shape]
-    dx, dy = (points[:, i, None] - some(a) for i, a in enumerate((splat.u, splat.v)))
-    # A pixel of its own for each point, at the origin.
-    at = evaluate((*columns, -dx, -dy), np.zeros((2, 1)), config)
-    if not config.sorts_pixels:
+    tables = tables_of(projection.splat, projection.channels, config)
+    # Each point is the only pixel of a tile whose corner it is.
+    chunk, pixel = Chunk(take_rows(tables, ranks), points), np.zeros((2, 1))
+    at = evaluated(chunk, pixel, config)
+    if config.sorts_pixels:
+        keys = keys_at(chunk, at, pixel, config)
+    else:
         # All are equal, so the order of the list stays.
         keys, config = jnp.zeros_like(at.alpha), config.replace(order="pixel")
-    elif splat.key:
-        numbers = tuple(some(a)[..., None] for a in splat.key)
-        keys = config.primitive.key(numbers, dx[..., None], dy[..., None])
-    else:
-        assert at.depth is not None
-        keys = at.depth
-    values = some(colors)
-    channels = jnp.concatenate([values, jnp.ones_like(values[..., :1])], -1)
-    parts = Parts(columns[0][..., None], channels)
-    return blend_ordered(at, parts, keys, config)["sums"][:, :-1, 0]
+    return blend_ordered(at, chunk.parts, keys, config)["sums"][:, :-1, 0]
 
 
 def sample(

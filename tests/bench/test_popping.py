@@ -3,7 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import COMPAT, DATA, render, scene_of
+from conftest import COMPAT, render, scene_of
+from pictures import order_data, order_scene
 
 import gsjax
 from gsjax.bench.popping import popping, same_rays, turned
@@ -13,24 +14,8 @@ from gsjax.raster.sampling import sample
 
 def test_figures_of_the_references():
     """`pop_exact`: the order of centres, and the floor that EWA has by itself."""
-    path = DATA / "methods" / "order.npz"
-    if not path.exists():
-        pytest.skip("order.npz is not there (../shared/data/methods)")
-    data = dict(np.load(path, allow_pickle=False))
-    logits = np.log(data["opacities"]) - np.log1p(-data["opacities"])
-    gaussians = gsjax.make_gaussians(
-        means=data["means"],
-        quats=data["quats"],
-        log_scales=np.log(data["scales"]),
-        logit_opacities=logits,
-        sh=np.zeros((len(logits), 1, 3)),
-    )
-    views = np.tile(np.eye(4), (2, 1, 1))
-    views[:, :3, :3], views[:, :3, 3] = data["R_frames"][:2], data["t_frames"][:2]
-    size = {"width": int(data["width"]), "height": int(data["height"])}
-    cameras = [
-        gsjax.make_camera(viewmat=v, K=data["K"], near=1e-3, **size) for v in views
-    ]
+    data = order_data()
+    gaussians, cameras = order_scene(data, 2)
     config = COMPAT.replace(
         alpha_min=1e-300, alpha_max=1.0, transmittance_min=0.0, stop_rule="after"
     )

@@ -13,7 +13,6 @@ import pytest
 from conftest import (
     AS_USERS,
     COMPAT,
-    DATA,
     HEIGHT,
     SCENES,
     WIDTH,
@@ -25,6 +24,7 @@ from conftest import (
     render,
     scene_of,
 )
+from pictures import order_data, order_scene
 from test_fused import RANKS, task_of, tiles_of
 
 import gsjax
@@ -45,32 +45,9 @@ WIDE = COMPAT.replace(order="window", order_window=32, **ROOM)
 BAR = {"needles_1000": 1e-6, "needles_10000": 1e-6}
 
 
-@pytest.fixture(scope="module")
-def data():
-    path = DATA / "methods" / "order.npz"
-    if not path.exists():
-        pytest.skip("order.npz is not there (../shared/data/methods)")
-    return dict(np.load(path, allow_pickle=False))
-
-
-def references_of(data):
-    logits = np.log(data["opacities"]) - np.log1p(-data["opacities"])
-    gaussians = gsjax.make_gaussians(
-        means=data["means"],
-        quats=data["quats"],
-        log_scales=np.log(data["scales"]),
-        logit_opacities=logits,
-        sh=np.zeros((len(data["means"]), 1, 3)),
-    )
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = data["R_frames"][0], data["t_frames"][0]
-    size = {name: int(data[name]) for name in ("width", "height")}
-    camera = gsjax.make_camera(viewmat=viewmat, K=data["K"], near=1e-3, **size)
-    return gaussians, camera
-
-
-def test_references(data, report):
-    gaussians, camera = references_of(data)
+def test_references(report):
+    data = order_data()
+    gaussians, (camera,) = order_scene(data, 1)
     limits = {"alpha_min": 1e-300, "alpha_max": 1.0, "transmittance_min": 0.0}
     config = PIXEL.replace(stop_rule="after", outputs=("rgb", "alpha"), **limits)
     assert (np.abs(data["image_tstar"] - data["image_centre"]) > 1 / 255).any()
