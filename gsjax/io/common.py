@@ -13,6 +13,7 @@ from gsjax.gaussians import Gaussians
 
 # Rounding that moves a Gaussian by more than this part of its size is warned about.
 MAX_SHIFT = 0.1
+ANY_MODE = "*"
 _TINY = np.finfo(np.float64).tiny
 
 
@@ -20,15 +21,23 @@ class Format(NamedTuple):
     """A file format of Gaussians, for `gsjax.io.formats.load` and `save`.
 
     Attributes:
-      name, suffixes: short name, and lower-case suffixes with the dot: (".ply",).
+      name: short name.
+      suffixes: lower-case ends of file names: (".ply",). The longest that fits selects
+        the format.
       load: ``load(path) -> Gaussians``, or None if the format is only written.
       save: ``save(path, gaussians, *, overwrite) -> None``, or None if it is only read.
+        With ``modes`` it also takes ``mode``, one of them or None.
+      mode: ``mode(path) -> str | None``, the render mode that a file records, see
+        `gsjax.io.formats.render_mode`; None if the format records none.
+      modes: render modes that ``save`` records; `ANY_MODE` stands for every word.
     """
 
     name: str
     suffixes: tuple[str, ...]
     load: Callable[[Path], Gaussians] | None
     save: Callable[..., None] | None
+    mode: Callable[[Path], str | None] | None = None
+    modes: tuple[str, ...] = ()
 
 
 def warn(message: str) -> None:

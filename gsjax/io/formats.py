@@ -1,16 +1,17 @@
 """Load and save Gaussians in the format that the suffix of the file name selects."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, check_gaussians
 from gsjax.io import ply, splat, spz
-from gsjax.io.common import Format
+from gsjax.io.common import ANY_MODE, Format, warn
 
 # A new format is one module and one entry here.
 FORMATS = (ply.FORMAT, splat.FORMAT, spz.FORMAT)
+DEFAULT_MODE = "default"  # of ordinary ellipsoids, as some programs record it
 
 
 def load(
@@ -28,10 +29,11 @@ def load(
 
     Raises:
       InputError: if the suffix is unknown, or the file is missing or invalid; see
-        `gsjax.io.ply.read_ply` and `gsjax.io.spz.read_spz`.
+        the reader of the format.
     """
-    path, read = _chosen(path, formats, "load")
-    return read(path)
+    path, form = _chosen(path, formats, "load")
+    assert form.load is not None
+    return form.load(path)
 
 
 def save(
@@ -39,39 +41,65 @@ def save(
     gaussians: Gaussians,
     *,
     overwrite: bool = False,
+    mode: str | None = None,
     formats: Sequence[Format] = FORMATS,
 ) -> None:
     """Write the active Gaussians to a file.
 
-    A .ply keeps every bit. A .spz is a fifth as large, and .splat is what simple web
-    viewers read; both round.
+    A .ply keeps every bit. The other formats round; see the reference page on formats.
 
     Args:
       path: the file to write; it appears complete or not at all.
       gaussians: the scene; inactive slots are left out.
       overwrite: replace an existing file.
+      mode: render mode to record, see `render_mode`. A format that cannot record it
+        causes a warning.
       formats: the known formats, as for `load`.
 
     Raises:
       InputError: if the suffix is unknown, the file exists and ``overwrite`` is
         not set, or it cannot be written.
     """
-    path, write = _chosen(path, formats, "save")
+    path, form = _chosen(path, formats, "save")
     check_gaussians(gaussians)
-    write(path, gaussians, overwrite=overwrite)
+    assert form.save is not None
+    options: dict = {"overwrite": overwrite}
+    if mode is not None and not {mode, ANY_MODE}.isdisjoint(form.modes):
+        options["mode"] = mode
+    elif mode is not None and mode != DEFAULT_MODE:
+        lost = f"{form.name} files do not record the render mode {mode!r}"
+        warn(f"{path}: {lost}; other programs draw the scene as ordinary ellipsoids")
+    form.save(path, gaussians, **options)
 
 
-def _chosen(path, formats: Sequence[Format], action: str) -> tuple[Path, Callable]:
+def render_mode(
+    path: str | PathLike[str], *, formats: Sequence[Format] = FORMATS
+) -> str | None:
+    """Return how the Gaussians of a file are to be drawn, as the file records it.
+
+    Returns:
+      "2dgs" for surfels, "mip" for ellipsoids trained with antialiasing, another word
+      of a PLY's "comment SplatRenderMode", or None if nothing is recorded.
+
+    Raises:
+      InputError: as `load`, from the header alone.
+    """
+    path, form = _chosen(path, formats, "load")
+    return None if form.mode is None else form.mode(path)
+
+
+def _chosen(path, formats: Sequence[Format], action: str) -> tuple[Path, Format]:
+    """Return the format whose suffix is the longest end of the file name."""
     if not isinstance(path, (str, PathLike)):
         got, remedy = type(path).__name__, "call load(path) or save(path, gaussians)"
         raise InputError(f"path: expected the name of a file, got {got}; {remedy}")
     path, known = Path(path), {s: f for f in formats for s in f.suffixes}
-    known = {s: getattr(f, action) for s, f in known.items() if getattr(f, action)}
-    suffix = path.suffix.lower()
-    if suffix not in known:
+    known = {s: f for s, f in known.items() if getattr(f, action)}
+    fitting = [suffix for suffix in known if path.name.lower().endswith(suffix)]
+    if not fitting:
         raise InputError(
             f"{path}: expected a suffix of {', '.join(sorted(known))}, got "
             f"{path.suffix!r}; convert the file, for example with SuperSplat, or pass "
             "formats=(*gsjax.io.formats.FORMATS, yours)"
         )
-    return path, known[suffix]
+    return path, known[max(fitting, key=len)]

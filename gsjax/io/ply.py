@@ -18,7 +18,7 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, make_gaussians
-from gsjax.io.common import MAX_SHIFT, Format, require_new, warn
+from gsjax.io.common import ANY_MODE, MAX_SHIFT, Format, require_new, warn
 from gsjax.io.ply_header import Header, check_properties, check_size, read_header
 from gsjax.io.ply_rows import CHUNK_ROWS, read_rows
 from gsjax.runtime.files import opened, replacing
@@ -295,4 +295,4 @@ def _is_rounded(values: np.ndarray) -> bool:
         return not np.array_equal(values.astype(np.float32), values, equal_nan=True)
 
 
-FORMAT = Format("ply", (".ply",), read_ply, write_ply)
+FORMAT = Format("ply", (".ply",), read_ply, write_ply, render_mode, (ANY_MODE,))

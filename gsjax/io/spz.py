@@ -42,8 +42,8 @@ _HALF_TURN = np.array([1.0, -1.0, -1.0])
 _MIN_OPACITY = 0.25 / 255  # rounds to 0
 
 
-def is_antialiased(path: str | PathLike[str]) -> bool:
-    """Return whether an SPZ file says that its scene was trained with antialiasing.
+def render_mode(path: str | PathLike[str]) -> str | None:
+    """Return "mip" if an SPZ file says that its scene was trained with antialiasing.
 
     The flag does not tell the size of the filter; gsjax draws such files with that of
     Mip-Splatting.
@@ -53,7 +53,7 @@ def is_antialiased(path: str | PathLike[str]) -> bool:
     """
     path = Path(path)
     with _opened(path) as (stream, _):
-        return bool(_read_header(stream, path)[-1] & _ANTIALIASED)
+        return "mip" if _read_header(stream, path)[-1] & _ANTIALIASED else None
 
 
 @contextmanager
@@ -79,7 +79,7 @@ def read_spz(path: str | PathLike[str]) -> Gaussians:
 
     Trailing bytes and extensions are ignored with a warning. A file that was trained
     with antialiasing is warned about: `RasterConfig` must be told. See
-    `is_antialiased`.
+    `render_mode`.
 
     Returns:
       Gaussians with capacity max(N, 1), in the order of the file.
@@ -224,7 +224,7 @@ def write_spz(
     gaussians: Gaussians,
     *,
     overwrite: bool = False,
-    antialias: bool = False,
+    mode: str | None = None,
 ) -> None:
     """Write the active Gaussians as an SPZ file of version 3.
 
@@ -234,7 +234,7 @@ def write_spz(
 
     Args:
       path, gaussians, overwrite: as `gsjax.io.formats.save`; SH degree 0 to 3.
-      antialias: record that the scene was trained with antialiasing.
+      mode: "mip" records that the scene was trained with antialiasing.
 
     Raises:
       InputError: as `write_ply`; if a value is NaN, or infinite and not a logit, if a
@@ -248,7 +248,7 @@ def write_spz(
     count, degree = len(rows["means"]), gaussians.sh_degree
     means = np.rint(rows["means"].astype(np.float64) * 2.0**fraction * _HALF_TURN)
     scales = _SCALE * (rows["log_scales"].astype(np.float64) + _SHIFT)
-    flags = _ANTIALIASED * antialias
+    flags = _ANTIALIASED * (mode == "mip")
     with (
         replacing(path, durable=True) as file,
         gzip.GzipFile("", "wb", 6, file, mtime=0) as stream,
@@ -316,4 +316,4 @@ def _warn_of_losses(path: Path, rows: dict[str, np.ndarray], fraction: int) -> N
             )
 
 
-FORMAT = common.Format("spz", (".spz",), read_spz, write_spz)
+FORMAT = common.Format("SPZ", (".spz",), read_spz, write_spz, render_mode, ("mip",))

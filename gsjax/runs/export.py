@@ -8,12 +8,9 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, num_active, select, with_sh_degree
-from gsjax.io.formats import load, save
-from gsjax.io.ply import render_mode, write_ply
-from gsjax.io.spz import write_spz
-from gsjax.raster.types import RasterConfig
+from gsjax.io.formats import load, render_mode, save
 from gsjax.runs.folder import load_settings, ply_mode
-from gsjax.runs.scene_source import file_raster, is_run, splat_file
+from gsjax.runs.scene_source import is_run, splat_file
 from gsjax.runtime.files import make_folder, reject_existing
 
 
@@ -51,28 +48,15 @@ def export_scene(
             rotated = np.any(np.asarray(gaussians.params.quats) != 0, axis=1)
             gaussians = select(gaussians, jnp.asarray(rotated))
         make_folder(out.parent)
-        if out.suffix.lower() == ".spz":
-            antialias = _raster(source).antialias
-            write_spz(out, gaussians, overwrite=True, antialias=antialias)
-        elif out.suffix.lower() == ".ply":
-            write_ply(out, gaussians, overwrite=True, mode=_mode(source))
-        else:
-            save(out, gaussians, overwrite=True)
+        save(out, gaussians, overwrite=True, mode=scene_mode(source))
         return int(num_active(gaussians)), found
 
 
-def _mode(source: Path) -> str | None:
+def scene_mode(source: Path) -> str | None:
     """Return the render mode of a run or file."""
-    if not is_run(source) and source.suffix.lower() == ".ply":
-        return render_mode(source)  # also a word that is not ours
-    return ply_mode(_raster(source))
-
-
-def _raster(source: Path) -> RasterConfig:
-    """Return the render settings of a run or file."""
     if is_run(source):
-        return load_settings(source).config.raster
-    return file_raster(source)
+        return ply_mode(load_settings(source).config.raster)
+    return render_mode(source)  # also a word that is not ours
 
 
 def _load_opaque(path: Path, min_opacity: float) -> tuple[Gaussians, int]:

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.gaussians import Gaussians
-from gsjax.io.ply import render_mode
-from gsjax.io.spz import is_antialiased
+from gsjax.io.formats import render_mode
 from gsjax.raster.types import RasterConfig
 from gsjax.runs import folder as run_folder
 from gsjax.train.config import mip_raster
@@ -66,19 +65,15 @@ def splat_file(path: Path) -> Path:
 def file_raster(path: Path) -> RasterConfig:
     """Return the render settings of a file of Gaussians: `RasterConfig.compat`.
 
-    They draw surfels if it is a PLY of surfels, and have the filter of Mip-Splatting if
-    its comment or the flag of an SPZ says so.
+    They draw surfels, or have the filter of Mip-Splatting, if the file says so.
 
     Raises:
       InputError: if the file cannot be read.
     """
-    config, suffix = RasterConfig.compat(), path.suffix.lower()
-    mode = render_mode(path) if suffix == ".ply" else None
+    config, mode = RasterConfig.compat(), render_mode(path)
     if mode == "2dgs":
         return config.replace(primitive="surfel")
-    if mode == "mip" or (suffix == ".spz" and is_antialiased(path)):
-        return mip_raster(config)
-    return config
+    return mip_raster(config) if mode == "mip" else config
 
 
 def open_scene_source(

@@ -15,10 +15,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gsjax.gaussians import Gaussians, grow, make_gaussians, select
+from gsjax.io import formats
 from gsjax.io.formats import load, save
 from gsjax.io.numerals import BLOCK, find_words, parse_number, parse_numbers
 from gsjax.io.ply import read_ply, render_mode, write_ply
-from gsjax.io.spz import is_antialiased, write_spz
+from gsjax.io.spz import write_spz
 from gsjax.raster.types import RasterConfig
 from gsjax.runs.export import export_scene
 from gsjax.runs.scene_source import open_scene_source
@@ -384,7 +385,7 @@ def test_the_mark_of_mip_splatting_is_kept_by_exports(tmp_path, first):
     if first == ".ply":
         write_ply(source, gaussians, mode="mip")
     else:
-        write_spz(source, gaussians, antialias=True)
+        write_spz(source, gaussians, mode="mip")
     write_ply(plain, gaussians)
     mip = RasterConfig(dilation=0.1, antialias=True)
     for suffix in (".ply", ".spz"):
@@ -393,7 +394,7 @@ def test_the_mark_of_mip_splatting_is_kept_by_exports(tmp_path, first):
             export_scene(start, out)
             assert open_scene_source(out).config == config
             if suffix == ".spz":
-                assert is_antialiased(out) == (config == mip)
+                assert (formats.render_mode(out) == "mip") == (config == mip)
             fast = open_scene_source(out, raster=RasterConfig.fast()).config
             assert fast.dilation == config.dilation
             assert fast.alpha_max == RasterConfig.fast().alpha_max
