@@ -6,12 +6,12 @@ from pathlib import Path
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, check_gaussians
-from gsjax.io import ply, sog, splat, spz
+from gsjax.io import gltf, ply, sog, splat, spz
 from gsjax.io.common import ANY_MODE, Format, warn
 from gsjax.io.sog_files import scene_path
 
 # A new format is one module and one entry here.
-FORMATS = (ply.FORMAT, splat.FORMAT, spz.FORMAT, sog.FORMAT)
+FORMATS = (ply.FORMAT, splat.FORMAT, spz.FORMAT, sog.FORMAT, gltf.FORMAT)
 DEFAULT_MODE = "default"  # of ordinary ellipsoids, as some programs record it
 
 
