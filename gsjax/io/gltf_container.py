@@ -26,6 +26,7 @@ _PARSED = 24  # memory of Python's parser relative to the text, for many small o
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 NAMES = {5120: "int8", 5121: "uint8", 5122: "int16", 5123: "uint16", 5126: "float"}
 FLOAT, BYTE = 5126, 5121
+_ARRAY_BUFFER = 34962  # target of a view: attributes of vertices
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _MAX_COUNT = 1 << 32
 
@@ -205,7 +206,14 @@ def write_gltf(file: BinaryIO, data: dict[str, Any], arrays: list[np.ndarray]) -
     """
     views, total = [], 0
     for array in arrays:
-        views.append({"buffer": 0, "byteOffset": total, "byteLength": array.nbytes})
+        views.append(
+            {
+                "buffer": 0,
+                "byteOffset": total,
+                "byteLength": array.nbytes,
+                "target": _ARRAY_BUFFER,
+            }
+        )
         total += -(-array.nbytes // 4) * 4
     buffers = [{"byteLength": total}]
     text = json.dumps({**data, "buffers": buffers, "bufferViews": views}).encode()

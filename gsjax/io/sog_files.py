@@ -9,12 +9,12 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from gsjax.errors import InputError
-from gsjax.runtime.files import opened, read_bytes, reading, shown
+from gsjax.runtime.files import opened, read_bytes, reading, replacing, shown, writing
 
 META = "meta.json"
 REMEDY = "export or download it again"
@@ -153,3 +153,43 @@ def _check_entry(where: str, size: int, most: int) -> None:
     if size > most:
         expected = f"expected at most {most:,} bytes, got {size:,}"
         raise InputError(f"{where}: {expected}; {REMEDY}")
+
+
+def write_files(path: Path, files: dict[str, bytes], *, overwrite: bool) -> None:
+    """Write the files of a scene as a .sog archive, or beside a meta.json.
+
+    They appear complete or not at all. In a folder the meta.json is removed before the
+    first texture is replaced, and appears last.
+
+    Raises:
+      InputError: if they cannot be written, or if textures exist without ``overwrite``.
+    """
+    if path.suffix.lower() != ".json":
+        with replacing(path, durable=True) as file:
+            _write_archive(file, files)
+        return
+    if path.name != META:
+        expected = f"expected the name {META} for a folder of files"
+        raise InputError(f"{path}: {expected}, got {path.name}; pass it, or a .sog")
+    places = {name: path.with_name(name) for name in files}
+    found = [place for place in places.values() if place.exists()]
+    if found and not overwrite:
+        remedy = "pass overwrite=True or another folder"
+        raise InputError(f"{found[0]}: exists; {remedy}")
+    with ExitStack() as stack:
+        # Entered first, it is renamed last.
+        last = stack.enter_context(replacing(path, durable=True))
+        last.write(files[META])
+        for name, data in files.items():
+            if name != META:
+                file = stack.enter_context(replacing(places[name], durable=True))
+                file.write(data)
+        with writing(path, "replaced"):
+            path.unlink(missing_ok=True)
+
+
+def _write_archive(file: BinaryIO, files: dict[str, bytes]) -> None:
+    """Write a ZIP archive of stored entries; equal files give equal bytes."""
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in files.items():
+            archive.writestr(zipfile.ZipInfo(name), data)
