@@ -15,6 +15,7 @@ from gsjax.gaussians import Gaussians
 MAX_SHIFT = 0.1
 ANY_MODE = "*"
 _TINY = np.finfo(np.float64).tiny
+_NEARER = "move the scene nearer to the origin, or write a .ply"
 
 
 class Format(NamedTuple):
@@ -105,3 +106,40 @@ def visible_rows(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
     lost = f"{(~visible).sum()} of {len(visible)} quaternions are zero"
     warn(f"{path}: {lost}; these Gaussians are never drawn and are left out")
     return {name: array[visible] for name, array in rows.items()}
+
+
+def float32_means(path: Path, rows: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the means [N, 3] of rows to write, rounded to float32.
+
+    Warns if that moves Gaussians by much of their size.
+
+    Raises:
+      InputError: if a mean exceeds float32.
+    """
+    means = rows["means"]
+    with np.errstate(over="ignore"):
+        rounded = means.astype(np.float32)
+    far = np.any(~np.isfinite(rounded), axis=1)
+    if far.any():
+        what = f"{far.sum():,} of {len(far):,} means exceed float32"
+        raise InputError(f"{path}: {what}; {_NEARER}")
+    warn_of_moves(path, rounded, rows)
+    return rounded
+
+
+def warn_of_moves(path: Path, stored: np.ndarray, rows: dict[str, np.ndarray]) -> None:
+    """Warn if rounding moves Gaussians by a tenth of their size or more.
+
+    Args:
+      path: the file.
+      stored: [N, 3] means as a file stores them.
+      rows: the Gaussians, see `visible_rows`.
+    """
+    shift = np.abs(stored - rows["means"].astype(np.float64)).max(1, initial=0)
+    largest = rows["log_scales"].max(1, initial=-np.inf).astype(np.float64)
+    moved = shift > MAX_SHIFT * np.exp(np.minimum(largest, 80))
+    if moved.any():
+        warn(
+            f"{path}: {moved.sum():,} of {len(moved):,} Gaussians have means rounded "
+            f"by a tenth of their size or more; {_NEARER}"
+        )

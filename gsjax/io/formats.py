@@ -6,11 +6,12 @@ from pathlib import Path
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, check_gaussians
-from gsjax.io import ply, splat, spz
+from gsjax.io import gltf, ply, sog, splat, spz
 from gsjax.io.common import ANY_MODE, Format, warn
+from gsjax.io.sog_files import scene_path
 
 # A new format is one module and one entry here.
-FORMATS = (ply.FORMAT, splat.FORMAT, spz.FORMAT)
+FORMATS = (ply.FORMAT, splat.FORMAT, spz.FORMAT, sog.FORMAT, gltf.FORMAT)
 DEFAULT_MODE = "default"  # of ordinary ellipsoids, as some programs record it
 
 
@@ -20,7 +21,7 @@ def load(
     """Read the Gaussians of a file; upper and lower case of the suffix are alike.
 
     Args:
-      path: the file.
+      path: the file, or the folder of a SOG.
       formats: the known formats; of two with one suffix the last is used.
         ``(*FORMATS, mine)`` adds a format.
 
@@ -94,6 +95,7 @@ def _chosen(path, formats: Sequence[Format], action: str) -> tuple[Path, Format]
         got, remedy = type(path).__name__, "call load(path) or save(path, gaussians)"
         raise InputError(f"path: expected the name of a file, got {got}; {remedy}")
     path, known = Path(path), {s: f for f in formats for s in f.suffixes}
+    path = scene_path(path) if action == "load" else path
     known = {s: f for s, f in known.items() if getattr(f, action)}
     fitting = [suffix for suffix in known if path.name.lower().endswith(suffix)]
     if not fitting:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.gaussians import Gaussians
-from gsjax.io.formats import render_mode
+from gsjax.io.formats import render_mode, scene_path
 from gsjax.raster.types import RasterConfig
 from gsjax.runs import folder as run_folder
 from gsjax.train.config import mip_raster
@@ -46,18 +46,24 @@ def free_view_config(trained: RasterConfig) -> RasterConfig:
 
 
 def is_run(path: Path) -> bool:
-    """Return whether a path denotes a run: a folder, or missing and without suffix."""
+    """Return whether a path denotes a run: a folder, or missing and without suffix.
+
+    The folder of a SOG is not a run: it stands for the file in it.
+    """
+    path = scene_path(path)
     return path.is_dir() or not (path.exists() or path.suffix)
 
 
 def splat_file(path: Path) -> Path:
     """Return the file of Gaussians of a scene: the path itself, or that of the run.
 
+    For the folder of a SOG it is the meta.json.
+
     Raises:
       InputError: if it is a folder but not a run, or a run without Gaussians yet.
     """
     if not is_run(path):
-        return path
+        return scene_path(path)
     run_folder.load_settings(path)
     return run_folder.require_splat(path)
 
