@@ -92,7 +92,7 @@ def quantise(source: Source, price: float) -> Quantised:
     errors = {"removal": float(importance.removal[removed].sum())}
     energy = importance.energy[kept]
     rows["sh"], entries, errors["harmonics"] = _harmonics(
-        source, kept, energy, price, rows["sh"]
+        source, energy, price, rows["sh"]
     )
     lattice = lattice_of(source.suffix, rows)
     if lattice is not None:
@@ -112,7 +112,10 @@ def _round_all(
     """Round the numbers of each kind, in place."""
     for name in ("means", "log_scales", "logit_opacities"):
         axis = getattr(lattice, name)
-        rounded = round_to(axis, rows[name], curvature[name], allowed)
+        coarsest = np.inf
+        if name == "means":  # half of the longest axis
+            coarsest = np.exp(rows["log_scales"].max(1, keepdims=True)) / 2
+        rounded = round_to(axis, rows[name], curvature[name], allowed, coarsest)
         rows[name], errors[name] = rounded.values.astype(np.float32), rounded.error
     weights = np.repeat(energy[:, None], 3, 1) / _SPHERE
     rounded = round_to(lattice.colors, rows["sh"][:, 0], weights, allowed)
@@ -139,7 +142,7 @@ def _round_quats(
 
 
 def _harmonics(
-    source: Source, kept: np.ndarray, energy: np.ndarray, price: float, sh: np.ndarray
+    source: Source, energy: np.ndarray, price: float, sh: np.ndarray
 ) -> tuple[np.ndarray, int, float]:
     """Return the harmonics [N, K, 3], the entries of the palette, and the error.
 
