@@ -44,6 +44,11 @@ class ViewedHarmonics:
         energy = self._energy[:, kept]
         return ViewedHarmonics(self.sh[kept], self._means[kept], self._centres, energy)
 
+    def scaled(self, factor: float) -> "ViewedHarmonics":
+        """Return the same with weights times a factor."""
+        energy = self._energy * np.float32(factor)
+        return ViewedHarmonics(self.sh, self._means, self._centres, energy)
+
     def simplified(self) -> np.ndarray:
         """Return small coefficients [N, K, 3] with nearly the same colours as seen.
 

@@ -3,7 +3,7 @@
 Axis legend: N Gaussians (capacity), V views, H W image.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -49,6 +49,16 @@ class Importance(NamedTuple):
     energy: np.ndarray
     removal: np.ndarray
     curvature: dict[str, np.ndarray]
+
+    def scaled(self, factors: Mapping[str, float]) -> "Importance":
+        """Return errors times a factor of their kind, see `Quantised.errors`."""
+        curvature = {k: factors.get(k, 1) * v for k, v in self.curvature.items()}
+        return self._replace(
+            shares=self.shares * np.float32(factors.get("harmonics", 1)),
+            energy=self.energy * factors.get("colors", 1),
+            removal=self.removal * factors.get("removal", 1),
+            curvature=curvature,
+        )
 
     def rows(self, kept: np.ndarray) -> "Importance":
         """Return the importance of some Gaussians, by their indices."""

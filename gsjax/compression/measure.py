@@ -18,6 +18,7 @@ from gsjax.raster.types import RasterConfig
 from gsjax.runtime.devices import replicate
 from gsjax.train.metrics import psnr, ssim
 
+_FEW = 4  # pictures from which estimates are corrected
 _MARGIN = 1.2  # spare room for pairs, so that few programs are compiled
 
 _psnr, _ssim = jax.jit(psnr), jax.jit(ssim)
@@ -51,13 +52,22 @@ class Judge:
         )
         self.pictures = self.draw(gaussians)
 
-    def draw(self, gaussians: Gaussians) -> list[np.ndarray]:
-        """Return the pictures of a scene, clipped to [0, 1]."""
+    def error(self, gaussians: Gaussians) -> float:
+        """Return the mean squared error of some pictures against those before."""
+        few = np.unique(np.linspace(0, len(self.pictures) - 1, _FEW).astype(int))
+        found = self.draw(gaussians, few)
+        pairs = zip(found, (self.pictures[place] for place in few))
+        return float(np.mean([np.mean(np.square(a - b)) for a, b in pairs]))
+
+    def draw(self, gaussians: Gaussians, places=None) -> list[np.ndarray]:
+        """Return the pictures of a scene, or those at ``places``, clipped to [0, 1]."""
         gaussians = with_sh_degree(gaussians, self.degree)
         if gaussians.capacity < self.slots:
             gaussians = grow(gaussians, self.slots)
         gaussians = replicate(gaussians)
-        return [self._picture(gaussians, camera) for camera in self.held_out.cameras]
+        cameras = self.held_out.cameras
+        places = range(len(cameras)) if places is None else places
+        return [self._picture(gaussians, cameras[place]) for place in places]
 
     def _picture(self, gaussians: Gaussians, camera: Camera) -> np.ndarray:
         drawn = render_exact(gaussians, camera, self.config, self.behind)

@@ -7,6 +7,7 @@ bit; at the best Δ that error is price / (2 ln 2) for every number.
 Axis legend: N Gaussians, K spherical-harmonic bases, C entries of the palette.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -22,8 +23,6 @@ _PER_BIT = 1 / (2 * np.log(2))
 _SPHERE = 4 * np.pi  # a coefficient adds the square of its change over 4 π, on average
 _GAUSSIAN_BITS = 100.0  # of one Gaussian without harmonics, before it is known
 _ENTRY_BITS = 6.0  # of a coefficient in the palette
-# Removals of neighbours add up: together they change more than each alone.
-_TOGETHER = 4.0
 PALETTES = (64, 256, 1024, 4096)
 _SH_TABLE = 256
 
@@ -54,9 +53,11 @@ class Quantised(NamedTuple):
     Attributes:
       rows: the Gaussians that are kept.
       kept: indices of them in the source.
-      errors: mean squared error that each kind of change adds, by estimate.
+      errors: mean squared error that each kind of change adds, by estimate: "removal",
+        "harmonics", "colors", and the numbers by their names in `GaussianParams`.
       entries: number of palette entries that are used; 0 without a palette.
       price: of a bit.
+      harmonics: [N, K, 3] coefficients before those of degree 0 are rounded.
     """
 
     rows: Rows
@@ -64,10 +65,19 @@ class Quantised(NamedTuple):
     errors: dict[str, float]
     entries: int
     price: float
+    harmonics: np.ndarray
 
-    def gaussians(self) -> Gaussians:
-        """Return the scene as Gaussians."""
-        return make_gaussians(**self.rows)
+    def with_change(self, source: Source, kind: str) -> Gaussians:
+        """Return the kept Gaussians of the source with one kind of change alone."""
+        rows = {k: np.asarray(v)[self.kept] for k, v in source.rows.items()}
+        if kind == "harmonics":
+            rows["sh"] = self.harmonics
+        elif kind == "colors":
+            rows["sh"] = np.array(rows["sh"])
+            rows["sh"][:, 0] += self.rows["sh"][:, 0] - self.harmonics[:, 0]
+        elif kind != "removal":
+            rows[kind] = self.rows[kind]
+        return as_gaussians(rows)
 
 
 def make_source(rows: Rows, importance: Importance, suffix: str, seed: int) -> Source:
@@ -85,20 +95,28 @@ def make_source(rows: Rows, importance: Importance, suffix: str, seed: int) -> S
     return Source(rows, importance, harmonics, simplified, tuple(palettes), suffix)
 
 
+def scaled(source: Source, factors: Mapping[str, float]) -> Source:
+    """Return a scene whose estimated errors are multiplied by factors of their kind."""
+    harmonics = source.harmonics.scaled(factors.get("harmonics", 1.0))
+    importance = source.importance.scaled(factors)
+    return source._replace(importance=importance, harmonics=harmonics)
+
+
 def quantise(source: Source, price: float) -> Quantised:
     """Return the scene at a price of a bit, in mean squared error per bit."""
     removal = source.importance.removal
-    kept = np.flatnonzero(_TOGETHER * removal > price * _GAUSSIAN_BITS)
+    kept = np.flatnonzero(removal > price * _GAUSSIAN_BITS)
     if not len(kept):
         kept = np.argsort(-removal)[:1]
     rows = {name: np.asarray(array)[kept] for name, array in source.rows.items()}
     importance = source.importance.rows(kept)
     errors = {"removal": float(removal.sum() - importance.removal.sum())}
-    rows["sh"], entries, errors["harmonics"] = _harmonics(source, kept, price)
+    harmonics, entries, errors["harmonics"] = _harmonics(source, kept, price)
+    rows["sh"] = harmonics
     lattice = lattice_of(source.suffix, rows)
     if lattice is not None:
         _round_all(rows, lattice, importance, price * _PER_BIT, errors)
-    return Quantised(rows, kept, errors, entries, price)
+    return Quantised(rows, kept, errors, entries, price, harmonics)
 
 
 def _round_all(

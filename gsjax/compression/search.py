@@ -9,8 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.compression.measure import Judge
-from gsjax.compression.quantise import Quantised, Source, as_gaussians, quantise
-from gsjax.compression.types import Goal, Quality
+from gsjax.compression.quantise import (
+    Quantised,
+    Source,
+    as_gaussians,
+    quantise,
+    scaled,
+)
+from gsjax.compression.types import NOMINAL_PSNR, Goal, Quality
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.io.formats import load, save
@@ -18,6 +24,7 @@ from gsjax.runtime.console import note
 
 _TRIALS = 8
 _ENOUGH = 0.9  # share of the goal that is near enough
+_FACTORS = 0.05, 50.0  # limits of what corrects an estimate
 _WIDEST = 16.0  # factor of the price from one trial to the next, at most
 
 
@@ -75,13 +82,14 @@ def search(
         )
         return trial
 
-    return _bisect(at, _first_price(source, judge, before, goal), limit, by_size)
+    source = calibrated(source, judge, _first_price(source, before, goal))
+    return _bisect(at, _first_price(source, before, goal), limit, by_size)
 
 
 def _bisect(
     at: Callable[[float], Trial], price: float, limit: float, by_size: bool
 ) -> Trial:
-    """Return the best trial: the value rises with the price, or falls if ``by_size``."""
+    """Return the best trial. Values rise with the price, or fall if ``by_size``."""
     best: Trial | None = None
     low, high = 0.0, np.inf  # prices that meet the goal, and that do not
     tried: list[Trial] = []
@@ -132,10 +140,9 @@ def _next_price(tried: list[Trial], limit: float, low: float, high: float) -> fl
     return float(price)
 
 
-def _first_price(source: Source, judge: Judge, before: Quality, goal: Goal) -> float:
+def _first_price(source: Source, before: Quality, goal: Goal) -> float:
     """Return a price whose estimated error is about that of the goal."""
-    del judge
-    psnr = before.psnr if before.psnr is not None else 30.0
+    psnr = before.psnr if before.psnr is not None else NOMINAL_PSNR
     if goal.max_loss is not None:
         target = 10 ** (-psnr / 10) * (10 ** (goal.max_loss / 10) - 1)
     elif goal.max_error is not None:
@@ -150,9 +157,27 @@ def _first_price(source: Source, judge: Judge, before: Quality, goal: Goal) -> f
             low = middle
         else:
             high = middle
-        if high < 1.5 * low:
+        if high < 2 * low:
             break
     return float(np.sqrt(low * high))
+
+
+def calibrated(source: Source, judge: Judge, price: float) -> Source:
+    """Return the scene with its estimates of errors corrected by measured ones.
+
+    Estimates take Gaussians one by one. Together they err more: neighbours lose the
+    same light, and those that change places in the order of depth are in no gradient.
+    Each kind of change at this price is drawn by itself.
+    """
+    scene, factors = quantise(source, price), {}
+    removed = judge.error(scene.with_change(source, "removal"))
+    for kind, estimate in scene.errors.items():
+        error = removed
+        if kind != "removal":
+            error = judge.error(scene.with_change(source, kind)) - removed
+        if estimate > 0:
+            factors[kind] = float(np.clip(error / estimate, *_FACTORS))
+    return scaled(source, factors)
 
 
 def _trial(source: Source, judge: Judge, price: float, mode: str | None) -> Trial:
