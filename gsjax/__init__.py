@@ -18,6 +18,8 @@ if typing.TYPE_CHECKING:  # the same names as in `_PUBLIC`
     from gsjax.cameras.camera import resize_camera as resize_camera
     from gsjax.cameras.camera import stack_cameras as stack_cameras
     from gsjax.cameras.lenses import Lens as Lens
+    from gsjax.compression.compress import compress as compress
+    from gsjax.compression.types import CompressedScene as CompressedScene
     from gsjax.data.arrays import make_dataset as make_dataset
     from gsjax.data.dataset import load_dataset as load_dataset
     from gsjax.data.photos import load_photos as load_photos
@@ -72,6 +74,8 @@ if typing.TYPE_CHECKING:  # the same names as in `_PUBLIC`
 _PUBLIC = {
     "cameras.camera": "Camera look_at make_camera resize_camera stack_cameras",
     "cameras.lenses": "Lens",
+    "compression.compress": "compress",
+    "compression.types": "CompressedScene",
     "data.arrays": "make_dataset",
     "data.dataset": "load_dataset",
     "data.photos": "load_photos",

@@ -121,7 +121,10 @@ def measure_importance(
     behind = jnp.asarray(background, gaussians.params.means.dtype)
     config = config.replace(outputs=("rgb",), absgrad=False, num_size_buckets=1)
     with_gradient = set(np.linspace(0, len(cameras) - 1, _GRADIENTS).astype(int))
-    found, squares = [], dict.fromkeys(_MEASURED, 0.0)
+    found = []
+    squares = {
+        name: np.zeros(getattr(gaussians.params, name).shape) for name in _MEASURED
+    }
     for place, camera in enumerate(progress(cameras, "importance")):
         one = contribution(gaussians, camera, config, behind)
         found.append([np.asarray(values, np.float32) for values in one])
@@ -131,7 +134,7 @@ def measure_importance(
             gradient = _of_signs(gaussians, camera, behind, key, fitted)
             for name in _MEASURED:
                 square = np.square(np.asarray(getattr(gradient, name), np.float64))
-                squares[name] = squares[name] + square
+                squares[name] += square
     total, largest, energy, removal = (np.stack(some) for some in zip(*found))
     numbers = sum(3 * camera.width * camera.height for camera in cameras)
     sampled = sum(3 * cameras[k].width * cameras[k].height for k in with_gradient)
@@ -182,5 +185,6 @@ def _of_signs(gaussians: Gaussians, camera: Camera, behind, key, config: RasterC
         return render(scene, camera, config, behind).rgb
 
     image, pull = jax.vjp(picture, gaussians.params)
+    assert image is not None
     signs = jax.random.rademacher(key, image.shape, image.dtype)
     return pull(signs)[0]

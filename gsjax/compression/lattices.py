@@ -68,7 +68,7 @@ def lattice_of(suffix: str, rows: Rows) -> Lattice | None:
 def _of_sog(rows: Rows) -> Lattice:
     means = np.asarray(rows["means"], np.float64)
     logs = np.sign(means) * np.log1p(np.abs(means))
-    low, high = (f(logs, axis=0, initial=None) for f in (np.min, np.max))
+    low, high = logs.min(axis=0), logs.max(axis=0)
     span = np.where(high > low, high - low, 1.0)
 
     def forward(values):

@@ -7,10 +7,9 @@ bit; at the best Δ that error is price / (2 ln 2) for every number.
 Axis legend: N Gaussians, K spherical-harmonic bases, C entries of the palette.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from gsjax.compression.harmonics import ViewedHarmonics
@@ -23,8 +22,31 @@ _PER_BIT = 1 / (2 * np.log(2))
 _SPHERE = 4 * np.pi  # a coefficient adds the square of its change over 4 π, on average
 _GAUSSIAN_BITS = 100.0  # of one Gaussian without harmonics, before it is known
 _ENTRY_BITS = 6.0  # of a coefficient in the palette
-PALETTES = (64, 256, 1024, 4096)
+_PALETTES, _LARGEST_PALETTE = (64, 256, 1024, 4096, 16384), 65536
 _SH_TABLE = 256
+
+
+class Palettes:
+    """Clusters of harmonics, each about four times as many as before.
+
+    They are made when first used: large ones take long, and few goals need them.
+    """
+
+    def __init__(self, points: np.ndarray, weights: np.ndarray, seed: int):
+        """Take [N, D] points, [N] weights and the seed of `kmeans`."""
+        self._points, self._weights, self._seed = points, weights, seed
+        most = min(len(points), _LARGEST_PALETTE)
+        self._sizes = [size for size in _PALETTES if size < most] + [most]
+        self._made: list[Clusters] = []
+
+    def __iter__(self) -> Iterator[Clusters]:
+        """Yield the clusters, fewest first; none without harmonics."""
+        for place, size in enumerate(self._sizes if self._points.shape[1] else ()):
+            if place == len(self._made):
+                weights, seed = self._weights, self._seed
+                made = kmeans(self._points, size, weights=weights, seed=seed)
+                self._made.append(made)
+            yield self._made[place]
 
 
 class Source(NamedTuple):
@@ -35,7 +57,7 @@ class Source(NamedTuple):
       importance: of each of them.
       harmonics: the spherical harmonics, as views see them.
       simplified: [N, D] harmonics above degree 0 that look nearly the same.
-      palettes: clusters of them, by falling error; empty without harmonics.
+      palettes: clusters of them.
       suffix: of the file format.
     """
 
@@ -43,7 +65,7 @@ class Source(NamedTuple):
     importance: Importance
     harmonics: ViewedHarmonics
     simplified: np.ndarray
-    palettes: tuple[Clusters, ...]
+    palettes: "Palettes"
     suffix: str
 
 
@@ -86,13 +108,9 @@ def make_source(rows: Rows, importance: Importance, suffix: str, seed: int) -> S
         rows["sh"], rows["means"], importance.centres, importance.shares
     )
     simplified = harmonics.simplified()[:, 1:].reshape(len(rows["sh"]), -1)
-    palettes, weights = [], importance.shares.sum(0, dtype=np.float64)
-    if simplified.shape[1]:
-        for count in PALETTES:
-            if count < len(simplified) / 8:
-                found = kmeans(simplified, count, weights=weights, seed=seed)
-                palettes.append(found)
-    return Source(rows, importance, harmonics, simplified, tuple(palettes), suffix)
+    weights = importance.shares.sum(0, dtype=np.float64)
+    palettes = Palettes(simplified, weights, seed)
+    return Source(rows, importance, harmonics, simplified, palettes, suffix)
 
 
 def scaled(source: Source, factors: Mapping[str, float]) -> Source:
@@ -175,6 +193,8 @@ def _harmonics(
     without = base, errors
     for palette in source.palettes:
         found = _with_palette(palette, rest, weights, price, seen, without)
+        if found.cost > best.cost and best.entries:
+            break  # larger ones cost even more
         best = min(best, found, key=lambda one: one.cost)
     if not best.entries:
         return best.base[:, None], 0, best.error
@@ -202,14 +222,17 @@ def _with_palette(
     """
     entries = np.concatenate([np.zeros_like(rest[:1]), palette.centroids])
     bits = np.zeros(len(entries))
-    for _ in range(3):
-        labels = nearest_by_cost(rest, entries, weights, price * bits)
+    labels = nearest_by_cost(rest, entries, weights, bits)
+    for _ in range(2):
         bits = _bits(labels, len(entries))
+        labels = nearest_by_cost(rest, entries, weights, price * bits)
+    bits = _bits(labels, len(entries))
     mass = np.bincount(labels, weights, minlength=len(entries))
     entries = _truncated(entries, mass, price)
     least = 1e-6 * mass.max() + 1e-300
     shares = np.repeat(mass + least, entries.shape[1])
     table, indices = codebook(entries.ravel(), _SH_TABLE, weights=shares)
+    table[np.abs(table).argmin()] = 0  # a dropped band stays dropped
     entries = table[indices].reshape(entries.shape)
     found = entries[labels].reshape(len(rest), -1, 3)
     base, errors = seen.refitted(found)
@@ -252,4 +275,12 @@ def rows_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 def as_gaussians(rows: Rows) -> Gaussians:
     """Return rows as Gaussians."""
-    return make_gaussians(**{k: jnp.asarray(v) for k, v in rows.items()})
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh")
+    means, quats, log_scales, logit_opacities, sh = (rows[name] for name in names)
+    return make_gaussians(
+        means=means,
+        quats=quats,
+        log_scales=log_scales,
+        logit_opacities=logit_opacities,
+        sh=sh,
+    )
