@@ -197,7 +197,8 @@ def test_imports_are_declared():
     # JAX's optional one.
     brought = {"IPython", "rich", "zstandard"}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    lines = [*project["dependencies"], *project["optional-dependencies"]["viewer"]]
+    extras = project["optional-dependencies"]
+    lines = [*project["dependencies"], *extras["viewer"], *extras["movies"]]
     declared = {re.split("[^A-Za-z0-9_-]", line)[0] for line in lines}
     found = {str(node.module).split(".")[0] for _, node in nodes(ast.ImportFrom)}
     for _, node in nodes(ast.Import):
