@@ -64,7 +64,9 @@ def turned(wxyz) -> np.ndarray:
 
 def test_without_viser_the_error_names_the_package(ply, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    for args in (["view", str(ply)], ["train", "x", "-o", str(tmp_path), "--viewer"]):
+    page = ["export", str(ply), str(tmp_path / "a.html")]
+    training = ["train", "x", "-o", str(tmp_path), "--viewer"]
+    for args in (["view", str(ply)], page, training):
         assert main(args) == 6
         out, err = capsys.readouterr()
         assert out == ""
@@ -98,6 +100,27 @@ def test_a_page_holds_the_scene_and_loads_nothing(ply, tmp_path, capsys):
     args = ["--overwrite", "--min-opacity", "0.999"]
     assert main(["view", str(ply), "--html", str(out), *args]) == 3
     assert "lower --min-opacity" in capsys.readouterr().err
+
+
+def test_export_writes_the_page_of_view(ply, tmp_path, capsys):
+    pages, said = [tmp_path / "a.html", tmp_path / "b.HTM"], []
+    for words in (["view", ply, "--html", pages[0]], ["export", ply, pages[1]]):
+        assert main([*map(str, words), "--min-opacity", "0.2"]) == 0
+        out, err = capsys.readouterr()
+        said.append((out.split("  ")[1], err))
+    assert said[0] == said[1]
+    assert "Gaussians left out: opacity below 0.2" in said[0][1]
+    assert pages[0].read_text() == pages[1].read_text()
+    again = ["export", str(ply), str(pages[1])]
+    for more, code, message in (
+        ([], 3, "b.HTM: exists; pass --overwrite"),
+        (["--overwrite", "--sh-degree", "1"], 2, "a page has one colour"),
+        (["--overwrite", "--min-opacity", "0.999"], 3, "lower --min-opacity"),
+    ):
+        assert main([*again, *more]) == code
+        assert message in capsys.readouterr().err
+        assert pages[0].read_text() == pages[1].read_text()
+    assert main([*again, "--overwrite", "--sh-degree", "0"]) == 0
 
 
 def test_a_page_of_a_run_holds_its_cameras_and_photographs(tmp_path, capsys):
