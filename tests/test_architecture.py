@@ -194,8 +194,8 @@ def test_imports_are_declared():
     """Dependencies of dependencies do not count."""
     packages = {"cv2": "opencv-contrib-python-headless"}
     # Each comes with a dependency, and is used together with that alone; `zstandard` is
-    # JAX's optional one.
-    brought = {"IPython", "rich", "zstandard"}
+    # JAX's optional one, and viser's, as are `rich` and `msgspec`.
+    brought = {"IPython", "msgspec", "rich", "zstandard"}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
     lines = [*project["dependencies"], *extras["viewer"], *extras["movies"]]

@@ -10,7 +10,12 @@ _THUMBNAIL = 160  # px, longest side of a photograph in a page
 
 
 def write_scene_page(
-    shown, path: Path, *, title: str, with_photos: bool = True
+    shown,
+    path: Path,
+    *,
+    title: str,
+    with_photos: bool = True,
+    parts: int | None = None,
 ) -> None:
     """Write a page, print its name and size, and report what it leaves out.
 
@@ -19,9 +24,10 @@ def write_scene_page(
       path: of the page, replaced if it exists.
       title: of the page.
       with_photos: show the cameras with small photographs.
+      parts: as `gsjax.viewer.page.write_page`.
 
     Raises:
-      MissingExtraError: if viser is absent.
+      MissingExtraError: as `write_page`.
       InputError: as `gsjax.viewer.page.write_page`.
     """
     from gsjax.viewer.opening import frusta_with_photos
@@ -31,7 +37,7 @@ def write_scene_page(
     content = shown.content
     if with_photos and shown.views:
         content.frusta = frusta_with_photos(shown.views, _THUMBNAIL)
-    page = write_page(content, path, title=title)
+    page = write_page(content, path, title=title, parts=parts)
     missing = 0 if page.triangles else page.found - page.drawn
     if missing and content.max_gaussians is None:
         least = max(content.min_opacity, MIN_DRAWN_OPACITY)

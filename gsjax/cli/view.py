@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.cli.common import HeavyCommand, check_output, start_jax
+from gsjax.cli.common import HeavyCommand, UsageError, check_output, start_jax
 from gsjax.cli.options import integer, real
 from gsjax.cli.page import PAGE_SUFFIXES, write_scene_page
 from gsjax.runtime.console import note, say
@@ -31,6 +31,12 @@ class ViewCommand(HeavyCommand):
     max_gaussians: Annotated[int | None, integer(1)] = None
     """Maximum number of Gaussians in the browser; the largest and most opaque are
     kept."""
+    ordered: bool = False
+    """The file lists Gaussians by importance, which decides what is kept and what
+    appears first; default: opacity times area decides."""
+    parts: Annotated[int | None, integer(1, 8)] = None
+    """Number of parts in which the Gaussians of a page appear while it loads, the most
+    important first; default: two from 100,000 Gaussians on."""
     no_photos: bool = False
     """Show the cameras of a run without their photographs."""
     up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
@@ -50,6 +56,8 @@ class ViewCommand(HeavyCommand):
 
         require_viser()
         check_output("--html", self.html, self.overwrite, *PAGE_SUFFIXES)
+        if self.parts is not None and self.html is None:
+            raise UsageError("--parts goes with --html")
         start_jax()
         from gsjax.runs.scene_source import RASTER_PRESETS
         from gsjax.viewer.opening import load_content
@@ -62,11 +70,17 @@ class ViewCommand(HeavyCommand):
             max_gaussians=self.max_gaussians,
             with_mesh=self.mesh,
         )
+        shown.content.ordered = self.ordered
         with_photos = not self.no_photos
         if self.html is None:
             return self._serve(shown.content, shown.views if with_photos else ())
-        title = self.scene.stem
-        write_scene_page(shown, self.html, title=title, with_photos=with_photos)
+        write_scene_page(
+            shown,
+            self.html,
+            title=self.scene.stem,
+            with_photos=with_photos,
+            parts=self.parts,
+        )
         return 0
 
     def _serve(self, content, views) -> int:

@@ -1,6 +1,8 @@
 """HTML pages of `gsjax view --html`, and the arguments of the command."""
 
 import base64
+import gzip
+import json
 import re
 import struct
 import sys
@@ -50,6 +52,30 @@ def decode(text: str) -> tuple[list[dict], np.ndarray]:
     (size,) = content["binaryBufferLengths"]
     packed = np.frombuffer(inner[len(inner) - size :], np.uint32).reshape(-1, 8)
     return messages, packed
+
+
+def later(text: str) -> list[list[dict]]:
+    """Messages of the parts that follow, with arrays as a browser decodes them."""
+    found = []
+    for call in re.findall(r"<script>gsjaxParts\.add\((.*?)\)</script>", text):
+        messages, data, _ = json.loads(f"[{call}]")
+        raw = gzip.decompress(base64.b64decode(data))
+
+        def revived(value, raw=raw):
+            if "array" not in value:
+                return value
+            kind = {"Uint32Array": np.uint32, "Uint8Array": np.uint8}[value["array"]]
+            return np.frombuffer(raw, kind, value["length"], value["offset"])
+
+        found.append(json.loads(messages, object_hook=revived))
+    return found
+
+
+def splats_of(props: dict, packed: np.ndarray) -> np.ndarray:
+    """Means in world units, and colours with opacities [M, 7]."""
+    means = packed[:, :3].copy().view(np.float32) * props["scale"]
+    rgba = packed[:, 7:].copy().view(np.uint8)
+    return np.concatenate([means, rgba], axis=1)
 
 
 def about(messages: list[dict], kind: str, name: str) -> dict:
@@ -121,6 +147,50 @@ def test_export_writes_the_page_of_view(ply, tmp_path, capsys):
         assert message in capsys.readouterr().err
         assert pages[0].read_text() == pages[1].read_text()
     assert main([*again, "--overwrite", "--sh-degree", "0"]) == 0
+
+
+@pytest.mark.parametrize("parts", [2, 3])
+def test_the_parts_of_a_page_are_the_whole(tmp_path, capsys, parts):
+    """The most important Gaussians come first, cameras and photographs last."""
+    run = run_at(tmp_path, TrainConfig())
+    gaussians = training.true_gaussians()
+    save_scene(run_files(run).splat, gaussians, training.dataset(), TrainConfig())
+    texts = []
+    for count in (1, parts):
+        out = tmp_path / f"{count}.html"
+        words = ["view", run, "--html", out, "--parts", count]
+        assert main(list(map(str, words))) == 0
+        texts.append(out.read_text())
+    whole, packed = decode(texts[0])
+    first, some = decode(texts[1])
+    added = later(texts[1])
+    assert len(added) == parts - 1
+    assert later(texts[0]) == []
+    shares = [some.shape[0]]
+    expected = splats_of(
+        about(whole, "GaussianSplatsMessage", "/splats")["props"], packed
+    )
+    found = [splats_of(about(first, "GaussianSplatsMessage", "/splats")["props"], some)]
+    for index, messages in enumerate(added, start=2):
+        name = f"/splats-{index}"
+        props = about(messages, "GaussianSplatsMessage", name)["props"]
+        found.append(splats_of(props, props["buffer"].reshape(-1, 8)))
+        shares.append(len(found[-1]))
+    rows = [each[np.lexsort(each.T)] for each in (np.concatenate(found), expected)]
+    np.testing.assert_allclose(*rows, rtol=1e-6)
+    assert shares[0] == round(0.1 * len(expected))
+    assert sorted(shares) == shares
+    names = [m["name"] for m in first if "CameraFrustum" in m["type"]]
+    assert names == []
+    for index in range(training.VIEWS):
+        name = f"/cameras/{index:04d}"
+        photos = [
+            about(messages, "CameraFrustumMessage", name)["props"]["_image_data"]
+            for messages in (whole, added[-1])
+        ]
+        assert bytes(photos[0]) == bytes(photos[1])
+    assert main(["view", str(run), "--parts", "2"]) == 2
+    assert "--parts goes with --html" in capsys.readouterr().err
 
 
 def test_a_page_of_a_run_holds_its_cameras_and_photographs(tmp_path, capsys):
