@@ -69,6 +69,7 @@ if typing.TYPE_CHECKING:  # the same names as in `_PUBLIC`
     from gsjax.train.state import save_state as save_state
     from gsjax.train.step import make_train_step as make_train_step
     from gsjax.viewer import notebook as notebook
+    from gsjax.viewer.notebook import save_movie as save_movie
     from gsjax.viewer.notebook import save_png as save_png
 
 _PUBLIC = {
@@ -102,7 +103,7 @@ _PUBLIC = {
     "train.state": "init_state load_state save_state",
     "train.step": "make_train_step",
     "viewer": "notebook",
-    "viewer.notebook": "save_png",
+    "viewer.notebook": "save_movie save_png",
 }
 _MODULES = {name: module for module, names in _PUBLIC.items() for name in names.split()}
 __all__ = list(_MODULES)  # pyright: ignore[reportUnsupportedDunderAll]

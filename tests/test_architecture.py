@@ -196,10 +196,11 @@ def test_imports_are_declared():
     """Dependencies of dependencies do not count."""
     packages = {"cv2": "opencv-contrib-python-headless"}
     # Each comes with a dependency, and is used together with that alone; `zstandard` is
-    # JAX's optional one.
-    brought = {"IPython", "rich", "zstandard"}
+    # JAX's optional one, and viser's, as are `rich` and `msgspec`.
+    brought = {"IPython", "msgspec", "rich", "zstandard"}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    lines = [*project["dependencies"], *project["optional-dependencies"]["viewer"]]
+    extras = project["optional-dependencies"]
+    lines = [*project["dependencies"], *extras["viewer"], *extras["movies"]]
     declared = {re.split("[^A-Za-z0-9_-]", line)[0] for line in lines}
     found = {str(node.module).split(".")[0] for _, node in nodes(ast.ImportFrom)}
     for _, node in nodes(ast.Import):
