@@ -22,7 +22,7 @@ from gsjax.math.clustering import codebook, kmeans
 from gsjax.math.sh import degree_of
 
 _UNIT, _MAX_UNITS = 1024, 64  # a palette has a power of two of units
-_ITERATIONS = 4
+_BINS = 1024
 _THIN = 7.0  # by which the log of a third scale is less, where surfels have none
 
 
@@ -95,8 +95,19 @@ def _stored_scales(log_scales: np.ndarray, mode: str | None) -> np.ndarray:
 
 def _indexed(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a codebook [256] float32, and indices uint8 in the shape of values."""
-    entries, indices = codebook(values, ENTRIES)
+    entries, indices = codebook(values, ENTRIES, weights=_rarity(values.ravel()))
     return entries, indices.reshape(values.shape).astype(np.uint8)
+
+
+def _rarity(values: np.ndarray) -> np.ndarray:
+    """Return weights [M] of numbers: 1 / √ of the number of those about as large.
+
+    With equal weights, rare values such as the largest scales have large errors.
+    """
+    low, extent = values.min(), np.ptp(values)
+    share = (values - low) / (extent or 1)
+    bins = np.minimum(share * _BINS, _BINS - 1).astype(int)
+    return 1 / np.sqrt(np.bincount(bins)[bins])
 
 
 def _decimals(values: np.ndarray) -> list[float]:
@@ -119,7 +130,7 @@ def _encode_harmonics(rest: np.ndarray, files: dict[str, bytes]) -> dict[str, An
     """Add the textures of coefficients [N, K - 1, 3], and return their metadata."""
     count, coefficients, _ = rest.shape
     found = kmeans(rest.reshape(count, -1), palette_size(count), iterations=_ITERATIONS)
-    order = _smooth_order(found.centroids)
+    order = _order_of_use(found.labels)
     palette, labels = found.centroids[order], np.argsort(order)[found.labels]
     # Values matter by the number of Gaussians that use them.
     uses = np.bincount(labels, minlength=len(palette)).astype(np.float64)
@@ -140,11 +151,10 @@ def _encode_harmonics(rest: np.ndarray, files: dict[str, bytes]) -> dict[str, An
     }
 
 
-def _smooth_order(palette: np.ndarray) -> np.ndarray:
-    """Return an order [C] in which neighbouring entries are alike.
+def _order_of_use(labels: np.ndarray) -> np.ndarray:
+    """Return the order [C] in which labels [N] first occur.
 
-    Along the first principal component; similar neighbours compress better.
+    Labels then often grow by 1, which compresses better than an order by values.
     """
-    centred = (palette - palette.mean(axis=0)).astype(np.float64)
-    _, axes = np.linalg.eigh(centred.T @ centred)
-    return np.argsort(centred @ axes[:, -1], kind="stable")
+    _, first = np.unique(labels, return_index=True)
+    return np.argsort(first)
