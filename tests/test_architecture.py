@@ -177,6 +177,7 @@ def test_the_rasteriser_has_few_doors():
     doors = {"render", "exact", "types", "reference", "memory_estimate"}
     doors |= {"argument_checks", "tile_render"}  # messages; `device_count`
     doors |= {"sampling"}  # places between pixels, for `gsjax bench`
+    doors |= {"contribution"}  # importance of Gaussians, for compression
     inside = ("gsjax.raster", "gsjax.stress")  # the latter examines every stage
     used = {b for a, b in imports() if not a.startswith(inside)}
     used = {name for name in used if name.startswith("gsjax.raster.")}

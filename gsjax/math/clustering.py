@@ -210,6 +210,46 @@ def _nearest(points: Array, centroids: Array) -> tuple[Array, Array]:
     return labels.reshape(-1), errors.reshape(-1)
 
 
+def nearest_by_cost(
+    points: np.ndarray, centroids: np.ndarray, weights: np.ndarray, costs: np.ndarray
+) -> np.ndarray:
+    """Return the labels [N] that minimise weight · squared distance + cost.
+
+    Args:
+      points: [N, D].
+      centroids: [C, D].
+      weights: [N] of each point.
+      costs: [C] of each centroid.
+    """
+    rows, slots = _bucket(len(points)), _bucket(len(centroids))
+    padded = np.zeros((rows, points.shape[1]), np.float32)
+    padded[: len(points)] = points
+    weight = np.zeros(rows, np.float32)
+    # Only the ratio to the costs counts; weights of about 1 keep all digits.
+    unit = float(np.max(weights, initial=0)) or 1.0
+    weight[: len(points)] = weights / unit
+    table = np.zeros((slots, points.shape[1]), np.float32)
+    table[: len(centroids)] = centroids
+    cost = np.full(slots, np.inf, np.float32)
+    cost[: len(costs)] = costs / unit
+    return np.asarray(_least_cost(padded, table, weight, cost))[: len(points)]
+
+
+@jax.jit
+def _least_cost(points: Array, centroids: Array, weights: Array, costs: Array) -> Array:
+    norms = jnp.sum(jnp.square(centroids), 1)
+
+    def of_chunk(inputs):
+        chunk, weight = inputs
+        product = jnp.matmul(chunk, centroids.T, precision="highest")
+        scores = weight[:, None] * (norms - 2 * product) + costs
+        return jnp.argmin(scores, 1).astype(jnp.int32)
+
+    size = min(_CHUNK, len(points))
+    chunks = points.reshape(-1, size, points.shape[1]), weights.reshape(-1, size)
+    return lax.map(of_chunk, chunks).reshape(-1)
+
+
 def codebook(
     values: np.ndarray, count: int, *, weights: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:

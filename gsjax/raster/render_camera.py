@@ -28,6 +28,7 @@ from gsjax.raster.types import (
     Demand,
     Inputs,
     Primitive,
+    Projection,
     RasterConfig,
     Splat,
 )
@@ -44,6 +45,33 @@ def render_camera(
       config: static settings.
     """
     gaussians, camera = inputs.gaussians, inputs.camera
+    out, order, visible, wraps = project_camera(inputs, config)
+    radii = jnp.zeros(gaussians.capacity, out.splat.u.dtype)
+    seen = binning.radii(lax.stop_gradient(out.footprint), *camera.visible)
+    size = camera.width, camera.height
+    sums, demand, overflowed = render_tiles(out, size, config, inputs.mask)
+    most = copies(camera.lens) * gaussians.capacity
+    room = min(config.visible_capacity or most, most)
+    radii = radii.at[order]
+    return (
+        sums,
+        (radii.max if wraps else radii.set)(seen, mode="drop"),
+        demand._replace(visible=visible),
+        overflowed | (visible > room),
+    )
+
+
+def project_camera(
+    inputs: Inputs, config: RasterConfig
+) -> tuple[Projection, Array, Array, bool]:
+    """Project what may be visible to a single camera.
+
+    Returns:
+      The projection, front to back; its slots [R], N where there is none; the number []
+      of visible ones; and whether a slot may occur more than once, as in an image that
+      wraps around.
+    """
+    gaussians = inputs.gaussians
     primitive = config.primitive or ELLIPSOID
     # The names that a profile shows.
     with jax.named_scope("order"):
@@ -60,19 +88,7 @@ def render_camera(
                 footprint=out.footprint._replace(u=out.footprint.u + offset),
                 splat=out.splat._replace(u=out.splat.u + offset),
             )
-    radii = jnp.zeros(gaussians.capacity, out.splat.u.dtype)
-    seen = binning.radii(lax.stop_gradient(out.footprint), *camera.visible)
-    size = camera.width, camera.height
-    sums, demand, overflowed = render_tiles(out, size, config, inputs.mask)
-    most = copies(camera.lens) * gaussians.capacity
-    room = min(config.visible_capacity or most, most)
-    radii = radii.at[order]
-    return (
-        sums,
-        (radii.set if offset is None else radii.max)(seen, mode="drop"),
-        demand._replace(visible=visible),
-        overflowed | (visible > room),
-    )
+    return out, order, visible, offset is not None
 
 
 _TURNS = (0, -1, 1)

@@ -1,0 +1,161 @@
+"""The numbers that a file format can store, and rounding to every 2ᵏth of them.
+
+A number is stored as a whole code, ``forward(value)`` rounded. Where an error is
+tolerated, a multiple of 2ᵏ is stored instead, which takes k bits less after entropy
+coding. Formats without entropy coding have no lattice: there nothing is gained.
+
+Axis legend: N Gaussians.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import expit, logit
+
+Rows = Mapping[str, np.ndarray]
+
+_MOST_BITS = 12  # left out of a number
+_FINEST = 1 / 64  # steps of log scales and of colours in SOG, whose tables are free
+_TABLE = 256  # entries of a table of SOG
+_QUARTER = 0.25 / 255  # opacities of the bytes 0 and 255 are this far within
+
+
+class Axis(NamedTuple):
+    """Codes of one kind of number.
+
+    Attributes:
+      forward: values → codes, before rounding.
+      inverse: codes → values.
+      low, high: least and greatest code.
+      most: number of distinct values that the file can hold; 0 for no limit.
+    """
+
+    forward: Callable[[np.ndarray], np.ndarray]
+    inverse: Callable[[np.ndarray], np.ndarray]
+    low: float = -np.inf
+    high: float = np.inf
+    most: int = 0
+
+
+class Lattice(NamedTuple):
+    """The axes of a format.
+
+    Attributes:
+      means, log_scales, logit_opacities, colors: axes; colours are those of SH degree 0.
+      quats: axis of the three smaller components of a unit quaternion.
+      has_palette: whether harmonics above degree 0 are an entry of a palette.
+    """
+
+    means: Axis
+    log_scales: Axis
+    logit_opacities: Axis
+    colors: Axis
+    quats: Axis
+    has_palette: bool
+
+
+def lattice_of(suffix: str, rows: Rows) -> Lattice | None:
+    """Return the lattice of a format for these Gaussians, or None if it has none."""
+    if suffix == ".sog":
+        return _of_sog(rows)
+    return _of_spz(rows) if suffix == ".spz" else None
+
+
+def _of_sog(rows: Rows) -> Lattice:
+    means = np.asarray(rows["means"], np.float64)
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    low, high = (f(logs, axis=0, initial=None) for f in (np.min, np.max))
+    span = np.where(high > low, high - low, 1.0)
+
+    def forward(values):
+        logs = np.sign(values) * np.log1p(np.abs(values))
+        return (logs - low) / span * 65535
+
+    def inverse(codes):
+        logs = low + codes / 65535 * span
+        return np.sign(logs) * np.expm1(np.abs(logs))
+
+    return Lattice(
+        means=Axis(forward, inverse, 0, 65535),
+        log_scales=_uniform(_FINEST)._replace(most=_TABLE),
+        logit_opacities=_OPACITY,
+        colors=_uniform(_FINEST)._replace(most=_TABLE),
+        quats=Axis(
+            lambda v: (v * np.sqrt(2) + 1) * 127.5,
+            lambda c: (c / 127.5 - 1) / np.sqrt(2),
+            0,
+            255,
+        ),
+        has_palette=True,
+    )
+
+
+def _of_spz(rows: Rows) -> Lattice:
+    largest = float(np.abs(rows["means"]).max(initial=0))
+    bits = np.floor(np.log2((2**23 - 1) / largest)) if largest else 20
+    return Lattice(
+        means=_uniform(2.0 ** -min(bits, 20)),
+        log_scales=Axis(lambda v: 16 * (v + 10), lambda c: c / 16 - 10, 0, 255),
+        logit_opacities=_OPACITY,
+        colors=Axis(
+            lambda v: 255 * (0.5 + 0.15 * v), lambda c: (c / 255 - 0.5) / 0.15, 0, 255
+        ),
+        quats=_uniform(np.sqrt(0.5) / 511),
+        has_palette=True,
+    )
+
+
+def _uniform(step: float) -> Axis:
+    return Axis(lambda v: v / step, lambda c: c * step)
+
+
+def _opacity_of(codes: np.ndarray) -> np.ndarray:
+    return logit(np.clip(codes / 255, _QUARTER, 1 - _QUARTER))
+
+
+_OPACITY = Axis(lambda v: 255 * expit(v), _opacity_of, 0, 255)
+
+
+class Rounded(NamedTuple):
+    """Rounded values, and the squared error that they add: Σ curvature · change²."""
+
+    values: np.ndarray
+    error: float
+
+
+def round_to(
+    axis: Axis, values: np.ndarray, curvature: np.ndarray, allowed: float
+) -> Rounded:
+    """Round each value as coarsely as its error allows.
+
+    Args:
+      axis: the codes.
+      values: [...] numbers.
+      curvature: [...] error per squared change of each.
+      allowed: mean error of a number; rounding to steps Δ adds curvature · Δ² / 12.
+    """
+    values = np.asarray(values, np.float64)
+    codes = np.clip(axis.forward(values), axis.low, axis.high)
+    left_out = _bits_left_out(axis, codes, curvature, allowed)
+    coarser = 0.0
+    while True:
+        unit = np.exp2(np.maximum(left_out, np.floor(coarser)))
+        found = np.clip(np.rint(codes / unit) * unit, axis.low, axis.high)
+        if not axis.most or len(np.unique(found)) <= axis.most:
+            break
+        coarser += 1
+    rounded = axis.inverse(found)
+    return Rounded(rounded, float(np.sum(curvature * np.square(rounded - values))))
+
+
+def _bits_left_out(
+    axis: Axis, codes: np.ndarray, curvature: np.ndarray, allowed: float
+) -> np.ndarray:
+    """Return k of the largest step 2ᵏ whose error is about ``allowed``."""
+    inner = np.clip(codes, axis.low + 0.5, axis.high - 0.5)
+    step = np.abs(axis.inverse(inner + 0.5) - axis.inverse(inner - 0.5))
+    error = curvature * np.square(step) / 12
+    with np.errstate(divide="ignore"):
+        bits = np.round(np.log2(allowed / np.maximum(error, 1e-300)) / 2)
+    return np.clip(bits, 0, _MOST_BITS)
