@@ -129,9 +129,11 @@ def palette_size(count: int) -> int:
 def _encode_harmonics(rest: np.ndarray, files: dict[str, bytes]) -> dict[str, Any]:
     """Add the textures of coefficients [N, K - 1, 3], and return their metadata."""
     count, coefficients, _ = rest.shape
-    found = kmeans(rest.reshape(count, -1), palette_size(count), iterations=_ITERATIONS)
+    found = kmeans(rest.reshape(count, -1), palette_size(count))
     order = _order_of_use(found.labels)
-    palette, labels = found.centroids[order], np.argsort(order)[found.labels]
+    palette, places = found.centroids[order], np.zeros(len(found.centroids), int)
+    places[order] = np.arange(len(order))
+    labels = places[found.labels]
     # Values matter by the number of Gaussians that use them.
     uses = np.bincount(labels, minlength=len(palette)).astype(np.float64)
     weights = np.repeat(uses, palette.shape[1])
@@ -152,9 +154,10 @@ def _encode_harmonics(rest: np.ndarray, files: dict[str, bytes]) -> dict[str, An
 
 
 def _order_of_use(labels: np.ndarray) -> np.ndarray:
-    """Return the order [C] in which labels [N] first occur.
+    """Return the distinct labels of [N], in the order in which they first occur.
 
-    Labels then often grow by 1, which compresses better than an order by values.
+    Neighbouring labels then often differ by 1, which compresses better than an order by
+    the values of the entries.
     """
-    _, first = np.unique(labels, return_index=True)
-    return np.argsort(first)
+    used, first = np.unique(labels, return_index=True)
+    return used[np.argsort(first)]
