@@ -30,6 +30,7 @@ class ExportCommand(HeavyCommand):
 
     def run(self) -> int:
         start_jax()
+        from gsjax.io.formats import stored_bytes
         from gsjax.runs.export import export_scene
 
         written, found = export_scene(
@@ -40,6 +41,6 @@ class ExportCommand(HeavyCommand):
             overwrite=self.overwrite,
         )
         of_all = f" of {found:,}" if written < found else ""
-        size = self.out.stat().st_size / 2**20
+        size = stored_bytes(self.out) / 2**20
         say(f"{self.out}  {written:,}{of_all} Gaussians, {size:.2f} MiB")
         return 0

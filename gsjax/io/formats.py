@@ -8,7 +8,7 @@ from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, check_gaussians
 from gsjax.io import gltf, ply, sog, splat, spz
 from gsjax.io.common import ANY_MODE, Format, warn
-from gsjax.io.sog_files import scene_path
+from gsjax.io.sog_files import META, scene_path
 
 # A new format is one module and one entry here.
 FORMATS = (ply.FORMAT, splat.FORMAT, spz.FORMAT, sog.FORMAT, gltf.FORMAT)
@@ -87,6 +87,16 @@ def render_mode(
     """
     path, form = _chosen(path, formats, "load")
     return None if form.mode is None else form.mode(path)
+
+
+def stored_bytes(path: Path) -> int:
+    """Return the size of a scene on the disk, in bytes: of all files of a SOG.
+
+    Raises:
+      InputError: if the meta.json of a SOG cannot be read.
+    """
+    path = scene_path(path)
+    return sog.scene_bytes(path) if path.name == META else path.stat().st_size
 
 
 def _chosen(path, formats: Sequence[Format], action: str) -> tuple[Path, Format]:

@@ -56,6 +56,16 @@ def render_mode(path: str | PathLike[str]) -> str | None:
         return read_meta(files).mode
 
 
+def scene_bytes(path: Path) -> int:
+    """Return the size of a SOG scene on the disk, in bytes, with its textures.
+
+    Raises:
+      InputError: as `read_sog`, from meta.json and the sizes of the files.
+    """
+    with opened_scene(path) as files:
+        return files.size([META, *read_meta(files).names()])
+
+
 def write_sog(
     path: str | PathLike[str],
     gaussians: Gaussians,
