@@ -10,7 +10,7 @@ from gsjax.io import ply, splat, spz
 from gsjax.io.common import ANY_MODE, Format, warn
 
 # A new format is one module and one entry here.
-FORMATS = (ply.FORMAT, splat.FORMAT, spz.FORMAT)
+FORMATS = (ply.FORMAT, ply.PACKED_FORMAT, splat.FORMAT, spz.FORMAT)
 DEFAULT_MODE = "default"  # of ordinary ellipsoids, as some programs record it
 
 
@@ -86,6 +86,11 @@ def render_mode(
     """
     path, form = _chosen(path, formats, "load")
     return None if form.mode is None else form.mode(path)
+
+
+def keeps_every_bit(path: Path) -> bool:
+    """Return True for a plain PLY, which stores any value; other formats round."""
+    return _chosen(path, FORMATS, "save")[1] is ply.FORMAT
 
 
 def _chosen(path, formats: Sequence[Format], action: str) -> tuple[Path, Format]:
