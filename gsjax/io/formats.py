@@ -6,11 +6,11 @@ from pathlib import Path
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, check_gaussians
-from gsjax.io import ply, splat, spz
+from gsjax.io import ksplat, ply, splat, spz
 from gsjax.io.common import ANY_MODE, Format, warn
 
 # A new format is one module and one entry here.
-FORMATS = (ply.FORMAT, ply.PACKED_FORMAT, splat.FORMAT, spz.FORMAT)
+FORMATS = (ply.FORMAT, ply.PACKED_FORMAT, splat.FORMAT, spz.FORMAT, ksplat.FORMAT)
 DEFAULT_MODE = "default"  # of ordinary ellipsoids, as some programs record it
 
 
