@@ -9,11 +9,9 @@ splat-transform 3.7, store our axes and do not say so.
 
 import math
 from collections.abc import Iterator
-from functools import cache
 from os import PathLike
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import InputError
@@ -28,7 +26,7 @@ from gsjax.io.packed_quats import (
     unpack_quats,
 )
 from gsjax.io.ply_rows import CHUNK_ROWS
-from gsjax.math.sh import num_bases, sh_basis
+from gsjax.math.sh import num_bases
 from gsjax.runtime.files import replacing
 from gsjax.runtime.memory import Estimate, require
 
@@ -40,6 +38,10 @@ _BITS = (6, 5)  # kept of harmonics of degree 1, and above; zero bits compress w
 _LEVELS = 1022  # of a component of a quaternion: a sign and 9 bits
 # Signs of x, y and z by the name of the axes: right up back, right down forward.
 _AXES = {"rub": (1, -1, -1), "rdf": (1, 1, 1)}
+# Axes in which each basis function of `gsjax.math.sh.sh_basis` is odd.
+_ODD = ("", "y", "z", "x", "xy", "yz", "", "xz", "")
+_ODD += ("y", "xyz", "y", "z", "x", "z", "x")
+_ODD += ("xy", "yz", "xy", "yz", "", "xz", "", "xz", "")
 _AXES_RECORD = 0xADBE0003  # extension whose payload is one of these numbers
 _AXES_NUMBERS = {4: "rub", 6: "rdf"}
 _CAMERA_RECORD = 0xADBE0002  # limits of an orbit camera; does not concern Gaussians
@@ -159,15 +161,11 @@ def _packed(wxyz: np.ndarray) -> np.ndarray:
     return join_words(PackedQuats(dropped, words)).astype("<u4")
 
 
-@cache
 def _signs(degree: int, axes: tuple[int, int, int]) -> np.ndarray:
     """Return the factor [K] of each basis function in axes with other signs."""
-    direction = np.array([0.48, 0.6, 0.64])  # where no basis function is zero
-    ours, theirs = (
-        np.asarray(sh_basis(degree, *jnp.asarray(d)))
-        for d in (direction, direction * axes)
-    )
-    return np.sign(ours * theirs).astype(np.float32)
+    sign = dict(zip("xyz", axes))
+    factors = (math.prod(sign[axis] for axis in odd) for odd in _ODD)
+    return np.fromiter(factors, np.float32)[: num_bases(degree)]
 
 
 def write_spz(
