@@ -139,10 +139,11 @@ def check_rows(path: Path, fields: Mapping[str, np.ndarray]) -> None:
     """
     found = {}
     for name, fault in _FAULTS.items():
-        values = fields[name].reshape(len(fields[name]), -1)
-        found[fault] = ~np.isfinite(values).all(axis=1)
+        values = fields[name]
+        axes = tuple(range(1, values.ndim))
+        found[fault] = ~np.isfinite(values).all(axis=axes)
         if name == "quats":
-            found[fault] |= ~values.any(axis=1)
+            found[fault] |= ~values.any(axis=axes)
     rows = np.logical_or.reduce([*found.values()])
     if rows.any():
         first = int(rows.argmax())
