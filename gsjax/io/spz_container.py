@@ -36,7 +36,7 @@ _ENTRY, _RECORD = Struct("<QQ"), Struct("<II")
 _MAX_RATIO = 1032  # of any deflated data
 # Zstandard has no such limit; this one is that of Niantic's reader.
 _MAX_ROWS_PER_BYTE = 1024 / 9
-_MAX_TAIL = 1 << 20  # bytes after the Gaussians of a gzip stream
+_MAX_TAIL = 1 << 18  # bytes after the Gaussians of a gzip stream
 _MIN_WINDOW, _MAX_WINDOW = 1 << 25, 1 << 30  # bytes of a frame kept for references
 _GZIP_LEVEL, _ZSTD_LEVEL = 6, 12
 
