@@ -194,9 +194,8 @@ def test_importing_is_light():
 def test_imports_are_declared():
     """Dependencies of dependencies do not count."""
     packages = {"cv2": "opencv-contrib-python-headless"}
-    # Each comes with a dependency, and is used together with that alone; `zstandard` is
-    # JAX's optional one.
-    brought = {"IPython", "rich", "zstandard"}
+    # Each comes with a dependency, and is used together with that alone.
+    brought = {"IPython", "rich"}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     lines = [*project["dependencies"], *project["optional-dependencies"]["viewer"]]
     declared = {re.split("[^A-Za-z0-9_-]", line)[0] for line in lines}

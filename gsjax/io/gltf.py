@@ -37,8 +37,6 @@ _ATTRIBUTES: dict[str, tuple[str, dict[int, str]]] = {
     "SH_DEGREE_0_COEF_0": ("VEC3", {FLOAT: ""}),
 }
 _HARMONIC = re.compile(rf"{EXTENSION}:SH_DEGREE_(\d+)_COEF_(\d+)")
-# A scale of 0 becomes this part of the greatest of its Gaussian, and at least _TINY.
-_THIN, _TINY = 1e-6, 1e-30
 _FLAT = 1e-9  # ratio of the scales of a node below which it has no thickness
 _ROUNDING = 1e-6  # of opacities
 _MAX_OPACITY = 1 - 2.0**-25  # rounds to 1
@@ -233,8 +231,7 @@ def _log_scales(gltf: Gltf, where: str, scales: np.ndarray) -> np.ndarray:
         got = f"{negative.sum():,} of {len(negative):,} below; earlier drafts of the "
         got += "extension stored logarithms"
         raise gltf.fault(f"{where}: SCALE", "scales of at least 0", got)
-    least = np.maximum(_THIN * scales.max(axis=1, keepdims=True, initial=0), _TINY)
-    return np.log(np.where(scales > 0, scales, least))
+    return common.scale_logs(scales)
 
 
 def _logits(gltf: Gltf, where: str, opacities: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from zipfile import ZIP_DEFLATED, ZIP_LZMA
 
 import numpy as np
+import zstandard
 from good_files import COLMAP_TEXT, META, POSES, STEP, entries, npy
 
 # A change of the bytes of a good file, and a regular expression of the error.
@@ -35,6 +36,39 @@ def put(at: int, form: str, *values):
 def unpacked(change: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
     """Change the content of a gzip file."""
     return lambda data: gzip.compress(change(gzip.decompress(data)))
+
+
+def insert(at: int, more: bytes):
+    """Insert bytes."""
+    return lambda data: data[:at] + more + data[at:]
+
+
+def chained(*changes: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """Apply changes one after another."""
+
+    def change(data: bytes) -> bytes:
+        for one in changes:
+            data = one(data)
+        return data
+
+    return change
+
+
+def extended(record: bytes) -> Callable[[bytes], bytes]:
+    """Add an extension record to SPZ of version 4."""
+    place = put(14, "BBI", 2, 5, 32 + len(record))
+    return chained(place, insert(32, record))
+
+
+def first_frame(content: bytes, **options) -> Callable[[bytes], bytes]:
+    """Replace the means of SPZ of version 4 of degree 0; its table stays true."""
+    frame = zstandard.ZstdCompressor(**options).compress(content)
+
+    def change(data: bytes) -> bytes:
+        rest = data[112 + struct.unpack_from("<Q", data, 32)[0] :]
+        return data[:32] + struct.pack("<Q", len(frame)) + data[40:112] + frame + rest
+
+    return change
 
 
 def just(data: bytes | str):
@@ -172,11 +206,11 @@ ROWS["ascii.ply"] = {
     ),
     "row endless": (lambda d: d[:-2] + b"1 " * 500_000, "vertex 3 .*got a line of"),
 }
-ROWS["scene.spz"] = {
+ROWS["older.spz"] = {
     "empty": (just(b""), "expected an SPZ header.*got b''"),
     "of something": (just(png(4, 4)), "not an SPZ file, or damaged .*gzip"),
     "magic": (unpacked(swap("NGSP", "PSGN")), "expected an SPZ header.*got b'PSGN"),
-    "of later": (gzip.decompress, "got 4 or later"),
+    "not packed": (gzip.decompress, "version 4, got 3"),
     "version": (unpacked(put(4, "I", 9)), "version 2 to 3, got 9"),
     "degree": (unpacked(put(12, "B", 7)), "degree 0 to 4, got 7"),
     "fraction": (unpacked(put(13, "B", 99)), "fraction 0 to 24, got 99"),
@@ -184,6 +218,88 @@ ROWS["scene.spz"] = {
     "count, a little": (unpacked(put(8, "I", 5)), "expected 20 bytes of quats, got 0"),
     "cut within": (unpacked(lambda d: d[:-5]), "bytes of quats, got"),
     "checksum": (lambda d: d[:-8] + bytes(4) + d[-4:], "damaged .*CRC"),
+    "long": (unpacked(lambda d: d + bytes(2**21)), "at most 262,144 bytes after"),
+    "extension": (
+        unpacked(chained(put(14, "B", 2), lambda d: d + bytes(7))),
+        "extension records, got one that is truncated after 7 bytes",
+    ),
+}
+AXES = struct.pack("<III", 0xADBE0003, 4, 3)
+ROWS["scene.spz"] = {
+    "empty": (just(b""), "expected an SPZ header of 16 bytes.*got b''"),
+    "magic": (swap("NGSP", "PSGN"), "not an SPZ file, or damaged"),
+    "version": (put(4, "I", 5), "version 4, got 5"),
+    "degree": (put(12, "B", 5), "degree 0 to 4, got 5"),
+    "count": (put(8, "I", 2**32 - 1), "4,294,967,295 Gaussians, which .* cannot hold"),
+    "count, a little": (put(8, "I", 5), "expected 45 bytes of means, got 36 in the"),
+    "blocks": (put(15, "B", 6), "expected a table of 5 blocks .*, got 6 at byte 32"),
+    "table before": (put(16, "I", 0), "got 5 at byte 0;"),
+    "table after": (put(16, "I", 2**31), "got 5 at byte 2,147,483,648"),
+    "size": (put(40, "Q", 2**40), "36 bytes of means, got 1,099,511,627,776 in the"),
+    "packed": (put(32, "Q", 2**40), "expected a file of 1,099,511,6"),
+    "long": (lambda d: d + b"x", "expected a file of .* after its table of contents"),
+    "frame": (put(112, "I", 0), "the block of means is damaged"),
+    "bomb": (first_frame(bytes(10**8)), "36 bytes of means, got 100,000,000"),
+    "bomb of unknown size": (
+        first_frame(bytes(10**8), write_content_size=False),
+        "the block of means is damaged",
+    ),
+    "frame, short": (
+        first_frame(bytes(35), write_content_size=False),
+        "36 bytes of means, got 35",
+    ),
+    "two frames": (
+        chained(first_frame(bytes(36)), put(32, "Q", 45), insert(112, b"x" * 27)),
+        "damaged",
+    ),
+    "extension": (extended(AXES[:-1]), "got one that is truncated after 11 bytes"),
+    "axes": (extended(AXES), r"axes of 4 \(rub\), 6 \(rdf\) .*, got 03000000"),
+    "axes empty": (extended(AXES[:4] + bytes(4)), "axes of .*, got no number"),
+}
+ROWS["scene.splat"] = {
+    "empty": (just(b""), "rows of 32 bytes, got 0 bytes"),
+    "long": (lambda d: d + b"x", "rows of 32 bytes, got 129 bytes"),
+    "mean": (put(32 + 4, "f", np.nan), "1 of 4 rows .* row 1 with a mean that is"),
+    "scale": (put(12, "f", -1e-9), "row 0 with a scale that is negative"),
+    "scale infinite": (put(16, "f", np.inf), "row 0 with a scale that is negative or"),
+    "quaternion": (put(124, "4B", *[128] * 4), "row 3 with a quaternion that is zero"),
+}
+ROWS["scene.compressed.ply"] = {
+    "text": (swap("binary_little_endian", "ascii"), "expected a binary body"),
+    "chunks": (swap("chunk 1", "chunk 2"), "expected 1 chunks for 4 Gaussians, got 2"),
+    "count": (swap("vertex 4", "vertex 4000000000"), "expected 15,625,000 chunks"),
+    "both": (
+        chained(swap("vertex 4", "vertex 1024000"), swap("chunk 1", "chunk 4000")),
+        "truncated: expected 16672000 bytes",
+    ),
+    "type": (swap("uint packed_scale", "int packed_scale"), "vertex packed_scale"),
+    "no bounds": (swap("min_x", "least_x"), "lacks the properties chunk min_x"),
+    "no element": (swap("chunk 1", "lump 1"), "lacks .*chunk min_x, chunk min_y"),
+    "list": (swap("float min_x", "list uchar int q"), "without lists"),
+    "harmonics": (
+        swap("end_header", "element sh 4\nproperty uchar f_rest_0\nend_header"),
+        r"4 rows of \[0, 9, 24, 45\] harmonics, got 4 of 1;",
+    ),
+    "not finite": (
+        lambda d: d[: -64 - 72] + NAN + d[-64 - 68 :],
+        "row [0-3] with a mean that is not finite",
+    ),
+}
+ROWS["scene.ksplat"] = {
+    "empty": (just(b""), "expected 4,096 bytes of the header, got 0"),
+    "version": (put(1, "B", 2), "version 0.1 and .*, got version 0.2 and level 1"),
+    "level": (put(20, "H", 3), "got version 0.1 and level 3"),
+    "sections": (put(4, "2I", 2**31, 2**31), "of 2,147,483,648"),
+    "no section": (put(8, "I", 0), "got 0 sections of 1"),
+    "count": (put(16, "I", 5), "sections of 5 Gaussians, at least 1, got 4"),
+    "incomplete": (put(4096, "I", 3), "all 4 Gaussians, got 3: .* incomplete"),
+    "both counts": (put(4096, "2I", 2**30, 2**30), "in section 0 .* bytes, got"),
+    "buckets": (put(4096 + 32, "I", 2), "expected in section 0 4 buckets"),
+    "bucket": (put(5120, "I", 5), "buckets that hold 4 Gaussians, got 8"),
+    "block": (put(4096 + 16, "f", np.nan), "finite size, got .* size nan"),
+    "degree": (put(4096 + 40, "H", 3), "SH degree 0 to 2, got 3"),
+    "storage": (put(4096 + 28, "I", 2**31), "bytes, got 2,147,483,648"),
+    "center": (put(5120 + 8, "f", np.inf), "with a mean that is not finite"),
 }
 ROWS["cloud.ply"] = {
     "without y": (swap("float y", "float why"), "expected scalar properties x, y, z"),
