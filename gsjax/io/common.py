@@ -196,8 +196,6 @@ def visible_rows(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
 def float32_means(path: Path, rows: dict[str, np.ndarray]) -> np.ndarray:
     """Return the means [N, 3] of rows to write, rounded to float32.
 
-    Warns if that moves Gaussians by much of their size.
-
     Raises:
       InputError: if a mean exceeds float32.
     """
@@ -208,7 +206,6 @@ def float32_means(path: Path, rows: dict[str, np.ndarray]) -> np.ndarray:
     if far.any():
         what = f"{far.sum():,} of {len(far):,} means exceed float32"
         raise InputError(f"{path}: {what}; {_NEARER}")
-    warn_of_moves(path, rounded, rows)
     return rounded
 
 

@@ -7,7 +7,7 @@ palette, K spherical-harmonic bases.
 
 import json
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,17 +26,30 @@ _BINS = 1024
 _THIN = 7.0  # by which the log of a third scale is less, where surfels have none
 
 
+class MeanCodes(NamedTuple):
+    """Means in whole numbers.
+
+    Attributes:
+      codes: [N, 3] int64 from 0 to 65535.
+      mins, maxs: [3] float64 bounds of sign(x) ln(1 + |x|).
+    """
+
+    codes: np.ndarray
+    mins: np.ndarray
+    maxs: np.ndarray
+
+
 def encode_scene(
-    rows: dict[str, np.ndarray], means: np.ndarray, mode: str | None
+    rows: dict[str, np.ndarray], means: MeanCodes, mode: str | None
 ) -> dict[str, bytes]:
     """Return the files by name, meta.json last.
 
     Args:
       rows: at least one Gaussian, see `gsjax.io.common.visible_rows`; SH degree 0 to 3.
-      means: [N, 3] float32, their means.
+      means: of `quantise_means`.
       mode: render mode: "mip", "2dgs" or None.
     """
-    codes, mins, maxs = quantise_means(means)
+    codes, mins, maxs = means
     # By the means as they are read, so that the order is kept when they are written.
     order = morton_order(dequantise_means(codes, mins, maxs))
     codes = codes[order]
@@ -65,20 +78,18 @@ def encode_scene(
     return files
 
 
-def quantise_means(means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def quantise_means(means: np.ndarray) -> MeanCodes:
     """Round means to 65536 steps of sign(x) ln(1 + |x|) along each axis.
 
     Args:
       means: [N, 3] float32, N at least 1.
-
-    Returns:
-      Codes [N, 3] int64, and the bounds [3] and [3] float64 of the logarithms.
     """
     wide = means.astype(np.float64)
     logs = np.copysign(np.log1p(np.abs(wide)), wide)
     mins, maxs = logs.min(axis=0), logs.max(axis=0)
     extent = np.where(maxs > mins, maxs - mins, 1)
-    return np.rint((logs - mins) / extent * WORD).astype(np.int64), mins, maxs
+    codes = np.rint((logs - mins) / extent * WORD).astype(np.int64)
+    return MeanCodes(codes, mins, maxs)
 
 
 def _stored_scales(log_scales: np.ndarray, mode: str | None) -> np.ndarray:
