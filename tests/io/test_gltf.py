@@ -90,7 +90,8 @@ def test_files_of_another_program_hold_their_source(name):
     found = gsjax.load(path)
     assert_equal(found, gsjax.load(path.with_suffix(".ply")))
     assert render_mode(path) is None
-    values = np.load(f"{path}.expected.npz")
+    with np.load(f"{path}.expected.npz") as arrays:
+        values = dict(arrays)
     rows = values["rows"] if "rows" in values else slice(None)
     params = {key: np.asarray(value)[rows] for key, value in vars(found.params).items()}
     np.testing.assert_array_equal(params["means"] @ TURN, values["means"])
