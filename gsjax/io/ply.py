@@ -54,7 +54,7 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
     Args:
       path: the file.
       drop_nonfinite: leave out Gaussians with NaN or infinite values, with a
-        warning, instead of raising.
+        warning, instead of raising; not in compressed files, whose bounds are shared.
 
     Returns:
       Gaussians with capacity max(N, 1), in the order of the file.

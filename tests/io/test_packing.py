@@ -64,7 +64,7 @@ def test_a_crowded_cell_is_sorted_within_its_own_box():
     for means in (np.ones((1000, 3)), np.zeros((0, 3)), np.ones((1, 3))):
         np.testing.assert_array_equal(morton_order(means), np.arange(len(means)))
     # Boxes within boxes, down to the smallest numbers: must end.
-    deep = np.repeat(2.0 ** -np.arange(0, 1074, 3.0), 300)[:, None] * np.ones(3)
+    deep = np.repeat(2.0 ** -np.arange(0, 1074, 12.0), 300)[:, None] * np.ones(3)
     assert sorted(morton_order(deep)) == list(range(len(deep)))
 
 
