@@ -50,6 +50,10 @@ READ: dict[str, Callable[[Path], object]] = {
     "older.spz": gsjax.load,
     "scene.splat": gsjax.load,
     "scene.ksplat": gsjax.load,
+    "scene.sog": gsjax.load,
+    "sog/meta.json": gsjax.load,
+    "sog/quats.webp": lambda path: gsjax.load(path.parent),
+    "scene.glb": gsjax.load,
     "sparse/0/cameras.bin": colmap_binary.read_cameras,
     "sparse/0/images.bin": colmap_binary.read_images,
     "sparse/0/points3D.bin": colmap_binary.read_points,
@@ -77,6 +81,10 @@ def write_good_files(folder: Path) -> None:
     for suffix in (".spz", ".splat", ".compressed.ply"):
         gsjax.save(folder / f"scene{suffix}", gaussians)
     write_spz(folder / "older.spz", gaussians, version=3)
+    (folder / "sog").mkdir()
+    harmonic = gsjax.with_sh_degree(gaussians, 1)
+    for name in ("scene.sog", "sog/meta.json", "scene.glb"):
+        gsjax.save(folder / name, harmonic)
     (folder / "scene.ksplat").write_bytes(ksplat_file(1, ksplat_fields(4)))
     (folder / "ascii.ply").write_bytes(as_ascii((folder / "scene.ply").read_bytes()))
     cloud = "ply\nformat ascii 1.0\nelement vertex 2\n"

@@ -10,6 +10,7 @@ from zipfile import ZIP_DEFLATED, ZIP_LZMA
 
 import numpy as np
 import zstandard
+from glb_files import edited, primitive, put_together, taken_apart, with_array
 from good_files import COLMAP_TEXT, META, POSES, STEP, entries, npy
 
 # A change of the bytes of a good file, and a regular expression of the error.
@@ -95,6 +96,19 @@ def at(*keys, to):
         value[keys[-1]] = to
 
     return changed(edit)
+
+
+def in_meta(*keys, to):
+    """Set a value in the meta.json of a SOG."""
+    change = at(*keys, to=to)
+    return entries(
+        lambda found: found.update({"meta.json": change(found["meta.json"])})
+    )
+
+
+def in_entry(name: str, change: Callable[[bytes], bytes]):
+    """Change a file of a SOG."""
+    return entries(lambda found: found.update({name: change(found[name])}))
 
 
 def frame(key, to):
@@ -300,6 +314,270 @@ ROWS["scene.ksplat"] = {
     "degree": (put(4096 + 40, "H", 3), "SH degree 0 to 2, got 3"),
     "storage": (put(4096 + 28, "I", 2**31), "bytes, got 2,147,483,648"),
     "center": (put(5120 + 8, "f", np.inf), "with a mean that is not finite"),
+}
+SECRET = "../../../etc/passwd"
+ROWS["scene.sog"] = {
+    "empty": (just(b""), "not a SOG, or truncated: File is not a zip"),
+    "of something": (just(png(4, 4)), "not a SOG"),
+    "without": (
+        entries(lambda e: e.pop("meta.json")),
+        "meta.json is missing, got .'me",
+    ),
+    "texture missing": (entries(lambda e: e.pop("sh0.webp")), "sh0.webp is missing"),
+    "compression": (entries(lambda _: 0, ZIP_LZMA), "expected a stored or deflated"),
+    "checksum": (swap("generator", "Generator"), "meta.json: damaged .*CRC"),
+    "bomb": (
+        entries(lambda e: e.update({"meta.json": b" " * 10**7}), ZIP_DEFLATED),
+        "meta.json: expected at most 1,048,576 bytes, got 10,000,000",
+    ),
+    "texture bomb": (
+        entries(lambda e: e.update({"quats.webp": bytes(10**7)}), ZIP_DEFLATED),
+        r"quats.webp: expected at most [\d,]+ bytes, got 10,000,000",
+    ),
+    "large": (in_entry("sh0.webp", just(webp(16_383, 16_383))), "up to .* 16383 ×"),
+    "small": (in_meta("count", to=17), "expected 17 texels or more, got 4 × 4"),
+    "count": (in_meta("count", to=2**28), "declares 268,435,456 Gaussians, which"),
+    "count negative": (in_meta("count", to=-1), "count: .* from 0 to .*, got -1"),
+    "count fraction": (in_meta("count", to=4.5), "count: .*a whole number .*, got 4.5"),
+    "lossy": (
+        in_entry("scales.webp", just(b"RIFF\x20\0\0\0WEBPVP8 " + bytes(24))),
+        "scales.webp: expected a lossless WebP",
+    ),
+    "no image": (in_entry("quats.webp", just(b"no")), "a WebP image, got 2 bytes"),
+    "texture cut": (in_entry("quats.webp", lambda d: d[:-4]), "the file is truncated"),
+    "pixels": (
+        in_entry("quats.webp", lambda d: d[:25] + bytes(len(d) - 25)),
+        "decoded",
+    ),
+    "no header": (
+        in_entry("quats.webp", just(b"RIFF\x14\0\0\0WEBPEXIF" + bytes(12))),
+        "expected a lossless WebP, got another",
+    ),
+    "path up": (
+        in_meta("quats", "files", 0, to=SECRET),
+        "name of a file beside .*passw",
+    ),
+    "path absolute": (in_meta("means", "files", 1, to="/etc/passwd"), "beside meta"),
+    "path of Windows": (in_meta("sh0", "files", 0, to="..\\a"), "beside meta.json"),
+    "path with 0": (in_meta("sh0", "files", 0, to="a\0b"), "beside meta.json"),
+    "path unpaired": (in_meta("sh0", "files", 0, to="\ud800"), "beside meta.json"),
+    "path empty": (in_meta("sh0", "files", 0, to=""), "beside meta.json"),
+    "path itself": (
+        in_meta("sh0", "files", 0, to="meta.json"),
+        "expected a WebP image",
+    ),
+    "files": (in_meta("means", "files", to=["a"]), "means.files: expected 2 names"),
+    "files of numbers": (
+        in_meta("sh0", "files", to=[1]),
+        "sh0.files: expected 1 names",
+    ),
+    "bounds": (in_meta("means", "mins", to=[0, 0]), "means.mins: expected 3 finite"),
+    "bounds nan": (in_meta("means", "maxs", 2, to=np.nan), "means.maxs: .*3 finite"),
+    "bounds far": (
+        in_meta("means", "maxs", 2, to=200),
+        "expected means within float32",
+    ),
+    "codebook nan": (in_meta("scales", "codebook", 9, to=np.nan), "1 to 256 finite"),
+    "codebook huge": (in_meta("sh0", "codebook", 9, to=1e39), "1 to 256 finite numb"),
+    "codebook long": (in_meta("sh0", "codebook", to=[0] * 257), "1 to 256 finite"),
+    "codebook text": (in_meta("sh0", "codebook", 0, to="0"), "1 to 256 finite num"),
+    "codebook short": (
+        in_meta("scales", "codebook", to=[0]),
+        "scales: expected indices",
+    ),
+    "bands": (in_meta("shN", "bands", to=4), "shN.bands: .* from 1 to 3, got 4"),
+    "bands other": (
+        in_meta("shN", "bands", to=2),
+        "a palette 512 texels wide, got 192",
+    ),
+    "entries": (in_meta("shN", "count", to=2**16 + 1), "shN.count: .* got 65537"),
+    "entries more": (in_meta("shN", "count", to=65), "2 rows for 65 entries, got 1"),
+    "label": (
+        in_meta("shN", "files", 1, to="quats.webp"),
+        "shN_labels|quats.webp: expected indices below the 1 entries",
+    ),
+}
+ROWS["sog/meta.json"] = {
+    "empty": (just(b""), "not JSON"),
+    "list": (just(b"[2]"), "expected an object with 'version'|got .2"),
+    "deep": (just(DEEP), "not JSON"),
+    "encoding": (just(b"\xff\xfe\xff"), "not JSON"),
+    "huge": (just(b" " * 2**21), "expected at most 1,048,576 bytes, got 2,097,152"),
+    "version": (at("version", to=3), "expected version 2, or none .*, got 3"),
+    "version true": (at("version", to=True), "expected version 2, .*, got True"),
+    "count": (at("count", to=2**28), "which [\\d,]+ bytes cannot hold"),
+    "object": (at("means", to=[]), "means.*: expected an object with"),
+    "texture missing": (at("sh0", "files", 0, to="none.webp"), "none.webp: cannot be"),
+    "path up": (at("quats", "files", 0, to=SECRET), "beside meta.json, got .*passwd"),
+}
+ROWS["sog/quats.webp"] = {
+    "empty": (just(b""), "expected a WebP image, got 0 bytes"),
+    "kind": (just(png(4, 4) + bytes(9)), "expected a WebP image, got .*PNG"),
+    "large": (just(webp(16_383, 16_383)), "texture of up to .* got 16383 × 16383"),
+}
+
+
+def as_glb(text: bytes) -> Callable[[bytes], bytes]:
+    """Replace the JSON of a glTF file by these bytes."""
+
+    def change(data: bytes) -> bytes:
+        body = taken_apart(data)[1]
+        padded = text + b" " * (-len(text) % 4)
+        head = struct.pack("<4sII", b"glTF", 2, 28 + len(padded) + len(body))
+        head += struct.pack("<I4s", len(padded), b"JSON") + padded
+        return head + struct.pack("<I4s", len(body), b"BIN\0") + body
+
+    return change
+
+
+def in_glb(*keys, to):
+    """Set a value in the JSON of a glTF file."""
+
+    def edit(value):
+        for key in keys[:-1]:
+            value = value[key]
+        value[keys[-1]] = to
+
+    return edited(edit)
+
+
+def in_primitive(edit: Callable[[dict], object]):
+    return edited(lambda data: edit(primitive(data)))
+
+
+SPLATS = "KHR_gaussian_splatting"
+
+
+def in_settings(key: str, to):
+    return in_primitive(lambda one: one["extensions"][SPLATS].update({key: to}))
+
+
+def without(name: str):
+    return in_primitive(lambda one: one["attributes"].pop(f"{SPLATS}:{name}"))
+
+
+def spoilt_array(name: str, value: float, width: int = 3):
+    """Set a number of an attribute of four Gaussians."""
+    array = np.full((4, width), 0.5, np.float32)
+    array[2, width - 1] = value
+    return lambda data: with_array(data, name, array)
+
+
+MAT = [1.0, *[0.0] * 4, 1.0, *[0.0] * 4, 1.0, *[0.0] * 4, 1.0]
+LONE = {"bufferView": 0, "byteOffset": 0, "componentType": 5126, "type": "VEC3"}
+ROWS["scene.glb"] = {
+    "empty": (just(b""), "byte 0: expected a binary glTF file.*got b''"),
+    "of something": (just(png(4, 4)), "byte 0: .*PNG"),
+    "version": (put(4, "I", 1), "glTF of version 2, got 1"),
+    "length": (put(8, "I", 99), "expected 99 bytes as its header declares, got"),
+    "long": (lambda d: d + bytes(4), "bytes as its header declares"),
+    "chunk": (put(16, "4s", b"TEXT"), "byte 12: expected a chunk b'JSON', got b'TEXT'"),
+    "chunk long": (put(12, "I", 2**31), "byte 12: expected a chunk of 2,147,483,648"),
+    "text": (as_glb(b"{,}"), "its JSON is damaged"),
+    "deep": (as_glb(DEEP), "its JSON is damaged"),
+    "list": (as_glb(b"[]"), "expected an object as JSON, got"),
+    "nothing": (as_glb(b"{}"), "expected a mesh with KHR_gaussian_splatting in the"),
+    "required": (
+        in_glb("extensionsRequired", to=["KHR_draco_mesh_compression", SPLATS]),
+        "no required extensions but .*, got .'KHR_draco_mesh_compression'",
+    ),
+    "required by a word": (in_glb("extensionsRequired", to="KHR"), "got 'KHR'"),
+    "scene": (in_glb("scene", to=1), "scenes: expected an index below 1, .*, got 1"),
+    "scene no list": (in_glb("scenes", 0, "nodes", to=0), "expected a list, got 0"),
+    "node": (in_glb("scenes", 0, "nodes", to=[7]), "nodes: expected an index below 1"),
+    "cycle": (
+        in_glb("nodes", 0, "children", to=[0]),
+        "expected nodes that form a tree",
+    ),
+    "twice": (
+        in_glb("scenes", 0, "nodes", to=[0, 0]),
+        "expected nodes that form a tree",
+    ),
+    "mesh": (in_glb("nodes", 0, "mesh", to=-1), "meshes: expected an index below 1"),
+    "translation": (in_glb("nodes", 0, "translation", to=[0, 0]), "3 finite numbers"),
+    "rotation": (in_glb("nodes", 0, "rotation", to=[0] * 4), "that is not zero"),
+    "scale": (in_glb("nodes", 0, "scale", to=[1, 1, 0]), "with scales that are not 0"),
+    "scale of a word": (in_glb("nodes", 0, "scale", to=1), "3 finite numbers, got 1"),
+    "scale nan": (in_glb("nodes", 0, "scale", to=[1, 1, np.nan]), "3 finite numbers"),
+    "matrix": (in_glb("nodes", 0, "matrix", to=MAT[:-1] + [2]), "last row of 0, 0, 0"),
+    "matrix huge": (in_glb("nodes", 0, "matrix", to=[10**400] * 16), "16 finite num"),
+    "mode": (
+        in_primitive(lambda one: one.pop("mode")),
+        "mode: expected 0, points, got 4",
+    ),
+    "kernel": (in_settings("kernel", "cube"), "kernel: expected 'ellipse', got 'cube'"),
+    "colours": (
+        in_settings("colorSpace", "acescg"),
+        "colorSpace: expected srgb_rec709",
+    ),
+    "no colours": (in_settings("colorSpace", None), "colorSpace: .*, got None"),
+    "attribute": (without("ROTATION"), "expected the attributes .*ROTATION, got"),
+    "compressed": (
+        chained(
+            without("SCALE"),
+            in_settings("extensions", {"KHR_gaussian_splatting_compression_x": {}}),
+        ),
+        "SCALE, got .*",
+    ),
+    "degree": (
+        without("SH_DEGREE_1_COEF_2"),
+        "whole SH degrees, .*, got '3 attributes",
+    ),
+    "degree 4": (
+        in_primitive(
+            lambda one: one["attributes"].update({f"{SPLATS}:SH_DEGREE_4_COEF_0": 0})
+        ),
+        "whole SH degrees, of up to 3",
+    ),
+    "accessor": (
+        in_primitive(lambda one: one["attributes"].update(POSITION=99)),
+        "accessors: expected an index below 9",
+    ),
+    "sparse": (
+        in_glb("accessors", 2, "sparse", to={}),
+        "a bufferView without 'sparse'",
+    ),
+    "zeros": (
+        edited(lambda data: data["accessors"][2].pop("bufferView")),
+        "a bufferView without 'sparse'",
+    ),
+    "type": (
+        in_glb("accessors", 3, "type", to="VEC4"),
+        "SCALE.: expected VEC3 of float",
+    ),
+    "kind": (
+        in_glb("accessors", 3, "componentType", to=5125),
+        "expected VEC3 of float",
+    ),
+    "normalised": (in_glb("accessors", 0, "normalized", to=True), "VEC3 of float, got"),
+    "count": (in_glb("accessors", 0, "count", to=10**9), "one Gaussian for each byte"),
+    "count, a little": (
+        in_glb("accessors", 3, "count", to=5),
+        "got '5 elements every 12",
+    ),
+    "count 0": (in_glb("accessors", 0, "count", to=0), "at least 1, got 0"),
+    "counts": (in_glb("accessors", 3, "count", to=3), "attributes of equal length"),
+    "instances": (
+        edited(lambda data: data.update(nodes=[{"mesh": 0}] * 1001, scenes=None)),
+        "at most 1,000 primitives with .*, got 'more'",
+    ),
+    "offset": (in_glb("accessors", 0, "byteOffset", to=2**31), "12 bytes within"),
+    "view": (in_glb("bufferViews", 0, "byteLength", to=47), "12 bytes within"),
+    "stride": (in_glb("bufferViews", 0, "byteStride", to=4), "12 bytes within"),
+    "buffer": (in_glb("bufferViews", 0, "buffer", to=1), "buffers: expected an index"),
+    "buffer long": (in_glb("buffers", 0, "byteLength", to=10**6), "12 bytes within"),
+    "uri": (in_glb("buffers", 0, "uri", to="file:///etc/passwd"), "without a URI"),
+    "meshopt": (
+        in_glb("bufferViews", 0, "extensions", to={"EXT_meshopt_compression": {}}),
+        "expected no extension, got .'EXT_meshopt",
+    ),
+    "no body": (
+        lambda data: put_together(taken_apart(data)[0], b""),
+        "elements of 12 bytes within 0 bytes",
+    ),
+    "mean nan": (spoilt_array("POSITION", np.nan), "POSITION: .*1 of 4 .*the first 2"),
+    "scale below 0": (spoilt_array("SCALE", -1), "at least 0, .*1 of 4 .*logarithms"),
+    "opacity": (spoilt_array("OPACITY", 1.5, 1), "opacities from 0 to 1"),
 }
 ROWS["cloud.ply"] = {
     "without y": (swap("float y", "float why"), "expected scalar properties x, y, z"),
