@@ -9,6 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 from captures import dataset_of_views, save_photo, to_opengl
+from ksplat_files import ksplat_fields, ksplat_file
 
 import gsjax
 from gsjax.data import colmap_binary
@@ -20,6 +21,7 @@ from gsjax.data.photos import load_photo
 from gsjax.data.transforms import load_transforms
 from gsjax.data.types import View
 from gsjax.io.point_cloud import read_point_cloud
+from gsjax.io.spz import write_spz
 from gsjax.runs.checkpoint import load_checkpoint, save_checkpoint
 from gsjax.runs.folder import RunSettings, load_settings, save_settings
 from gsjax.runs.info import describe_run
@@ -43,7 +45,15 @@ READ: dict[str, Callable[[Path], object]] = {
     "scene.ply": gsjax.load,
     "ascii.ply": gsjax.load,
     "cloud.ply": read_point_cloud,
+    "scene.compressed.ply": gsjax.load,
     "scene.spz": gsjax.load,
+    "older.spz": gsjax.load,
+    "scene.splat": gsjax.load,
+    "scene.ksplat": gsjax.load,
+    "scene.sog": gsjax.load,
+    "sog/meta.json": gsjax.load,
+    "sog/quats.webp": lambda path: gsjax.load(path.parent),
+    "scene.glb": gsjax.load,
     "sparse/0/cameras.bin": colmap_binary.read_cameras,
     "sparse/0/images.bin": colmap_binary.read_images,
     "sparse/0/points3D.bin": colmap_binary.read_points,
@@ -57,6 +67,8 @@ READ: dict[str, Callable[[Path], object]] = {
     "eval.json": lambda path: describe_run(path.parent),
     "cameras.json": lambda path: load_cameras(SCENE, path),
 }
+# A prefix of whole rows is a valid shorter file: bytes of a row.
+WHOLE_ROWS = {"scene.splat": 32}
 # A prefix of text may be a valid shorter file, which gives a warning if it is detected.
 TEXT = ("ascii.ply", "cloud.ply", *(f"text/{name}.txt" for name in MODEL))
 
@@ -66,7 +78,14 @@ def write_good_files(folder: Path) -> None:
     with jax.enable_x64(False):
         gaussians = gsjax.init_gaussians(SCENE, sh_degree=0)
     gsjax.save(folder / "scene.ply", gaussians)
-    gsjax.save(folder / "scene.spz", gaussians)
+    for suffix in (".spz", ".splat", ".compressed.ply"):
+        gsjax.save(folder / f"scene{suffix}", gaussians)
+    write_spz(folder / "older.spz", gaussians, version=3)
+    (folder / "sog").mkdir()
+    harmonic = gsjax.with_sh_degree(gaussians, 1)
+    for name in ("scene.sog", "sog/meta.json", "scene.glb"):
+        gsjax.save(folder / name, harmonic)
+    (folder / "scene.ksplat").write_bytes(ksplat_file(1, ksplat_fields(4)))
     (folder / "ascii.ply").write_bytes(as_ascii((folder / "scene.ply").read_bytes()))
     cloud = "ply\nformat ascii 1.0\nelement vertex 2\n"
     names = [*(f"float {axis}" for axis in "xyz"), "uchar red", "uchar green"]

@@ -195,9 +195,9 @@ def test_importing_is_light():
 def test_imports_are_declared():
     """Dependencies of dependencies do not count."""
     packages = {"cv2": "opencv-contrib-python-headless"}
-    # Each comes with a dependency, and is used together with that alone; `zstandard` is
-    # JAX's optional one, and viser's, as are `rich` and `msgspec`.
-    brought = {"IPython", "msgspec", "rich", "zstandard"}
+    # Each comes with a dependency, and is used together with that alone: viser brings
+    # `rich` and `msgspec`.
+    brought = {"IPython", "msgspec", "rich"}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
     lines = [*project["dependencies"], *extras["viewer"], *extras["movies"]]

@@ -36,6 +36,7 @@ class ExportCommand(HeavyCommand):
         if self.out.suffix.lower() in PAGE_SUFFIXES:
             return self._write_page()
         start_jax()
+        from gsjax.io.formats import stored_bytes
         from gsjax.runs.export import export_scene
 
         written, found = export_scene(
@@ -46,7 +47,7 @@ class ExportCommand(HeavyCommand):
             overwrite=self.overwrite,
         )
         of_all = f" of {found:,}" if written < found else ""
-        size = self.out.stat().st_size / 2**20
+        size = stored_bytes(self.out) / 2**20
         say(f"{self.out}  {written:,}{of_all} Gaussians, {size:.2f} MiB")
         return 0
 

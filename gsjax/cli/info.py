@@ -29,7 +29,7 @@ class InfoCommand(HeavyCommand):
         check_output("--plot", self.plot, self.overwrite, ".png")
         start_jax()
         from gsjax.io import images
-        from gsjax.io.formats import load
+        from gsjax.io.formats import load, stored_bytes
         from gsjax.plots.figures import histograms
         from gsjax.runs.folder import run_files
         from gsjax.runs.info import describe, describe_run, info_text, run_text
@@ -46,7 +46,7 @@ class InfoCommand(HeavyCommand):
         if splat.exists() or "run" not in report:
             gaussians = load(splat)
             facts = describe(gaussians)
-            facts["file_bytes"] = splat.stat().st_size
+            facts["file_bytes"] = stored_bytes(splat)
             report |= facts
             texts.append(info_text(str(splat), facts))
             if self.plot is not None:

@@ -2,20 +2,23 @@
 
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
+from gsjax.math.sh import C0
 
 # Rounding that moves a Gaussian by more than this part of its size is warned about.
 MAX_SHIFT = 0.1
 ANY_MODE = "*"
 _TINY = np.finfo(np.float64).tiny
 _NEARER = "move the scene nearer to the origin, or write a .ply"
+_MIN_OPACITY = 0.25 / 255  # rounds to 0
+_LEAST_SCALE = np.exp(-80.0)
 
 
 class Format(NamedTuple):
@@ -60,6 +63,26 @@ def require_new(path: Path, overwrite: bool) -> None:
         raise InputError(f"{path}: the folder {path.parent} is missing; create it")
 
 
+def read_exactly(file: BinaryIO, size: int, path: Path, what: str) -> bytes:
+    """Return the next ``size`` bytes of a file or an inflated stream.
+
+    Args:
+      file: the stream.
+      size: number of bytes, checked against the size of the file before.
+      path, what: the file and the name of its part, for the message.
+
+    Raises:
+      InputError: if there are fewer.
+    """
+    raw = file.read(size)
+    if len(raw) < size:
+        raise InputError(
+            f"{path}: expected {size:,} bytes of {what}, got {len(raw):,}; the file is "
+            "truncated: export or download it again"
+        )
+    return raw
+
+
 def to_bytes(values: np.ndarray) -> np.ndarray:
     """Round to the nearest whole numbers from 0 to 255."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
@@ -69,6 +92,68 @@ def opacity_bytes(logits: np.ndarray) -> np.ndarray:
     """Return opacities of [N] logits in a byte each, 255 for 1."""
     with np.errstate(over="ignore"):
         return to_bytes(255 / (1 + np.exp(-logits.astype(np.float64))))
+
+
+def byte_logits(opacities: np.ndarray) -> np.ndarray:
+    """Return logits [N] float32 of opacities in a byte each, 255 for 1.
+
+    The bytes 0 and 255 stand for opacities a quarter of a step within (0, 1), or
+    training could never change them.
+    """
+    shares = np.clip(np.arange(256) / 255, _MIN_OPACITY, 1 - _MIN_OPACITY)
+    return np.log(shares / (1 - shares)).astype(np.float32)[opacities]
+
+
+def byte_colors(colors: np.ndarray) -> np.ndarray:
+    """Return SH coefficients of degree 0, float32, of colours in a byte each."""
+    return ((np.arange(256) / 255 - 0.5) / C0).astype(np.float32)[colors]
+
+
+def scale_logs(scales: np.ndarray) -> np.ndarray:
+    """Return natural logarithms, float32, of σ of any shape; NaN if one is negative.
+
+    A σ of 0, which some writers give surfels, is read as e^-80.
+    """
+    with np.errstate(invalid="ignore"):
+        small = (scales >= 0) & (scales < _LEAST_SCALE)
+        return np.log(np.where(small, _LEAST_SCALE, scales)).astype(np.float32)
+
+
+_FAULTS = {
+    "means": "a mean that is not finite",
+    "log_scales": "a scale that is negative or not finite",
+    "quats": "a quaternion that is zero or not finite",
+    "sh": "a colour that is not finite",
+}
+
+
+def check_rows(path: Path, fields: Mapping[str, np.ndarray]) -> None:
+    """Reject values that a writer of Gaussians cannot have meant.
+
+    Args:
+      path: the file, for messages.
+      fields: arrays [N, …] by their names in `GaussianParams`.
+
+    Raises:
+      InputError: if a value is not finite, or a quaternion is zero; names the first
+        such row.
+    """
+    found = {}
+    for name, fault in _FAULTS.items():
+        values = fields[name]
+        axes = tuple(range(1, values.ndim))
+        found[fault] = ~np.isfinite(values).all(axis=axes)
+        if name == "quats":
+            found[fault] |= ~values.any(axis=axes)
+    rows = np.logical_or.reduce([*found.values()])
+    if rows.any():
+        first = int(rows.argmax())
+        fault = next(fault for fault, bad in found.items() if bad[first])
+        raise InputError(
+            f"{path}: expected finite values, got {rows.sum():,} of {len(rows):,} rows "
+            f"without, the first is row {first} with {fault}; the file is damaged or "
+            "has another layout: export it again"
+        )
 
 
 def visible_rows(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -111,8 +196,6 @@ def visible_rows(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
 def float32_means(path: Path, rows: dict[str, np.ndarray]) -> np.ndarray:
     """Return the means [N, 3] of rows to write, rounded to float32.
 
-    Warns if that moves Gaussians by much of their size.
-
     Raises:
       InputError: if a mean exceeds float32.
     """
@@ -123,7 +206,6 @@ def float32_means(path: Path, rows: dict[str, np.ndarray]) -> np.ndarray:
     if far.any():
         what = f"{far.sum():,} of {len(far):,} means exceed float32"
         raise InputError(f"{path}: {what}; {_NEARER}")
-    warn_of_moves(path, rounded, rows)
     return rounded
 
 

@@ -6,12 +6,15 @@ from pathlib import Path
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, check_gaussians
-from gsjax.io import gltf, ply, sog, splat, spz
+from gsjax.io import gltf, ksplat, ply, sog, splat, spz
 from gsjax.io.common import ANY_MODE, Format, warn
-from gsjax.io.sog_files import scene_path
+from gsjax.io.sog_files import META, scene_path
 
 # A new format is one module and one entry here.
-FORMATS = (ply.FORMAT, splat.FORMAT, spz.FORMAT, sog.FORMAT, gltf.FORMAT)
+FORMATS = (
+    *(ply.FORMAT, ply.PACKED_FORMAT, splat.FORMAT, spz.FORMAT, ksplat.FORMAT),
+    *(sog.FORMAT, gltf.FORMAT),
+)
 DEFAULT_MODE = "default"  # of ordinary ellipsoids, as some programs record it
 
 
@@ -87,6 +90,21 @@ def render_mode(
     """
     path, form = _chosen(path, formats, "load")
     return None if form.mode is None else form.mode(path)
+
+
+def keeps_every_bit(path: Path) -> bool:
+    """Return True for a plain PLY, which stores any value; other formats round."""
+    return _chosen(path, FORMATS, "save")[1] is ply.FORMAT
+
+
+def stored_bytes(path: Path) -> int:
+    """Return the size of a scene on the disk, in bytes: of all files of a SOG.
+
+    Raises:
+      InputError: if the meta.json of a SOG cannot be read.
+    """
+    path = scene_path(path)
+    return sog.scene_bytes(path) if path.name == META else path.stat().st_size
 
 
 def _chosen(path, formats: Sequence[Format], action: str) -> tuple[Path, Format]:

@@ -37,9 +37,8 @@ _ATTRIBUTES: dict[str, tuple[str, dict[int, str]]] = {
     "SH_DEGREE_0_COEF_0": ("VEC3", {FLOAT: ""}),
 }
 _HARMONIC = re.compile(rf"{EXTENSION}:SH_DEGREE_(\d+)_COEF_(\d+)")
-# A scale of 0 becomes this part of the greatest of its Gaussian, and at least _TINY.
-_THIN, _TINY = 1e-6, 1e-30
 _FLAT = 1e-9  # ratio of the scales of a node below which it has no thickness
+_MAX_PLACED = 1000
 _ROUNDING = 1e-6  # of opacities
 _MAX_OPACITY = 1 - 2.0**-25  # rounds to 1
 
@@ -63,22 +62,34 @@ def read_glb(path: str | PathLike[str]) -> Gaussians:
     """
     gltf = read_gltf(Path(path))
     _check_required(gltf)
-    placed = [
-        (where, primitive, matrix)
-        for mesh, matrix in placed_meshes(gltf)
-        for where, primitive in _primitives(gltf, mesh)
-    ]
+    placed = _placed_primitives(gltf)
+    _check_count(gltf, [(where, primitive) for where, primitive, _ in placed])
+    found: dict[str, dict[str, np.ndarray]] = {}
+    parts = []
+    for where, primitive, matrix in placed:
+        if where not in found:
+            found[where] = _read_primitive(gltf, where, primitive)
+        full = _invertible(gltf, where, matrix)
+        parts.append(transform_gaussians(found[where], full))
+    return make_gaussians(**_joined(parts), capacity=None)
+
+
+def _placed_primitives(gltf: Gltf) -> list[tuple[str, dict[str, Any], np.ndarray]]:
+    """Return the primitives of the scene that hold Gaussians, and their matrices."""
+    known: dict[int, list[tuple[str, dict[str, Any]]]] = {}
+    placed = []
+    for mesh, matrix in placed_meshes(gltf):
+        if mesh not in known:  # nodes may share a mesh
+            known[mesh] = _primitives(gltf, mesh)
+        placed += [(where, primitive, matrix) for where, primitive in known[mesh]]
+        if len(placed) > _MAX_PLACED:
+            expected = f"at most {_MAX_PLACED:,} primitives with {EXTENSION}, counted "
+            expected += "for each of their nodes"
+            raise gltf.fault("nodes", expected, "more")
     if not placed:
         expected = f"a mesh with {EXTENSION} in the scene"
         raise gltf.fault("meshes", expected, gltf.data.get("extensionsUsed"))
-    _check_count(gltf, [(where, primitive) for where, primitive, _ in placed])
-    parts = [
-        transform_gaussians(
-            _read_primitive(gltf, where, primitive), _invertible(gltf, where, matrix)
-        )
-        for where, primitive, matrix in placed
-    ]
-    return make_gaussians(**_joined(parts), capacity=None)
+    return placed
 
 
 def _invertible(gltf: Gltf, where: str, matrix: np.ndarray) -> np.ndarray:
@@ -233,8 +244,7 @@ def _log_scales(gltf: Gltf, where: str, scales: np.ndarray) -> np.ndarray:
         got = f"{negative.sum():,} of {len(negative):,} below; earlier drafts of the "
         got += "extension stored logarithms"
         raise gltf.fault(f"{where}: SCALE", "scales of at least 0", got)
-    least = np.maximum(_THIN * scales.max(axis=1, keepdims=True, initial=0), _TINY)
-    return np.log(np.where(scales > 0, scales, least))
+    return common.scale_logs(scales)
 
 
 def _logits(gltf: Gltf, where: str, opacities: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """The scene graph of a glTF file: meshes, and the matrices that place them."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from gsjax.io.gltf_container import Gltf
 
 _LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 _TOLERANCE = 1e-6
+_MAX_VALUE = 1e30  # of a transform
 
 
 def placed_meshes(gltf: Gltf) -> list[tuple[int, np.ndarray]]:
@@ -68,25 +70,29 @@ def _list(gltf: Gltf, place: str, value: Any) -> list[Any]:
 def _local(gltf: Gltf, index: int, node: dict[str, Any]) -> np.ndarray:
     """Return the matrix [4, 4] of a node relative to its parent."""
 
-    def numbers(key: str, default: list[float]) -> np.ndarray:
-        value = node.get(key, default)
+    def numbers(key: str, count: int) -> np.ndarray:
+        value = node[key]
         numeric = isinstance(value, list) and {*map(type, value)} <= {int, float}
-        found = [float(v) if abs(v) < 1e30 else np.nan for v in value if numeric]
-        if len(found) != len(default) or not np.isfinite(found).all():
-            expected = f"{len(default)} finite numbers"
+        listed = value if numeric else []
+        found = [float(v) if abs(v) < _MAX_VALUE else math.nan for v in listed]
+        if len(found) != count or any(map(math.isnan, found)):
+            expected = f"{count} finite numbers"
             raise gltf.fault(f"nodes[{index}].{key}", expected, value)
         return np.asarray(found)
 
     if "matrix" in node:
-        matrix = numbers("matrix", [0.0] * 16).reshape(4, 4).T  # by columns
+        matrix = numbers("matrix", 16).reshape(4, 4).T  # by columns
         if np.abs(matrix[3] - _LAST_ROW).max() > _TOLERANCE:
             expected = "a last row of 0, 0, 0, 1"
             raise gltf.fault(f"nodes[{index}].matrix", expected, matrix[3].tolist())
         return matrix
     matrix = np.eye(4)
-    matrix[:3, :3] = _rotation(gltf, index, numbers("rotation", [0.0, 0.0, 0.0, 1.0]))
-    matrix[:3, :3] *= numbers("scale", [1.0] * 3)
-    matrix[:3, 3] = numbers("translation", [0.0] * 3)
+    if "rotation" in node:
+        matrix[:3, :3] = _rotation(gltf, index, numbers("rotation", 4))
+    if "scale" in node:
+        matrix[:3, :3] *= numbers("scale", 3)
+    if "translation" in node:
+        matrix[:3, 3] = numbers("translation", 3)
     return matrix
 
 

@@ -76,6 +76,7 @@ def write_glb(
 def _attributes(path: Path, rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the arrays of a primitive by their names."""
     means = common.float32_means(path, rows)
+    common.warn_of_moves(path, means, rows)
     w, x, y, z = rows["quats"].T
     with np.errstate(over="ignore"):
         opacities = 1 / (1 + np.exp(-rows["logit_opacities"].astype(np.float64)))

@@ -1,5 +1,7 @@
 """Gaussians in standard 3DGS PLY files: read by property name, written in order.
 
+Compressed PLY files are recognised by their properties, see `gsjax.io.packed_ply`.
+
 Axis legend: N Gaussians, K spherical-harmonic bases.
 
 Values are stored as in `GaussianParams` (log scales, logit opacities, wxyz), except
@@ -19,6 +21,7 @@ import numpy as np
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.io.common import ANY_MODE, MAX_SHIFT, Format, require_new, warn
+from gsjax.io.packed_ply import is_packed, read_packed, write_packed_ply
 from gsjax.io.ply_header import Header, check_properties, check_size, read_header
 from gsjax.io.ply_rows import CHUNK_ROWS, read_rows
 from gsjax.runtime.files import opened, replacing
@@ -34,7 +37,7 @@ _MAX_LOGIT = math.log((1 - 2.0**-23) / 2.0**-23)
 
 
 def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaussians:
-    """Read a 3DGS PLY file, binary or ascii, of any SH degree up to 4.
+    """Read a 3DGS PLY file, binary, ascii or compressed, of any SH degree up to 4.
 
     Properties are found by name, in any order and of any scalar type; others, such as
     normals, are ignored. Mip-Splatting's ``filter_3D`` is applied to scales and
@@ -45,10 +48,13 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
     Surfels have two scales, or "comment SplatRenderMode: 2dgs"; a third that is absent
     or −inf becomes a thousandth of the others. `render_mode` tells them apart.
 
+    Compressed (packed) files have degree 0 to 3. Their opacities of 0 and 1 are read as
+    a quarter of a step within.
+
     Args:
       path: the file.
       drop_nonfinite: leave out Gaussians with NaN or infinite values, with a
-        warning, instead of raising.
+        warning, instead of raising; not in compressed files, whose bounds are shared.
 
     Returns:
       Gaussians with capacity max(N, 1), in the order of the file.
@@ -61,6 +67,8 @@ def read_ply(path: str | PathLike[str], *, drop_nonfinite: bool = False) -> Gaus
     path = Path(path)
     with opened(path, "a .ply file") as file:
         header = read_header(file, path)
+        if is_packed(header):
+            return make_gaussians(**read_packed(file, header), capacity=None)
         needed = [*_columns(_allocate(0, 1, np.float32))]
         needed.remove(_THIRD)
         bases = check_properties(header, needed)
@@ -74,8 +82,9 @@ def render_mode(path: str | PathLike[str]) -> str | None:
     """Return how the Gaussians of a PLY file are to be drawn.
 
     Returns:
-      "2dgs" for surfels, "mip" for ellipsoids trained with antialiasing, another word
-      of "comment SplatRenderMode" in lower case, or None without one.
+      "2dgs" for surfels, "mip" for ellipsoids trained with antialiasing ("comment
+      antialiased 1" too), another word of "comment SplatRenderMode" in lower case, or
+      None without one. The last comment counts.
 
     Raises:
       InputError: if the file cannot be read or is not a PLY.
@@ -296,3 +305,11 @@ def _is_rounded(values: np.ndarray) -> bool:
 
 
 FORMAT = Format("ply", (".ply",), read_ply, write_ply, render_mode, (ANY_MODE,))
+PACKED_FORMAT = Format(
+    "compressed ply",
+    (".compressed.ply",),
+    read_ply,
+    write_packed_ply,
+    render_mode,
+    (ANY_MODE,),
+)

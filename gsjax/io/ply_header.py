@@ -20,7 +20,11 @@ _TYPES = {
 _FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _F_REST_COUNTS = [3 * (num_bases(d) - 1) for d in range(MAX_DEGREE + 1)]
 _MAX_HEADER = 1 << 20
-_RENDER_MODE = re.compile(r"^comment\s+SplatRenderMode\s*:\s*(\w+)", re.I | re.M)
+# Of several programs, and Postshot's, whose words these are.
+_RENDER_MODE = re.compile(
+    r"comment\s+(?:SplatRenderMode\s*:\s*(\w+)|antialiased\s*:?\s*([01])\b)", re.I
+)
+_ANTIALIASED = {"0": "default", "1": "mip"}
 
 
 class Element(NamedTuple):
@@ -49,7 +53,8 @@ class Header(NamedTuple):
       order: byte order of the body, "<", ">", or "" for ascii.
       before, vertex, after: the elements, in the order of the body.
       body, size: byte at which the body starts, and bytes of the file.
-      render_mode: lower-case value of the last "comment SplatRenderMode:"; or None.
+      render_mode: lower-case value of the last "comment SplatRenderMode:", or "mip" or
+        "default" for "comment antialiased 1" or 0; None without such a comment.
     """
 
     path: Path
@@ -80,16 +85,23 @@ def read_header(file: BinaryIO, path: Path) -> Header:
             "the file is truncated or damaged: export or download it again"
         )
     text = head[magic.end() : max(end.start(), magic.end())]
-    order, elements = _parse_header(path, text.split(eol) if text else [], eol)
+    lines = text.split(eol) if text else []
+    order, elements = _parse_header(path, lines, eol)
     names = [element.name for element in elements]
     if "vertex" not in names:
         found = f"found {names[:8]}; export the scene as a 3DGS PLY"
         raise InputError(f"{path}: the header has no 'element vertex'; {found}")
     at = names.index("vertex")
     before, after = elements[:at], elements[at + 1 :]
-    modes = _RENDER_MODE.findall(text.decode("ascii", "replace"))
-    mode = modes[-1].lower() if modes else None
+    mode = _render_mode(lines)
     return Header(path, order, before, elements[at], after, end.end(), size, mode)
+
+
+def _render_mode(lines: list[bytes]) -> str | None:
+    """Return the render mode of the last comment that has one."""
+    found = (_RENDER_MODE.match(line.decode("ascii", "replace")) for line in lines)
+    modes = [(match[1] or _ANTIALIASED[match[2]]).lower() for match in found if match]
+    return modes[-1] if modes else None
 
 
 def _parse_header(
@@ -159,9 +171,6 @@ def check_properties(header: Header, required: Collection[str]) -> int:
     elif cloud:
         fault = "this is a point cloud (red, green, blue), not a Gaussian PLY "
         fault += f"(missing: {names}); train a scene from the points first"
-    elif "packed_position" in found:
-        fault = "this is a compressed (packed) Gaussian PLY, which is not supported; "
-        fault += "convert it to the standard, uncompressed PLY"
     elif missing:
         fault = f"element vertex lacks the properties {names}; found {len(found)}: "
         fault += f"{', '.join([*found][:20])}; {export}"

@@ -13,8 +13,8 @@ from pathlib import Path
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.io import common
-from gsjax.io.sog_decode import decode_scene
-from gsjax.io.sog_encode import encode_scene
+from gsjax.io.sog_decode import decode_scene, dequantise_means
+from gsjax.io.sog_encode import encode_scene, quantise_means
 from gsjax.io.sog_files import META, REMEDY, SogFiles, opened_scene, write_files
 from gsjax.io.sog_meta import MAX_DEGREE, MODELS, Meta, read_meta
 from gsjax.math.sh import num_bases
@@ -54,6 +54,16 @@ def render_mode(path: str | PathLike[str]) -> str | None:
     """
     with opened_scene(Path(path)) as files:
         return read_meta(files).mode
+
+
+def scene_bytes(path: Path) -> int:
+    """Return the size of a SOG scene on the disk, in bytes, with its textures.
+
+    Raises:
+      InputError: as `read_sog`, from meta.json and the sizes of the files.
+    """
+    with opened_scene(path) as files:
+        return files.size([META, *read_meta(files).names()])
 
 
 def write_sog(
@@ -97,8 +107,9 @@ def write_sog(
     if not len(rows["means"]):
         expected = "expected at least one active Gaussian, got none"
         raise InputError(f"{path}: {expected}: SOG has no empty textures; write a .ply")
-    means = common.float32_means(path, rows)
-    write_files(path, encode_scene(rows, means, mode), overwrite=overwrite)
+    codes = quantise_means(common.float32_means(path, rows))
+    common.warn_of_moves(path, dequantise_means(*codes), rows)
+    write_files(path, encode_scene(rows, codes, mode), overwrite=overwrite)
 
 
 def _check_count(files: SogFiles, meta: Meta) -> None:

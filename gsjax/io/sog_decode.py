@@ -10,6 +10,7 @@ from gsjax.io.common import warn
 from gsjax.io.packed_quats import PackedQuats, unpack_quats
 from gsjax.io.sog_files import REMEDY, SogFiles
 from gsjax.io.sog_meta import (
+    MAX_DEGREE,
     MAX_PALETTE,
     PALETTE_COLUMNS,
     Harmonics,
@@ -133,13 +134,10 @@ def _palette(files: SogFiles, harmonics: Harmonics) -> np.ndarray:
     height, width, _ = texels.shape
     degree = degree_of_width(width)
     if degree is None or degree != (harmonics.degree or degree):
-        widths = [PALETTE_COLUMNS * (num_bases(d) - 1) for d in range(1, 4)]
-        expected = (
-            f"{widths[harmonics.degree - 1]}" if harmonics.degree else f"{widths}"
-        )
-        raise InputError(
-            f"{where}: expected a palette {widths} texels wide, got {width}; {REMEDY}"
-        )
+        degrees = [harmonics.degree] if harmonics.degree else range(1, MAX_DEGREE + 1)
+        widths = [PALETTE_COLUMNS * (num_bases(d) - 1) for d in degrees]
+        expected = f"a palette {' or '.join(map(str, widths))} texels wide"
+        raise InputError(f"{where}: expected {expected}, got {width}; {REMEDY}")
     count = harmonics.entries or min(height * PALETTE_COLUMNS, MAX_PALETTE)
     if height < palette_height(count):
         expected = f"expected {palette_height(count)} rows for {count:,} entries"

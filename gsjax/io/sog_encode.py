@@ -7,7 +7,7 @@ palette, K spherical-harmonic bases.
 
 import json
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,21 +22,34 @@ from gsjax.math.clustering import codebook, kmeans
 from gsjax.math.sh import degree_of
 
 _UNIT, _MAX_UNITS = 1024, 64  # a palette has a power of two of units
-_ITERATIONS = 4
+_BINS = 1024
 _THIN = 7.0  # by which the log of a third scale is less, where surfels have none
 
 
+class MeanCodes(NamedTuple):
+    """Means in whole numbers.
+
+    Attributes:
+      codes: [N, 3] int64 from 0 to 65535.
+      mins, maxs: [3] float64 bounds of sign(x) ln(1 + |x|).
+    """
+
+    codes: np.ndarray
+    mins: np.ndarray
+    maxs: np.ndarray
+
+
 def encode_scene(
-    rows: dict[str, np.ndarray], means: np.ndarray, mode: str | None
+    rows: dict[str, np.ndarray], means: MeanCodes, mode: str | None
 ) -> dict[str, bytes]:
     """Return the files by name, meta.json last.
 
     Args:
       rows: at least one Gaussian, see `gsjax.io.common.visible_rows`; SH degree 0 to 3.
-      means: [N, 3] float32, their means.
+      means: of `quantise_means`.
       mode: render mode: "mip", "2dgs" or None.
     """
-    codes, mins, maxs = quantise_means(means)
+    codes, mins, maxs = means
     # By the means as they are read, so that the order is kept when they are written.
     order = morton_order(dequantise_means(codes, mins, maxs))
     codes = codes[order]
@@ -65,20 +78,18 @@ def encode_scene(
     return files
 
 
-def quantise_means(means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def quantise_means(means: np.ndarray) -> MeanCodes:
     """Round means to 65536 steps of sign(x) ln(1 + |x|) along each axis.
 
     Args:
       means: [N, 3] float32, N at least 1.
-
-    Returns:
-      Codes [N, 3] int64, and the bounds [3] and [3] float64 of the logarithms.
     """
     wide = means.astype(np.float64)
     logs = np.copysign(np.log1p(np.abs(wide)), wide)
     mins, maxs = logs.min(axis=0), logs.max(axis=0)
     extent = np.where(maxs > mins, maxs - mins, 1)
-    return np.rint((logs - mins) / extent * WORD).astype(np.int64), mins, maxs
+    codes = np.rint((logs - mins) / extent * WORD).astype(np.int64)
+    return MeanCodes(codes, mins, maxs)
 
 
 def _stored_scales(log_scales: np.ndarray, mode: str | None) -> np.ndarray:
@@ -95,8 +106,19 @@ def _stored_scales(log_scales: np.ndarray, mode: str | None) -> np.ndarray:
 
 def _indexed(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a codebook [256] float32, and indices uint8 in the shape of values."""
-    entries, indices = codebook(values, ENTRIES)
+    entries, indices = codebook(values, ENTRIES, weights=_rarity(values.ravel()))
     return entries, indices.reshape(values.shape).astype(np.uint8)
+
+
+def _rarity(values: np.ndarray) -> np.ndarray:
+    """Return weights [M] of numbers: 1 / √ of the number of those about as large.
+
+    With equal weights, rare values such as the largest scales have large errors.
+    """
+    low, extent = values.min(), np.ptp(values)
+    share = (values - low) / (extent or 1)
+    bins = np.minimum(share * _BINS, _BINS - 1).astype(int)
+    return 1 / np.sqrt(np.bincount(bins)[bins])
 
 
 def _decimals(values: np.ndarray) -> list[float]:
@@ -118,9 +140,11 @@ def palette_size(count: int) -> int:
 def _encode_harmonics(rest: np.ndarray, files: dict[str, bytes]) -> dict[str, Any]:
     """Add the textures of coefficients [N, K - 1, 3], and return their metadata."""
     count, coefficients, _ = rest.shape
-    found = kmeans(rest.reshape(count, -1), palette_size(count), iterations=_ITERATIONS)
-    order = _smooth_order(found.centroids)
-    palette, labels = found.centroids[order], np.argsort(order)[found.labels]
+    found = kmeans(rest.reshape(count, -1), palette_size(count))
+    order = _order_of_use(found.labels)
+    palette, places = found.centroids[order], np.zeros(len(found.centroids), int)
+    places[order] = np.arange(len(order))
+    labels = places[found.labels]
     # Values matter by the number of Gaussians that use them.
     uses = np.bincount(labels, minlength=len(palette)).astype(np.float64)
     weights = np.repeat(uses, palette.shape[1])
@@ -140,11 +164,11 @@ def _encode_harmonics(rest: np.ndarray, files: dict[str, bytes]) -> dict[str, An
     }
 
 
-def _smooth_order(palette: np.ndarray) -> np.ndarray:
-    """Return an order [C] in which neighbouring entries are alike.
+def _order_of_use(labels: np.ndarray) -> np.ndarray:
+    """Return the distinct labels of [N], in the order in which they first occur.
 
-    Along the first principal component; similar neighbours compress better.
+    Neighbouring labels then often differ by 1, which compresses better than an order by
+    the values of the entries.
     """
-    centred = (palette - palette.mean(axis=0)).astype(np.float64)
-    _, axes = np.linalg.eigh(centred.T @ centred)
-    return np.argsort(centred @ axes[:, -1], kind="stable")
+    used, first = np.unique(labels, return_index=True)
+    return used[np.argsort(first)]

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsjax.errors import InputError
+from gsjax.io.common import byte_logits
 from gsjax.io.sog_files import META, REMEDY, SogFiles, checked_name
 from gsjax.math.sh import num_bases
 from gsjax.runtime.files import shown
@@ -16,8 +17,6 @@ PALETTE_COLUMNS = 64  # entries of the palette in a row of its texture
 MAX_PALETTE = 1 << 16  # an index is two bytes
 MAX_DEGREE = 3
 MODELS = {"mip": "antialiased", "2dgs": "2dgs"}  # by render mode
-# Opacities of byte 0 and 255: a quarter of a step within.
-_MIN_OPACITY = 0.25 / 255
 _MAX_COUNT = 1 << 28  # of the largest texture
 _MAX_VALUE = float(np.finfo(np.float32).max)
 
@@ -172,8 +171,7 @@ def _mode(fields: _Fields) -> str | None:
 def _codebooks(fields: _Fields) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the tables of scales, colours and opacities of version 2."""
     scales, colors = (_codebook(fields, key) for key in ("scales", "sh0"))
-    shares = np.linspace(0, 1, ENTRIES).clip(_MIN_OPACITY, 1 - _MIN_OPACITY)
-    logits = np.log(shares / (1 - shares)).astype(np.float32)
+    logits = byte_logits(np.arange(ENTRIES))
     return np.tile(scales, (3, 1)), np.tile(colors, (3, 1)), logits
 
 

@@ -3,7 +3,8 @@ https://github.com/antimatter15/splat): 32 bytes a Gaussian and no header.
 
 Each holds float32 of mean [3] and σ [3], then a byte each of red, green, blue, opacity
 and the quaternion wxyz, 128 (1 + q). The largest come first, as viewers draw while they
-load. Files are written only: nothing in them tells whether they are complete.
+load. Nothing in a file tells whether it is complete: one that is cut between two
+Gaussians is a valid shorter file.
 """
 
 from os import PathLike
@@ -12,14 +13,57 @@ from pathlib import Path
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.gaussians import Gaussians
+from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.io import common
 from gsjax.math.sh import C0
-from gsjax.runtime.files import replacing
+from gsjax.runtime.files import opened, replacing
+from gsjax.runtime.memory import Estimate, require
 
 _FLOATS = [("means", "<f4", 3), ("scales", "<f4", 3)]
 _ROW = np.dtype([*_FLOATS, ("rgba", "u1", 4), ("quats", "u1", 4)])
 _NEARER = "move the scene nearer to the origin, or write a .ply"
+
+
+def read_splat(path: str | PathLike[str]) -> Gaussians:
+    """Read a `.splat` file; its Gaussians have SH degree 0.
+
+    Quaternions are decoded as (byte - 128) / 128, as the first viewer does
+    (https://github.com/antimatter15/splat), and not normalised. Some programs read
+    byte / 127.5 - 1, which differs by up to 0.006.
+
+    Returns:
+      Gaussians in the order of the file.
+
+    Raises:
+      InputError: if the file cannot be read, is empty, is not a whole number of rows of
+        32 bytes, or has a row with a mean that is not finite, a negative scale or a
+        zero quaternion.
+      CapacityError: if memory is too small; raised before the file is read.
+    """
+    path = Path(path)
+    with opened(path, "a .splat file") as file:
+        size = file.seek(0, 2)
+        if not size or size % _ROW.itemsize:
+            raise InputError(
+                f"{path}: expected one or more rows of {_ROW.itemsize} bytes, got "
+                f"{size:,} bytes; the file is truncated or has another layout: export "
+                "or download it again"
+            )
+        count = size // _ROW.itemsize
+        remedy = "reduce the file with the tool that made it"
+        estimate = Estimate({"values as read": 200 * count})
+        require(estimate, f"{path}: {count:,} Gaussians", remedy)
+        file.seek(0)
+        table = np.frombuffer(common.read_exactly(file, size, path, "rows"), _ROW)
+    fields = {
+        "means": table["means"],
+        "quats": (table["quats"].astype(np.float32) - 128) / 128,
+        "log_scales": common.scale_logs(table["scales"]),
+        "logit_opacities": common.byte_logits(table["rgba"][:, 3]),
+        "sh": common.byte_colors(table["rgba"][:, None, :3]),
+    }
+    common.check_rows(path, fields)
+    return make_gaussians(**fields, capacity=None)
 
 
 def write_splat(
@@ -79,4 +123,4 @@ def _warn_of_losses(
         )
 
 
-FORMAT = common.Format("splat", (".splat",), None, write_splat)
+FORMAT = common.Format("splat", (".splat",), read_splat, write_splat)

@@ -1,45 +1,50 @@
 """Gaussians in SPZ files (Niantic, https://github.com/nianticlabs/spz).
 
-A file is a gzip stream of a header and then, each for all Gaussians, means of 24 bits a
-number, opacities, colours and log scales of 8, quaternions of 32 bits, and harmonics of
-8. Its axes are x right, y up, z backward: ours after half a turn about x. Versions 2
-and 3 are read, 3 is written.
+A file holds, each for all Gaussians, means of 24 bits a number, opacities, colours and
+log scales of 8, quaternions of 24 or 32 bits, and harmonics of 8. Its axes are x right,
+y up, z backward: ours after half a turn about x. Versions 2, 3 and 4 are read, 3 and 4
+are written; `gsjax.io.spz_container` has the difference. Some writers, such as
+splat-transform 3.7, store our axes and do not say so.
 """
 
-import gzip
 import math
-import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from struct import Struct
-from typing import BinaryIO, cast
 
-import jax.numpy as jnp
 import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.io import common
+from gsjax.io import spz_container as container
+from gsjax.io.packed_quats import (
+    PackedQuats,
+    join_words,
+    pack_quats,
+    split_words,
+    unpack_quats,
+)
 from gsjax.io.ply_rows import CHUNK_ROWS
-from gsjax.math.sh import num_bases, sh_basis
-from gsjax.runtime.files import opened, replacing
+from gsjax.math.sh import num_bases
+from gsjax.runtime.files import replacing
 from gsjax.runtime.memory import Estimate, require
 
-_MAGIC = b"NGSP"
-_REMEDY = "export or download it again"
-_HEADER = Struct("<4sIIBBBB")
-# Flags: trained with antialiasing; data follow the harmonics.
-_ANTIALIASED, _EXTENSIONS = 1, 2
-_MAX_WRITTEN_DEGREE = 3  # more is not read by most programs
+_COMMON_DEGREE = 3  # more is not read by most programs
 # A mean is an integer of 24 bits divided by 2 to the power of ``fraction``.
 _MAX_FRACTION, _MAX_MEAN = 20, 2**23 - 1
 _COLOR, _SCALE, _SHIFT = 0.15, 16, 10
 _BITS = (6, 5)  # kept of harmonics of degree 1, and above; zero bits compress well
-_MAX_RATIO = 1032  # of any deflated data
-_HALF_TURN = np.array([1.0, -1.0, -1.0])
-_MIN_OPACITY = 0.25 / 255  # rounds to 0
+_LEVELS = 1022  # of a component of a quaternion: a sign and 9 bits
+# Signs of x, y and z by the name of the axes: right up back, right down forward.
+_AXES = {"rub": (1, -1, -1), "rdf": (1, 1, 1)}
+# Axes in which each basis function of `gsjax.math.sh.sh_basis` is odd.
+_ODD = ("", "y", "z", "x", "xy", "yz", "", "xz", "")
+_ODD += ("y", "xyz", "y", "z", "x", "z", "x")
+_ODD += ("xy", "yz", "xy", "yz", "", "xz", "", "xz", "")
+_AXES_RECORD = 0xADBE0003  # extension whose payload is one of these numbers
+_AXES_NUMBERS = {4: "rub", 6: "rdf"}
+_CAMERA_RECORD = 0xADBE0002  # limits of an orbit camera; does not concern Gaussians
 
 
 def render_mode(path: str | PathLike[str]) -> str | None:
@@ -51,120 +56,73 @@ def render_mode(path: str | PathLike[str]) -> str | None:
     Raises:
       InputError: as `read_spz`, from the header alone.
     """
-    path = Path(path)
-    with _opened(path) as (stream, _):
-        return "mip" if _read_header(stream, path)[-1] & _ANTIALIASED else None
+    flags = container.read_spz_header(Path(path)).flags
+    return "mip" if flags & container.ANTIALIASED else None
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[tuple[BinaryIO, int]]:
-    """Yield the inflated stream of a file, and the size of the file."""
-    with opened(path, "an .spz file") as file:
-        size = file.seek(0, 2)
-        file.seek(0)
-        if file.read(4) == _MAGIC:
-            what = "expected SPZ of version 2 or 3, got 4 or later"
-            raise InputError(f"{path}: {what}; convert it, for example with SuperSplat")
-        file.seek(0)
-        try:
-            with gzip.GzipFile(fileobj=file) as stream:
-                yield cast(BinaryIO, stream), size
-        except (gzip.BadGzipFile, zlib.error, EOFError) as error:
-            what = f"not an SPZ file, or damaged or truncated: {error}"
-            raise InputError(f"{path}: {what}; {_REMEDY}") from error
+def read_spz(path: str | PathLike[str], *, frame: str = "rub") -> Gaussians:
+    """Read an SPZ file of version 2, 3 or 4 and SH degree 0 to 4.
 
+    Bytes after the last Gaussian and unknown extensions are ignored with a warning. A
+    file that was trained with antialiasing is warned about: `RasterConfig` must be
+    told. See `render_mode`.
 
-def read_spz(path: str | PathLike[str]) -> Gaussians:
-    """Read an SPZ file of version 2 or 3 and SH degree 0 to 4.
-
-    Trailing bytes and extensions are ignored with a warning. A file that was trained
-    with antialiasing is warned about: `RasterConfig` must be told. See
-    `render_mode`.
+    Args:
+      path: the file.
+      frame: axes of a file that does not record them: "rub" (right, up, back), as the
+        specification says, or "rdf" (right, down, forward) for writers that store the
+        axes of PLY files. A record of the axes in the file takes precedence.
 
     Returns:
       Gaussians with capacity max(N, 1), in the order of the file.
 
     Raises:
-      InputError: if the file cannot be read, is not an SPZ, has another version, or is
-        damaged or truncated.
+      InputError: if the file cannot be read, is not an SPZ, has another version or
+        unknown axes, or is damaged or truncated; or if ``frame`` is unknown.
       CapacityError: if memory is too small; raised before the body is read.
     """
     path = Path(path)
-    with _opened(path) as (stream, size):
-        return _read(stream, path, size)
-
-
-def _read(stream: BinaryIO, path: Path, size: int) -> Gaussians:
-    version, count, degree, fraction, flags = _read_header(stream, path)
-    bases = num_bases(degree)
-    widths = {"means": 9, "opacities": 1, "colors": 3, "scales": 3}
-    widths["quats"] = 3 if version == 2 else 4
-    widths["sh"] = 3 * (bases - 1)
-    if count * sum(widths.values()) > _MAX_RATIO * size:
-        raise InputError(
-            f"{path}: the header declares {count:,} Gaussians, which {size:,} bytes "
-            f"cannot hold; the file is truncated or damaged: {_REMEDY}"
-        )
-    estimate = Estimate({"values as read": count * (220 + 16 * 3 * bases)})
-    remedy = "reduce the file with the tool that made it"
-    require(estimate, f"{path}: {count:,} Gaussians", remedy)
-    parts: dict[str, np.ndarray] = {}
-    for name, width in widths.items():
-        raw = stream.read(count * width)
-        if len(raw) < count * width:
-            raise InputError(
-                f"{path}: expected {count * width:,} bytes of {name}, got {len(raw):,}"
-                f"; the file is truncated: {_REMEDY}"
-            )
-        parts[name] = np.frombuffer(raw, np.uint8).reshape(count, width)
-    if stream.read(1):
-        what = "bytes after the last Gaussian are ignored"
-        if flags & _EXTENSIONS:
-            what = "extensions are ignored, and may change colours"
-        common.warn(f"{path}: {what}")
-    if flags & _ANTIALIASED:
+    if frame not in _AXES:
+        got = f"got {frame!r}; choose that of the program that wrote {path}"
+        raise InputError(f"frame: expected one of {[*_AXES]}, {got}")
+    header, blocks, extensions = container.read_spz_content(path)
+    axes = _recorded_axes(path, extensions) or _AXES[frame]
+    if header.flags & container.ANTIALIASED:
         remedy = "render it with RasterConfig(antialias=True, dilation=0.1)"
         common.warn(f"{path}: the scene was trained with antialiasing; {remedy}")
-    sh = np.zeros((count, bases, 3), np.float32)
-    sh[:, 0] = (parts["colors"] / 255 - 0.5) / _COLOR
-    rest = parts["sh"].reshape(count, bases - 1, 3)
-    signs = _signs(degree)
-    sh[:, 1:] = (rest.astype(np.float32) - 128) / 128 * signs[1:, None]
+    bases = num_bases(header.degree)
+    sh = np.zeros((header.rows, bases, 3), np.float32)
+    sh[:, 0] = (blocks["colors"] / 255 - 0.5) / _COLOR
+    rest = blocks["sh"].reshape(header.rows, bases - 1, 3)
+    signs = _signs(header.degree, axes)[1:, None] / 128
+    np.multiply(rest.astype(np.float32) - 128, signs, out=sh[:, 1:])
     return make_gaussians(
-        means=_integers(parts["means"]) / 2.0**fraction * _HALF_TURN,
-        quats=_unpack_quats(parts["quats"]),
-        log_scales=parts["scales"].astype(np.float32) / _SCALE - _SHIFT,
-        logit_opacities=_logits(parts["opacities"][:, 0]),
+        means=_integers(blocks["means"]) / 2.0**header.fraction * axes,
+        quats=_unpacked(blocks["quats"], axes),
+        log_scales=blocks["scales"].astype(np.float32) / _SCALE - _SHIFT,
+        logit_opacities=common.byte_logits(blocks["opacities"][:, 0]),
         sh=sh,
         capacity=None,
     )
 
 
-def _read_header(stream: BinaryIO, path: Path) -> tuple[int, int, int, int, int]:
-    """Return version, number of Gaussians, degree, fraction and flags."""
-    raw = stream.read(_HEADER.size)
-    if len(raw) < _HEADER.size or raw[:4] != _MAGIC:
+def _recorded_axes(path: Path, extensions: dict[int, bytes]) -> tuple | None:
+    """Return the signs of the axes that a file records, or None without a record."""
+    unknown = sorted(extensions.keys() - {_AXES_RECORD, _CAMERA_RECORD})
+    if unknown:
+        kinds = ", ".join(f"{kind:#x}" for kind in unknown)
+        common.warn(f"{path}: extensions of type {kinds} are ignored")
+    payload = extensions.get(_AXES_RECORD)
+    if payload is None:
+        return None
+    number = int.from_bytes(payload, "little")
+    if len(payload) != 4 or number not in _AXES_NUMBERS:
+        known = ", ".join(f"{key} ({axes})" for key, axes in _AXES_NUMBERS.items())
         raise InputError(
-            f"{path}: expected an SPZ header of {_HEADER.size} bytes that starts with "
-            f"{_MAGIC!r}, got {raw[:8]!r}; {_REMEDY}"
+            f"{path}: expected axes of {known} in the extension {_AXES_RECORD:#x}, got "
+            f"{payload[:8].hex() or 'no number'}; export the file in one of them"
         )
-    _, version, rows, degree, fraction, flags, _ = _HEADER.unpack(raw)
-    for name, value, least, most in (
-        *(("version", version, 2, 3), ("degree", degree, 0, 4)),
-        ("fraction", fraction, 0, 24),
-    ):
-        if not least <= value <= most:
-            expected = f"a header with {name} {least} to {most}, got {value}"
-            raise InputError(
-                f"{path}: expected {expected}; export it in another version"
-            )
-    return version, rows, degree, fraction, flags
-
-
-def _logits(opacities: np.ndarray) -> np.ndarray:
-    """Return logits of [N] bytes; 0 and 255 stand for a quarter of a step within."""
-    share = np.clip(opacities / 255, _MIN_OPACITY, 1 - _MIN_OPACITY)
-    return np.log(share / (1 - share))
+    return _AXES[_AXES_NUMBERS[number]]
 
 
 def _integers(raw: np.ndarray) -> np.ndarray:
@@ -173,50 +131,41 @@ def _integers(raw: np.ndarray) -> np.ndarray:
     return low + 256 * middle + 65536 * (high - 256 * (high > 127))
 
 
-def _unpack_quats(raw: np.ndarray) -> np.ndarray:
+def _quat_signs(axes: tuple[int, int, int]) -> np.ndarray:
+    """Return the factors [4] of a quaternion xyzw in axes with other signs."""
+    x, y, z = axes
+    return np.asarray([y * z, x * z, x * y, 1])
+
+
+def _unpacked(raw: np.ndarray, axes: tuple[int, int, int]) -> np.ndarray:
     """Return unit quaternions wxyz [N, 4] in our axes, from 3 or 4 bytes."""
-    xyzw = np.zeros((len(raw), 4))
     if raw.shape[1] == 3:
+        xyzw = np.zeros((len(raw), 4))
         xyzw[:, :3] = raw / 127.5 - 1
-        largest = np.full(len(raw), 3)
+        xyzw[:, 3] = np.sqrt(np.maximum(0, 1 - np.sum(xyzw**2, 1)))
     else:
-        packed = np.ascontiguousarray(raw).view("<u4")[:, 0].astype(np.int64)
-        largest = packed >> 30
-        for axis in reversed(range(4)):
-            stored = largest != axis
-            value = (packed & 511) / 511 * math.sqrt(0.5)
-            value = np.where(packed & 512, -value, value)
-            xyzw[:, axis] = np.where(stored, value, 0)
-            packed = np.where(stored, packed >> 10, packed)
-    rest = np.sqrt(np.maximum(0, 1 - np.sum(xyzw**2, 1)))
-    xyzw[np.arange(len(raw)), largest] = rest
-    xyzw[:, :3] *= _HALF_TURN
-    return xyzw[:, [3, 0, 1, 2]]
+        words = split_words(np.ascontiguousarray(raw).view("<u4")[:, 0])
+        # A sign above a size of 9 bits.
+        sizes, half = words.codes & 511, _LEVELS // 2
+        codes = half + np.where(words.codes > 511, -sizes, sizes)
+        xyzw = unpack_quats(PackedQuats(words.dropped, codes), _LEVELS)
+    return (xyzw * _quat_signs(axes))[:, [3, 0, 1, 2]]
 
 
-def _pack_quats(wxyz: np.ndarray) -> np.ndarray:
-    """Pack the three smallest components and the index of the largest in 4 bytes."""
-    xyzw = wxyz[:, [1, 2, 3, 0]] * [*_HALF_TURN, 1]
-    largest = np.abs(xyzw).argmax(1)
-    # The largest is made positive: -q is the rotation q.
-    xyzw = xyzw * np.where(np.take_along_axis(xyzw, largest[:, None], 1) < 0, -1, 1)
-    packed = largest.astype(np.int64)
-    for axis in range(4):
-        value = xyzw[:, axis]
-        size = np.rint(511 * np.abs(value) / math.sqrt(0.5)).astype(np.int64)
-        one = np.where(value < 0, 512, 0) + np.minimum(size, 511)
-        packed = np.where(largest == axis, packed, (packed << 10) + one)
-    return packed.astype("<u4")
+def _packed(wxyz: np.ndarray) -> np.ndarray:
+    """Return quaternions [N, 4] in words [N] of 32 bits."""
+    xyzw = wxyz[:, [1, 2, 3, 0]] * _quat_signs(_AXES["rub"])
+    dropped, codes = pack_quats(xyzw, _LEVELS)
+    signed = codes - _LEVELS // 2
+    words = np.abs(signed) + 512 * (signed < 0)
+    return join_words(PackedQuats(dropped, words)).astype("<u4")
 
 
-def _signs(degree: int) -> np.ndarray:
-    """Return the factor [K] of each basis function under half a turn about x."""
-    direction = np.array([0.48, 0.6, 0.64])  # where no basis function is zero
-    ours, theirs = (
-        np.asarray(sh_basis(degree, *jnp.asarray(d)))
-        for d in (direction, direction * _HALF_TURN)
-    )
-    return np.sign(ours * theirs).astype(np.float32)
+def _signs(degree: int, axes: tuple[int, int, int]) -> np.ndarray:
+    """Return the factor [K] of each basis function in axes with other signs."""
+    sign = dict(zip("xyz", axes))
+    factors = (math.prod(sign[axis] for axis in odd) for odd in _ODD)
+    return np.fromiter(factors, np.float32)[: num_bases(degree)]
 
 
 def write_spz(
@@ -225,44 +174,50 @@ def write_spz(
     *,
     overwrite: bool = False,
     mode: str | None = None,
+    version: int = container.PLAIN_VERSION,
 ) -> None:
-    """Write the active Gaussians as an SPZ file of version 3.
+    """Write the active Gaussians as an SPZ file of version 3 or 4.
 
     Means are rounded to 2⁻²⁰, or to 2⁻²³ of the largest; log scales to 1/16 from -10
     to 5.9; opacities and colours to 8 bits; harmonics to 6 bits of -1 to 1 in degree 1,
-    5 above. Values out of range are clipped with a warning.
+    5 above. Values out of range are clipped with a warning, and so is SH degree 4
+    warned about, which most programs reject. The axes are right, up, back.
 
     Args:
-      path, gaussians, overwrite: as `gsjax.io.formats.save`; SH degree 0 to 3.
+      path, gaussians, overwrite: as `gsjax.io.formats.save`.
       mode: "mip" records that the scene was trained with antialiasing.
+      version: 4 is what Niantic's library and splat-transform write, and is smaller. 3
+        is read by Spark and by programs older than version 4, not by PlayCanvas.
 
     Raises:
       InputError: as `write_ply`; if a value is NaN, or infinite and not a logit, if a
-        mean exceeds 8 million, if the degree is 4, or if nothing would be drawn.
+        mean exceeds 8 million, if the version is unknown, or if nothing would be drawn.
       CapacityError: if memory is too small.
     """
     path = Path(path)
+    if version not in container.VERSIONS[1:]:
+        known, remedy = container.VERSIONS[1:], "pass one of them"
+        raise InputError(f"version: expected one of {known}, got {version!r}; {remedy}")
     common.require_new(path, overwrite)
     rows, fraction = _checked_rows(path, gaussians)
     _warn_of_losses(path, rows, fraction)
     count, degree = len(rows["means"]), gaussians.sh_degree
-    means = np.rint(rows["means"].astype(np.float64) * 2.0**fraction * _HALF_TURN)
+    flags = container.ANTIALIASED * (mode == "mip")
+    header = container.SpzHeader(version, count, degree, fraction, flags)
+    means = np.rint(rows["means"] * (2.0**fraction * np.asarray(_AXES["rub"])))
+    integers = np.ascontiguousarray(means.astype("<i4")).view(np.uint8)
     scales = _SCALE * (rows["log_scales"].astype(np.float64) + _SHIFT)
-    flags = _ANTIALIASED * (mode == "mip")
-    with (
-        replacing(path, durable=True) as file,
-        gzip.GzipFile("", "wb", 6, file, mtime=0) as stream,
-    ):
-        stream.write(_HEADER.pack(_MAGIC, 3, count, degree, fraction, flags, 0))
-        integers = np.ascontiguousarray(means.astype("<i4")).view(np.uint8)
-        stream.write(integers.reshape(-1, 4)[:, :3].tobytes())
-        stream.write(common.opacity_bytes(rows["logit_opacities"]).tobytes())
-        stream.write(common.to_bytes(255 * (0.5 + _COLOR * rows["sh"][:, 0])).tobytes())
-        stream.write(common.to_bytes(scales).tobytes())
-        stream.write(_pack_quats(rows["quats"]).tobytes())
-        for start in range(0, count, CHUNK_ROWS):
-            some = rows["sh"][start : start + CHUNK_ROWS]
-            stream.write(_harmonics(some, degree).tobytes())
+    arrays = {
+        "means": integers.reshape(-1, 4)[:, :3],
+        "opacities": common.opacity_bytes(rows["logit_opacities"]),
+        "colors": common.to_bytes(255 * (0.5 + _COLOR * rows["sh"][:, 0])),
+        "scales": common.to_bytes(scales),
+        "quats": _packed(rows["quats"]),
+    }
+    blocks = {name: iter([array.tobytes()]) for name, array in arrays.items()}
+    blocks["sh"] = _harmonics(rows["sh"], degree)
+    with replacing(path, durable=True) as file:
+        container.write_spz_content(file, header, blocks)
 
 
 def _checked_rows(
@@ -270,10 +225,10 @@ def _checked_rows(
 ) -> tuple[dict[str, np.ndarray], int]:
     """Return the Gaussians to write, and the bits of the fraction of their means."""
     degree = gaussians.sh_degree
-    if degree > _MAX_WRITTEN_DEGREE:
-        raise InputError(
-            f"{path}: expected SH degree 0 to {_MAX_WRITTEN_DEGREE}, got {degree}; cut "
-            "it with gsjax.with_sh_degree (--sh-degree)"
+    if degree > _COMMON_DEGREE:
+        common.warn(
+            f"{path}: most programs reject SPZ files of SH degree {degree}; cut it to "
+            f"{_COMMON_DEGREE} with gsjax.with_sh_degree (--sh-degree)"
         )
     slots, bases = gaussians.capacity, num_bases(degree)
     estimate = Estimate({"values to be written": slots * (300 + 16 * 3 * bases)})
@@ -290,13 +245,15 @@ def _checked_rows(
     return rows, min(_MAX_FRACTION, math.floor(fraction))
 
 
-def _harmonics(sh: np.ndarray, degree: int) -> np.ndarray:
-    """Return [N, K - 1, 3] bytes of [N, K, 3]: 128 (1 + value), to the bits kept."""
-    turned = sh[:, 1:] * _signs(degree)[1:, None]
+def _harmonics(sh: np.ndarray, degree: int) -> Iterator[bytes]:
+    """Yield the bytes of harmonics [N, K, 3]: 128 (1 + value), to the bits kept."""
+    signs = _signs(degree, _AXES["rub"])[1:, None]
     first, above = _BITS
-    steps = np.full((turned.shape[1], 1), 2.0 ** (8 - above))
+    steps = np.full(signs.shape, 2.0 ** (8 - above))
     steps[:3] = 2.0 ** (8 - first)
-    return common.to_bytes(np.rint(128 * (1 + turned) / steps) * steps)
+    for start in range(0, len(sh), CHUNK_ROWS):
+        turned = sh[start : start + CHUNK_ROWS, 1:] * signs
+        yield common.to_bytes(np.rint(128 * (1 + turned) / steps) * steps).tobytes()
 
 
 def _warn_of_losses(path: Path, rows: dict[str, np.ndarray], fraction: int) -> None:

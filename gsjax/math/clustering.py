@@ -21,7 +21,7 @@ _PER_GROUP = 256  # clusters of a group, on average
 _IN_GROUP = 4  # iterations within a group
 _SAMPLED = 4  # points per cluster among which the first centroids are chosen
 _LLOYD_STEPS = 40
-_BINS = 8192
+_BINS = 512  # more are noisy: each then holds few values
 
 
 class Clusters(NamedTuple):

@@ -6,6 +6,7 @@ K spherical-harmonic bases.
 """
 
 import math
+from functools import cache
 
 import numpy as np
 
@@ -42,12 +43,12 @@ def rotation_blocks(degree: int, rotation: np.ndarray) -> list[np.ndarray]:
             f"rotation: expected an orthogonal matrix [3, 3], got {got}; divide it by "
             "its scale"
         )
-    directions = _directions()
-    before, after = (_basis(degree, d) for d in (directions, directions @ rotation.T))
+    # The colour of c' in a direction e is that of c in the direction Rᵀ e.
+    directions, inverses = _system(degree)
+    before = _basis(degree, directions @ rotation)
     blocks = [np.eye(1)]
     for l in range(1, degree + 1):
-        band = slice(l * l, (l + 1) ** 2)
-        block = np.linalg.lstsq(after[:, band], before[:, band], rcond=None)[0]
+        block = inverses[l] @ before[:, l * l : (l + 1) ** 2]
         whole = np.rint(block)
         blocks.append(np.where(np.abs(block - whole) < _SNAP, whole, block))
     return blocks
@@ -70,13 +71,27 @@ def rotate_sh(sh: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     rotated = np.empty_like(sh)
     for l, block in enumerate(rotation_blocks(degree_of(sh.shape[1]), rotation)):
         band = slice(l * l, (l + 1) ** 2)
-        rotated[:, band] = np.einsum("ij,njc->nic", block, sh[:, band])
+        signs = np.diagonal(block)
+        if np.array_equal(block, np.diag(signs)):  # as for half turns: much faster
+            rotated[:, band] = sh[:, band] * signs[:, None]
+        else:
+            turned = np.tensordot(sh[:, band], block, axes=(1, 1))
+            rotated[:, band] = np.moveaxis(turned, -1, 1)
     return rotated
 
 
 def _is_orthogonal(matrix: np.ndarray) -> bool:
     error = np.abs(matrix @ matrix.T - np.eye(3))
     return bool(error.max() < _ORTHOGONAL)  # False for NaN
+
+
+@cache
+def _system(degree: int) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return directions [D, 3], and the inverses [2 l + 1, D] of their basis."""
+    directions = _directions()
+    basis = _basis(degree, directions)
+    bands = [basis[:, l * l : (l + 1) ** 2] for l in range(degree + 1)]
+    return directions, [np.linalg.pinv(band) for band in bands]
 
 
 def _directions() -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, num_active, select, with_sh_degree
-from gsjax.io.formats import load, render_mode, save
+from gsjax.io.formats import keeps_every_bit, load, render_mode, save
 from gsjax.runs.folder import load_settings, ply_mode
 from gsjax.runs.scene_source import is_run, splat_file
 from gsjax.runtime.files import make_folder, reject_existing
@@ -44,7 +44,7 @@ def export_scene(
         gaussians, found = _load_opaque(path, min_opacity)
         if sh_degree is not None:
             gaussians = with_sh_degree(gaussians, sh_degree)
-        if out.suffix.lower() != ".ply":  # other formats cannot hold zero quaternions
+        if not keeps_every_bit(out):  # such formats cannot hold zero quaternions
             rotated = np.any(np.asarray(gaussians.params.quats) != 0, axis=1)
             gaussians = select(gaussians, jnp.asarray(rotated))
         make_folder(out.parent)

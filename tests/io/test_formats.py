@@ -45,11 +45,11 @@ def test_formats_from_outside(tmp_path):
     gsjax.save(path, gsjax.grow(scene(), 9), formats=formats, overwrite=True)
     found = gsjax.load(path, formats=formats)
     np.testing.assert_array_equal(found.params.means, scene().params.means)
-    rejects(r"a suffix of \.ply, \.spz, got '\.M", gsjax.load, path)
+    rejects(r"a suffix of .*\.ply, .*\.spz, .*got '\.M", gsjax.load, path)
     ply = tmp_path / "a.ply"
     gsjax.save(ply, scene(), formats=formats)
     assert np.load(ply).shape == (2, 3)
-    expected = r"expected a suffix of \.means, \.npy, \.spz, got"
+    expected = r"expected a suffix of .*\.means, \.npy, (?!\.ply).*\.spz, .*got"
     rejects(expected, gsjax.load, ply, formats=formats)
 
 
@@ -61,15 +61,14 @@ def refusals(folder: Path):
     for path in there:
         path.touch()
     return [
-        (lambda: gsjax.load(folder / "a.obj"), r"a\.obj: .*\.ply, \.spz, got '\.obj'"),
-        (lambda: gsjax.load(folder / "a.splat"), r"a\.splat: .* of \.ply, \.spz, got"),
+        (lambda: gsjax.load(folder / "a.obj"), r"a\.obj: .*ply, .*\.spz, .*got '\.obj'"),
         (lambda: gsjax.load(folder / "none.ply"), r"none\.ply: cannot be read: No su"),
         (lambda: gsjax.load(folder / "folder.ply"), r"folder\.ply: not a regular file"),
         (lambda: gsjax.load(folder / "pipe.ply"), r"pipe\.ply: not a regular file"),
         (lambda: gsjax.load(one), r"path: expected .*, got Gaussians; call load\(path"),
         (lambda: gsjax.save(one, folder / "a.ply"), r"path: .*save\(path, gaussians\)"),
         (lambda: gsjax.save(folder / "a.ply", [one]), r"got list; .*gsjax.concatenate"),
-        (lambda: gsjax.save(folder / "a.obj", one), r"of \.ply, \.splat, \.spz, got"),
+        (lambda: gsjax.save(folder / "a.obj", one), r"of .*\.splat, \.spz, .*got"),
         (lambda: gsjax.save(folder / "none/a.ply", one), r"none.* is missing; create"),
         (lambda: gsjax.save(there[0], one), r"there\.ply: exists.*overwrite=True"),
         (lambda: gsjax.save(there[1], one), r"there\.spz: exists.*overwrite=True"),

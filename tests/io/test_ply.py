@@ -276,7 +276,7 @@ BAD = [
         renamed(lambda k: None if k[-2:] == "_8" else k),
         r"72\] properties f_rest.*got 8",
     ),
-    (PACKED, "compressed"),
+    (PACKED, "compressed PLY, got .* lacks .* vertex packed_rotation"),
     (ASCII[: ASCII.rindex(b" ")], r"vertex 2 \(byte \d+\): .* 17 .* got 16;"),
     # The last line is empty.
     (ASCII[: ASCII.rindex(b"\n", 0, -1)] + b"\n" + b" " * 99 + b"\n", "2 .* got 0;"),

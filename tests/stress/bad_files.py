@@ -9,6 +9,8 @@ from collections.abc import Callable
 from zipfile import ZIP_DEFLATED, ZIP_LZMA
 
 import numpy as np
+import zstandard
+from glb_files import edited, primitive, put_together, taken_apart, with_array
 from good_files import COLMAP_TEXT, META, POSES, STEP, entries, npy
 
 # A change of the bytes of a good file, and a regular expression of the error.
@@ -37,6 +39,39 @@ def unpacked(change: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
     return lambda data: gzip.compress(change(gzip.decompress(data)))
 
 
+def insert(at: int, more: bytes):
+    """Insert bytes."""
+    return lambda data: data[:at] + more + data[at:]
+
+
+def chained(*changes: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """Apply changes one after another."""
+
+    def change(data: bytes) -> bytes:
+        for one in changes:
+            data = one(data)
+        return data
+
+    return change
+
+
+def extended(record: bytes) -> Callable[[bytes], bytes]:
+    """Add an extension record to SPZ of version 4."""
+    place = put(14, "BBI", 2, 5, 32 + len(record))
+    return chained(place, insert(32, record))
+
+
+def first_frame(content: bytes, **options) -> Callable[[bytes], bytes]:
+    """Replace the means of SPZ of version 4 of degree 0; its table stays true."""
+    frame = zstandard.ZstdCompressor(**options).compress(content)
+
+    def change(data: bytes) -> bytes:
+        rest = data[112 + struct.unpack_from("<Q", data, 32)[0] :]
+        return data[:32] + struct.pack("<Q", len(frame)) + data[40:112] + frame + rest
+
+    return change
+
+
 def just(data: bytes | str):
     return lambda _: data.encode() if isinstance(data, str) else data
 
@@ -61,6 +96,19 @@ def at(*keys, to):
         value[keys[-1]] = to
 
     return changed(edit)
+
+
+def in_meta(*keys, to):
+    """Set a value in the meta.json of a SOG."""
+    change = at(*keys, to=to)
+    return entries(
+        lambda found: found.update({"meta.json": change(found["meta.json"])})
+    )
+
+
+def in_entry(name: str, change: Callable[[bytes], bytes]):
+    """Change a file of a SOG."""
+    return entries(lambda found: found.update({name: change(found[name])}))
 
 
 def frame(key, to):
@@ -172,11 +220,11 @@ ROWS["ascii.ply"] = {
     ),
     "row endless": (lambda d: d[:-2] + b"1 " * 500_000, "vertex 3 .*got a line of"),
 }
-ROWS["scene.spz"] = {
+ROWS["older.spz"] = {
     "empty": (just(b""), "expected an SPZ header.*got b''"),
     "of something": (just(png(4, 4)), "not an SPZ file, or damaged .*gzip"),
     "magic": (unpacked(swap("NGSP", "PSGN")), "expected an SPZ header.*got b'PSGN"),
-    "of later": (gzip.decompress, "got 4 or later"),
+    "not packed": (gzip.decompress, "version 4, got 3"),
     "version": (unpacked(put(4, "I", 9)), "version 2 to 3, got 9"),
     "degree": (unpacked(put(12, "B", 7)), "degree 0 to 4, got 7"),
     "fraction": (unpacked(put(13, "B", 99)), "fraction 0 to 24, got 99"),
@@ -184,6 +232,352 @@ ROWS["scene.spz"] = {
     "count, a little": (unpacked(put(8, "I", 5)), "expected 20 bytes of quats, got 0"),
     "cut within": (unpacked(lambda d: d[:-5]), "bytes of quats, got"),
     "checksum": (lambda d: d[:-8] + bytes(4) + d[-4:], "damaged .*CRC"),
+    "long": (unpacked(lambda d: d + bytes(2**21)), "at most 262,144 bytes after"),
+    "extension": (
+        unpacked(chained(put(14, "B", 2), lambda d: d + bytes(7))),
+        "extension records, got one that is truncated after 7 bytes",
+    ),
+}
+AXES = struct.pack("<III", 0xADBE0003, 4, 3)
+ROWS["scene.spz"] = {
+    "empty": (just(b""), "expected an SPZ header of 16 bytes.*got b''"),
+    "magic": (swap("NGSP", "PSGN"), "not an SPZ file, or damaged"),
+    "version": (put(4, "I", 5), "version 4, got 5"),
+    "degree": (put(12, "B", 5), "degree 0 to 4, got 5"),
+    "count": (put(8, "I", 2**32 - 1), "4,294,967,295 Gaussians, which .* cannot hold"),
+    "count, a little": (put(8, "I", 5), "expected 45 bytes of means, got 36 in the"),
+    "blocks": (put(15, "B", 6), "expected a table of 5 blocks .*, got 6 at byte 32"),
+    "table before": (put(16, "I", 0), "got 5 at byte 0;"),
+    "table after": (put(16, "I", 2**31), "got 5 at byte 2,147,483,648"),
+    "size": (put(40, "Q", 2**40), "36 bytes of means, got 1,099,511,627,776 in the"),
+    "packed": (put(32, "Q", 2**40), "expected a file of 1,099,511,6"),
+    "long": (lambda d: d + b"x", "expected a file of .* after its table of contents"),
+    "frame": (put(112, "I", 0), "the block of means is damaged"),
+    "bomb": (first_frame(bytes(10**8)), "36 bytes of means, got 100,000,000"),
+    "bomb of unknown size": (
+        first_frame(bytes(10**8), write_content_size=False),
+        "the block of means is damaged",
+    ),
+    "frame, short": (
+        first_frame(bytes(35), write_content_size=False),
+        "36 bytes of means, got 35",
+    ),
+    "two frames": (
+        chained(first_frame(bytes(36)), put(32, "Q", 45), insert(112, b"x" * 27)),
+        "damaged",
+    ),
+    "extension": (extended(AXES[:-1]), "got one that is truncated after 11 bytes"),
+    "axes": (extended(AXES), r"axes of 4 \(rub\), 6 \(rdf\) .*, got 03000000"),
+    "axes empty": (extended(AXES[:4] + bytes(4)), "axes of .*, got no number"),
+}
+ROWS["scene.splat"] = {
+    "empty": (just(b""), "rows of 32 bytes, got 0 bytes"),
+    "long": (lambda d: d + b"x", "rows of 32 bytes, got 129 bytes"),
+    "mean": (put(32 + 4, "f", np.nan), "1 of 4 rows .* row 1 with a mean that is"),
+    "scale": (put(12, "f", -1e-9), "row 0 with a scale that is negative"),
+    "scale infinite": (put(16, "f", np.inf), "row 0 with a scale that is negative or"),
+    "quaternion": (put(124, "4B", *[128] * 4), "row 3 with a quaternion that is zero"),
+}
+ROWS["scene.compressed.ply"] = {
+    "text": (swap("binary_little_endian", "ascii"), "expected a binary body"),
+    "chunks": (swap("chunk 1", "chunk 2"), "expected 1 chunks for 4 Gaussians, got 2"),
+    "count": (swap("vertex 4", "vertex 4000000000"), "expected 15,625,000 chunks"),
+    "both": (
+        chained(swap("vertex 4", "vertex 1024000"), swap("chunk 1", "chunk 4000")),
+        "truncated: expected 16672000 bytes",
+    ),
+    "type": (swap("uint packed_scale", "int packed_scale"), "vertex packed_scale"),
+    "no bounds": (swap("min_x", "least_x"), "lacks the properties chunk min_x"),
+    "no element": (swap("chunk 1", "lump 1"), "lacks .*chunk min_x, chunk min_y"),
+    "list": (swap("float min_x", "list uchar int q"), "without lists"),
+    "harmonics": (
+        swap("end_header", "element sh 4\nproperty uchar f_rest_0\nend_header"),
+        r"4 rows of \[0, 9, 24, 45\] harmonics, got 4 of 1;",
+    ),
+    "not finite": (
+        lambda d: d[: -64 - 72] + NAN + d[-64 - 68 :],
+        "row [0-3] with a mean that is not finite",
+    ),
+}
+ROWS["scene.ksplat"] = {
+    "empty": (just(b""), "expected 4,096 bytes of the header, got 0"),
+    "version": (put(1, "B", 2), "version 0.1 and .*, got version 0.2 and level 1"),
+    "level": (put(20, "H", 3), "got version 0.1 and level 3"),
+    "sections": (put(4, "2I", 2**31, 2**31), "of 2,147,483,648"),
+    "no section": (put(8, "I", 0), "got 0 sections of 1"),
+    "count": (put(16, "I", 5), "sections of 5 Gaussians, at least 1, got 4"),
+    "incomplete": (put(4096, "I", 3), "all 4 Gaussians, got 3: .* incomplete"),
+    "both counts": (put(4096, "2I", 2**30, 2**30), "in section 0 .* bytes, got"),
+    "buckets": (put(4096 + 32, "I", 2), "expected in section 0 4 buckets"),
+    "bucket": (put(5120, "I", 5), "buckets that hold 4 Gaussians, got 8"),
+    "block": (put(4096 + 16, "f", np.nan), "finite size, got .* size nan"),
+    "degree": (put(4096 + 40, "H", 3), "SH degree 0 to 2, got 3"),
+    "storage": (put(4096 + 28, "I", 2**31), "bytes, got 2,147,483,648"),
+    "center": (put(5120 + 8, "f", np.inf), "with a mean that is not finite"),
+}
+SECRET = "../../../etc/passwd"
+ROWS["scene.sog"] = {
+    "empty": (just(b""), "not a SOG, or truncated: File is not a zip"),
+    "of something": (just(png(4, 4)), "not a SOG"),
+    "without": (
+        entries(lambda e: e.pop("meta.json")),
+        "meta.json is missing, got .'me",
+    ),
+    "texture missing": (entries(lambda e: e.pop("sh0.webp")), "sh0.webp is missing"),
+    "compression": (entries(lambda _: 0, ZIP_LZMA), "expected a stored or deflated"),
+    "checksum": (swap("generator", "Generator"), "meta.json: damaged .*CRC"),
+    "bomb": (
+        entries(lambda e: e.update({"meta.json": b" " * 10**7}), ZIP_DEFLATED),
+        "meta.json: expected at most 1,048,576 bytes, got 10,000,000",
+    ),
+    "texture bomb": (
+        entries(lambda e: e.update({"quats.webp": bytes(10**7)}), ZIP_DEFLATED),
+        r"quats.webp: expected at most [\d,]+ bytes, got 10,000,000",
+    ),
+    "large": (in_entry("sh0.webp", just(webp(16_383, 16_383))), "up to .* 16383 ×"),
+    "small": (in_meta("count", to=17), "expected 17 texels or more, got 4 × 4"),
+    "count": (in_meta("count", to=2**28), "declares 268,435,456 Gaussians, which"),
+    "count negative": (in_meta("count", to=-1), "count: .* from 0 to .*, got -1"),
+    "count fraction": (in_meta("count", to=4.5), "count: .*a whole number .*, got 4.5"),
+    "lossy": (
+        in_entry("scales.webp", just(b"RIFF\x20\0\0\0WEBPVP8 " + bytes(24))),
+        "scales.webp: expected a lossless WebP",
+    ),
+    "no image": (in_entry("quats.webp", just(b"no")), "a WebP image, got 2 bytes"),
+    "texture cut": (in_entry("quats.webp", lambda d: d[:-4]), "the file is truncated"),
+    "pixels": (
+        in_entry("quats.webp", lambda d: d[:25] + bytes(len(d) - 25)),
+        "decoded",
+    ),
+    "no header": (
+        in_entry("quats.webp", just(b"RIFF\x14\0\0\0WEBPEXIF" + bytes(12))),
+        "expected a lossless WebP, got another",
+    ),
+    "path up": (
+        in_meta("quats", "files", 0, to=SECRET),
+        "name of a file beside .*passw",
+    ),
+    "path absolute": (in_meta("means", "files", 1, to="/etc/passwd"), "beside meta"),
+    "path of Windows": (in_meta("sh0", "files", 0, to="..\\a"), "beside meta.json"),
+    "path with 0": (in_meta("sh0", "files", 0, to="a\0b"), "beside meta.json"),
+    "path unpaired": (in_meta("sh0", "files", 0, to="\ud800"), "beside meta.json"),
+    "path empty": (in_meta("sh0", "files", 0, to=""), "beside meta.json"),
+    "path itself": (
+        in_meta("sh0", "files", 0, to="meta.json"),
+        "expected a WebP image",
+    ),
+    "files": (in_meta("means", "files", to=["a"]), "means.files: expected 2 names"),
+    "files of numbers": (
+        in_meta("sh0", "files", to=[1]),
+        "sh0.files: expected 1 names",
+    ),
+    "bounds": (in_meta("means", "mins", to=[0, 0]), "means.mins: expected 3 finite"),
+    "bounds nan": (in_meta("means", "maxs", 2, to=np.nan), "means.maxs: .*3 finite"),
+    "bounds far": (
+        in_meta("means", "maxs", 2, to=200),
+        "expected means within float32",
+    ),
+    "codebook nan": (in_meta("scales", "codebook", 9, to=np.nan), "1 to 256 finite"),
+    "codebook huge": (in_meta("sh0", "codebook", 9, to=1e39), "1 to 256 finite numb"),
+    "codebook long": (in_meta("sh0", "codebook", to=[0] * 257), "1 to 256 finite"),
+    "codebook text": (in_meta("sh0", "codebook", 0, to="0"), "1 to 256 finite num"),
+    "codebook short": (
+        in_meta("scales", "codebook", to=[0]),
+        "scales: expected indices",
+    ),
+    "bands": (in_meta("shN", "bands", to=4), "shN.bands: .* from 1 to 3, got 4"),
+    "bands other": (
+        in_meta("shN", "bands", to=2),
+        "a palette 512 texels wide, got 192",
+    ),
+    "entries": (in_meta("shN", "count", to=2**16 + 1), "shN.count: .* got 65537"),
+    "entries more": (in_meta("shN", "count", to=65), "2 rows for 65 entries, got 1"),
+    "label": (
+        in_meta("shN", "files", 1, to="quats.webp"),
+        "shN_labels|quats.webp: expected indices below the 1 entries",
+    ),
+}
+ROWS["sog/meta.json"] = {
+    "empty": (just(b""), "not JSON"),
+    "list": (just(b"[2]"), "expected an object with 'version'|got .2"),
+    "deep": (just(DEEP), "not JSON"),
+    "encoding": (just(b"\xff\xfe\xff"), "not JSON"),
+    "huge": (just(b" " * 2**21), "expected at most 1,048,576 bytes, got 2,097,152"),
+    "version": (at("version", to=3), "expected version 2, or none .*, got 3"),
+    "version true": (at("version", to=True), "expected version 2, .*, got True"),
+    "count": (at("count", to=2**28), "which [\\d,]+ bytes cannot hold"),
+    "object": (at("means", to=[]), "means.*: expected an object with"),
+    "texture missing": (at("sh0", "files", 0, to="none.webp"), "none.webp: cannot be"),
+    "path up": (at("quats", "files", 0, to=SECRET), "beside meta.json, got .*passwd"),
+}
+ROWS["sog/quats.webp"] = {
+    "empty": (just(b""), "expected a WebP image, got 0 bytes"),
+    "kind": (just(png(4, 4) + bytes(9)), "expected a WebP image, got .*PNG"),
+    "large": (just(webp(16_383, 16_383)), "texture of up to .* got 16383 × 16383"),
+}
+
+
+def as_glb(text: bytes) -> Callable[[bytes], bytes]:
+    """Replace the JSON of a glTF file by these bytes."""
+
+    def change(data: bytes) -> bytes:
+        body = taken_apart(data)[1]
+        padded = text + b" " * (-len(text) % 4)
+        head = struct.pack("<4sII", b"glTF", 2, 28 + len(padded) + len(body))
+        head += struct.pack("<I4s", len(padded), b"JSON") + padded
+        return head + struct.pack("<I4s", len(body), b"BIN\0") + body
+
+    return change
+
+
+def in_glb(*keys, to):
+    """Set a value in the JSON of a glTF file."""
+
+    def edit(value):
+        for key in keys[:-1]:
+            value = value[key]
+        value[keys[-1]] = to
+
+    return edited(edit)
+
+
+def in_primitive(edit: Callable[[dict], object]):
+    return edited(lambda data: edit(primitive(data)))
+
+
+SPLATS = "KHR_gaussian_splatting"
+
+
+def in_settings(key: str, to):
+    return in_primitive(lambda one: one["extensions"][SPLATS].update({key: to}))
+
+
+def without(name: str):
+    return in_primitive(lambda one: one["attributes"].pop(f"{SPLATS}:{name}"))
+
+
+def spoilt_array(name: str, value: float, width: int = 3):
+    """Set a number of an attribute of four Gaussians."""
+    array = np.full((4, width), 0.5, np.float32)
+    array[2, width - 1] = value
+    return lambda data: with_array(data, name, array)
+
+
+MAT = [1.0, *[0.0] * 4, 1.0, *[0.0] * 4, 1.0, *[0.0] * 4, 1.0]
+LONE = {"bufferView": 0, "byteOffset": 0, "componentType": 5126, "type": "VEC3"}
+ROWS["scene.glb"] = {
+    "empty": (just(b""), "byte 0: expected a binary glTF file.*got b''"),
+    "of something": (just(png(4, 4)), "byte 0: .*PNG"),
+    "version": (put(4, "I", 1), "glTF of version 2, got 1"),
+    "length": (put(8, "I", 99), "expected 99 bytes as its header declares, got"),
+    "long": (lambda d: d + bytes(4), "bytes as its header declares"),
+    "chunk": (put(16, "4s", b"TEXT"), "byte 12: expected a chunk b'JSON', got b'TEXT'"),
+    "chunk long": (put(12, "I", 2**31), "byte 12: expected a chunk of 2,147,483,648"),
+    "text": (as_glb(b"{,}"), "its JSON is damaged"),
+    "deep": (as_glb(DEEP), "its JSON is damaged"),
+    "list": (as_glb(b"[]"), "expected an object as JSON, got"),
+    "nothing": (as_glb(b"{}"), "expected a mesh with KHR_gaussian_splatting in the"),
+    "required": (
+        in_glb("extensionsRequired", to=["KHR_draco_mesh_compression", SPLATS]),
+        "no required extensions but .*, got .'KHR_draco_mesh_compression'",
+    ),
+    "required by a word": (in_glb("extensionsRequired", to="KHR"), "got 'KHR'"),
+    "scene": (in_glb("scene", to=1), "scenes: expected an index below 1, .*, got 1"),
+    "scene no list": (in_glb("scenes", 0, "nodes", to=0), "expected a list, got 0"),
+    "node": (in_glb("scenes", 0, "nodes", to=[7]), "nodes: expected an index below 1"),
+    "cycle": (
+        in_glb("nodes", 0, "children", to=[0]),
+        "expected nodes that form a tree",
+    ),
+    "twice": (
+        in_glb("scenes", 0, "nodes", to=[0, 0]),
+        "expected nodes that form a tree",
+    ),
+    "mesh": (in_glb("nodes", 0, "mesh", to=-1), "meshes: expected an index below 1"),
+    "translation": (in_glb("nodes", 0, "translation", to=[0, 0]), "3 finite numbers"),
+    "rotation": (in_glb("nodes", 0, "rotation", to=[0] * 4), "that is not zero"),
+    "scale": (in_glb("nodes", 0, "scale", to=[1, 1, 0]), "with scales that are not 0"),
+    "scale of a word": (in_glb("nodes", 0, "scale", to=1), "3 finite numbers, got 1"),
+    "scale nan": (in_glb("nodes", 0, "scale", to=[1, 1, np.nan]), "3 finite numbers"),
+    "matrix": (in_glb("nodes", 0, "matrix", to=MAT[:-1] + [2]), "last row of 0, 0, 0"),
+    "matrix huge": (in_glb("nodes", 0, "matrix", to=[10**400] * 16), "16 finite num"),
+    "mode": (
+        in_primitive(lambda one: one.pop("mode")),
+        "mode: expected 0, points, got 4",
+    ),
+    "kernel": (in_settings("kernel", "cube"), "kernel: expected 'ellipse', got 'cube'"),
+    "colours": (
+        in_settings("colorSpace", "acescg"),
+        "colorSpace: expected srgb_rec709",
+    ),
+    "no colours": (in_settings("colorSpace", None), "colorSpace: .*, got None"),
+    "attribute": (without("ROTATION"), "expected the attributes .*ROTATION, got"),
+    "compressed": (
+        chained(
+            without("SCALE"),
+            in_settings("extensions", {"KHR_gaussian_splatting_compression_x": {}}),
+        ),
+        "SCALE, got .*",
+    ),
+    "degree": (
+        without("SH_DEGREE_1_COEF_2"),
+        "whole SH degrees, .*, got '3 attributes",
+    ),
+    "degree 4": (
+        in_primitive(
+            lambda one: one["attributes"].update({f"{SPLATS}:SH_DEGREE_4_COEF_0": 0})
+        ),
+        "whole SH degrees, of up to 3",
+    ),
+    "accessor": (
+        in_primitive(lambda one: one["attributes"].update(POSITION=99)),
+        "accessors: expected an index below 9",
+    ),
+    "sparse": (
+        in_glb("accessors", 2, "sparse", to={}),
+        "a bufferView without 'sparse'",
+    ),
+    "zeros": (
+        edited(lambda data: data["accessors"][2].pop("bufferView")),
+        "a bufferView without 'sparse'",
+    ),
+    "type": (
+        in_glb("accessors", 3, "type", to="VEC4"),
+        "SCALE.: expected VEC3 of float",
+    ),
+    "kind": (
+        in_glb("accessors", 3, "componentType", to=5125),
+        "expected VEC3 of float",
+    ),
+    "normalised": (in_glb("accessors", 0, "normalized", to=True), "VEC3 of float, got"),
+    "count": (in_glb("accessors", 0, "count", to=10**9), "one Gaussian for each byte"),
+    "count, a little": (
+        in_glb("accessors", 3, "count", to=5),
+        "got '5 elements every 12",
+    ),
+    "count 0": (in_glb("accessors", 0, "count", to=0), "at least 1, got 0"),
+    "counts": (in_glb("accessors", 3, "count", to=3), "attributes of equal length"),
+    "instances": (
+        edited(lambda data: data.update(nodes=[{"mesh": 0}] * 1001, scenes=None)),
+        "at most 1,000 primitives with .*, got 'more'",
+    ),
+    "offset": (in_glb("accessors", 0, "byteOffset", to=2**31), "12 bytes within"),
+    "view": (in_glb("bufferViews", 0, "byteLength", to=47), "12 bytes within"),
+    "stride": (in_glb("bufferViews", 0, "byteStride", to=4), "12 bytes within"),
+    "buffer": (in_glb("bufferViews", 0, "buffer", to=1), "buffers: expected an index"),
+    "buffer long": (in_glb("buffers", 0, "byteLength", to=10**6), "12 bytes within"),
+    "uri": (in_glb("buffers", 0, "uri", to="file:///etc/passwd"), "without a URI"),
+    "meshopt": (
+        in_glb("bufferViews", 0, "extensions", to={"EXT_meshopt_compression": {}}),
+        "expected no extension, got .'EXT_meshopt",
+    ),
+    "no body": (
+        lambda data: put_together(taken_apart(data)[0], b""),
+        "elements of 12 bytes within 0 bytes",
+    ),
+    "mean nan": (spoilt_array("POSITION", np.nan), "POSITION: .*1 of 4 .*the first 2"),
+    "scale below 0": (spoilt_array("SCALE", -1), "at least 0, .*1 of 4 .*logarithms"),
+    "opacity": (spoilt_array("OPACITY", 1.5, 1), "opacities from 0 to 1"),
 }
 ROWS["cloud.ply"] = {
     "without y": (swap("float y", "float why"), "expected scalar properties x, y, z"),

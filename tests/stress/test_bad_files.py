@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from bad_files import BAD, CAMERAS, IMAGES, POINTS
 from captures import dataset_of_views, ply_file
-from good_files import READ, STEP, TEXT, write_good_files
+from good_files import READ, STEP, TEXT, WHOLE_ROWS, write_good_files
 
 from gsjax.cli.main import main
 from gsjax.data import colmap_binary, colmap_text
@@ -105,9 +105,13 @@ def test_irregular_files_are_rejected_at_once(folder, tmp_path, name):
 def test_every_prefix_is_rejected(folder, name):
     path, whole = folder / name, (folder / name).read_bytes()
     end = len(whole.rstrip(b"\n")) if name.endswith(".json") else len(whole)
+    step = WHOLE_ROWS.get(name, end)
     with replaced(path, whole):
         for length in reversed(range(end)):
             os.truncate(path, length)
+            if length and length % step == 0:
+                assert READ[name](path).capacity == length // step
+                continue
             begun = time.perf_counter()
             with pytest.raises((InputError, UserWarning)) as caught:
                 READ[name](path)
@@ -161,6 +165,14 @@ def test_memory_of_good_files(tmp_path, report):
 COMMANDS = {
     "scene.ply": "info scene.ply",
     "scene.spz": "info scene.spz",
+    "older.spz": "export older.spz out.ply",
+    "scene.splat": "info scene.splat",
+    "scene.ksplat": "info scene.ksplat",
+    "scene.sog": "info scene.sog",
+    "sog/meta.json": "export sog out.ply",
+    "sog/quats.webp": "info sog",
+    "scene.glb": "export scene.glb out.ply",
+    "scene.compressed.ply": "export scene.compressed.ply out.ply",
     "ascii.ply": "export ascii.ply out.ply",
     **dict.fromkeys((CAMERAS, IMAGES, POINTS), "train . -o run"),
     **dict.fromkeys((n for n in READ if n.startswith("text/")), "train text -o run"),
