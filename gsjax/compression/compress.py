@@ -9,7 +9,7 @@ from gsjax.cameras.camera import Camera
 from gsjax.compression.importance import measure_importance, sample_cameras
 from gsjax.compression.measure import Judge
 from gsjax.compression.quantise import as_gaussians, make_source, rows_of
-from gsjax.compression.search import Trial, search
+from gsjax.compression.search import Trial, search, write_and_read
 from gsjax.compression.types import CompressedScene, Goal, HeldOut
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, num_active, select
@@ -19,7 +19,6 @@ from gsjax.raster.types import RasterConfig
 
 DEFAULT_GOAL = Goal(max_loss=0.3)
 _SUFFIXES = (".sog", ".spz", ".compressed.ply", ".glb", ".ply")
-_HEADER, _NUMBERS = 1500, 14  # of a PLY: bytes, and numbers beside the harmonics
 _JUDGED = 24  # held-out pictures
 
 
@@ -79,14 +78,13 @@ def compress(
     source = make_source(rows, importance, suffix, 0)
     best = search(source, judge, before, goal, mode)
     after = judge.judge(best.gaussians, timed=True)
-    count, bases = rows["sh"].shape[:2]
     return CompressedScene(
         gaussians=best.gaussians,
         data=best.data,
         suffix=suffix,
         before=before,
         after=after,
-        size_before=_HEADER + 4 * count * (_NUMBERS + 3 * bases),
+        size_before=len(write_and_read(scene, ".ply", None)[0]),
         reasons=_reasons(best, int(num_active(gaussians)), importance.largest),
     )
 

@@ -16,7 +16,7 @@ NOMINAL_PSNR = 30.0  # of a scene whose photographs are not given, dB
 
 
 class Goal(NamedTuple):
-    """What a compressed scene must reach; exactly one is set.
+    """Goal of a compression; exactly one limit is set.
 
     Attributes:
       max_loss: largest loss of PSNR on the held-out pictures, dB.
