@@ -111,14 +111,14 @@ def _indexed(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rarity(values: np.ndarray) -> np.ndarray:
-    """Return weights [M] of numbers: 1 / √ of the number of those about as large.
+    """Return weights [M] of numbers: n^-1/3 for n numbers that are about as large.
 
     With equal weights, rare values such as the largest scales have large errors.
     """
     low, extent = values.min(), np.ptp(values)
     share = (values - low) / (extent or 1)
     bins = np.minimum(share * _BINS, _BINS - 1).astype(int)
-    return 1 / np.sqrt(np.bincount(bins)[bins])
+    return np.bincount(bins)[bins] ** (-1 / 3)
 
 
 def _decimals(values: np.ndarray) -> list[float]:
