@@ -18,6 +18,8 @@ if typing.TYPE_CHECKING:  # the same names as in `_PUBLIC`
     from gsjax.cameras.camera import resize_camera as resize_camera
     from gsjax.cameras.camera import stack_cameras as stack_cameras
     from gsjax.cameras.lenses import Lens as Lens
+    from gsjax.compression.compress import compress as compress
+    from gsjax.compression.types import CompressedScene as CompressedScene
     from gsjax.data.arrays import make_dataset as make_dataset
     from gsjax.data.dataset import load_dataset as load_dataset
     from gsjax.data.photos import load_photos as load_photos
@@ -67,11 +69,14 @@ if typing.TYPE_CHECKING:  # the same names as in `_PUBLIC`
     from gsjax.train.state import save_state as save_state
     from gsjax.train.step import make_train_step as make_train_step
     from gsjax.viewer import notebook as notebook
+    from gsjax.viewer.notebook import save_movie as save_movie
     from gsjax.viewer.notebook import save_png as save_png
 
 _PUBLIC = {
     "cameras.camera": "Camera look_at make_camera resize_camera stack_cameras",
     "cameras.lenses": "Lens",
+    "compression.compress": "compress",
+    "compression.types": "CompressedScene",
     "data.arrays": "make_dataset",
     "data.dataset": "load_dataset",
     "data.photos": "load_photos",
@@ -98,7 +103,7 @@ _PUBLIC = {
     "train.state": "init_state load_state save_state",
     "train.step": "make_train_step",
     "viewer": "notebook",
-    "viewer.notebook": "save_png",
+    "viewer.notebook": "save_movie save_png",
 }
 _MODULES = {name: module for module, names in _PUBLIC.items() for name in names.split()}
 __all__ = list(_MODULES)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -94,8 +94,27 @@ class Browser:
         )
         self.encode = msgspec.msgpack.encode
         self.socket.send(self.encode(CAMERA))
-        self.reader = threading.Thread(target=lambda: list(self.socket), daemon=True)
+        self.received: list[bytes] = []
+        read = lambda: self.received.extend(self.socket)  # noqa: E731
+        self.reader = threading.Thread(target=read, daemon=True)
         self.reader.start()
+
+    def splat_counts(self) -> list[int]:
+        """Return the numbers of splats of each message about them."""
+        import msgspec
+        import zstandard
+
+        counts = []
+        for data in list(self.received):
+            size = int.from_bytes(data[8:16], "little")
+            packed = zstandard.ZstdDecompressor().decompress(data[16 : 16 + size])
+            window = msgspec.msgpack.decode(packed)
+            lengths = window["binaryBufferLengths"]
+            for message in window["messages"]:
+                if message["type"] == "GaussianSplatsMessage":
+                    index = message["props"]["buffer"]["__binary_index"]
+                    counts.append(lengths[index] // 32)
+        return counts
 
     def look_from(self, position) -> None:
         """Send a camera at this position."""

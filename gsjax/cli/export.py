@@ -6,29 +6,35 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.cli.common import HeavyCommand, start_jax
+from gsjax.cli.common import HeavyCommand, UsageError, start_jax
 from gsjax.cli.options import real
+from gsjax.cli.page import PAGE_SUFFIXES, write_scene_page
 from gsjax.runtime.console import say
+from gsjax.runtime.files import reject_existing
 
 
 @dataclass(kw_only=True)
 class ExportCommand(HeavyCommand):
-    """Write a scene as .ply, .spz or .splat, in the coordinates of its dataset."""
+    """Write a scene as .ply, .spz or .splat, in the coordinates of its dataset, or as
+    an .html page."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
     """Folder of a run, or a .ply or .spz file."""
     out: Annotated[Positional[Path], arg(metavar="OUT.ply")]
-    """File to write: .ply; .spz, about a fifth of the size; or .splat, without
-    spherical harmonics. Its folder is created if missing."""
+    """File to write: .ply; .spz, about a fifth of the size; .splat, without spherical
+    harmonics; or .html, the page of gsjax view --html. Its folder is created if
+    missing."""
     sh_degree: Literal[0, 1, 2, 3, 4] | None = None
     """SH degree to write: higher bands are dropped, missing ones are zero. Some viewers
-    read degree 3 only."""
+    read degree 3 only. A page has degree 0."""
     min_opacity: Annotated[float, real(0, 1)] = 0.0
     """Leave out Gaussians below this opacity; 0.005 is hardly visible."""
     overwrite: bool = False
     """Replace an existing file."""
 
     def run(self) -> int:
+        if self.out.suffix.lower() in PAGE_SUFFIXES:
+            return self._write_page()
         start_jax()
         from gsjax.io.formats import stored_bytes
         from gsjax.runs.export import export_scene
@@ -43,4 +49,20 @@ class ExportCommand(HeavyCommand):
         of_all = f" of {found:,}" if written < found else ""
         size = stored_bytes(self.out) / 2**20
         say(f"{self.out}  {written:,}{of_all} Gaussians, {size:.2f} MiB")
+        return 0
+
+    def _write_page(self) -> int:
+        """Write what `gsjax view --html` writes."""
+        if self.sh_degree:
+            fault = "a page has one colour for all directions, SH degree 0"
+            raise UsageError(f"--sh-degree {self.sh_degree}: {fault}; leave it out")
+        from gsjax.viewer.viser_server import require_viser
+
+        require_viser()
+        reject_existing([self.out], self.overwrite)
+        start_jax()
+        from gsjax.viewer.opening import load_content
+
+        shown = load_content(self.scene, min_opacity=self.min_opacity)
+        write_scene_page(shown, self.out, title=self.scene.stem)
         return 0

@@ -22,6 +22,7 @@ COMMANDS = {
     "render": ("render", "RenderCommand"),
     "view": ("view", "ViewCommand"),
     "export": ("export", "ExportCommand"),
+    "compress": ("compress", "CompressCommand"),
     "mesh": ("mesh", "MeshCommand"),
     "info": ("info", "InfoCommand"),
     "bench": ("bench", "BenchCommand"),

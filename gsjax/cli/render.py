@@ -10,8 +10,8 @@ from gsjax.cli.common import HeavyCommand, UsageError, start_jax
 from gsjax.cli.options import Budget, Color, Kinds, OptionalSize, integer, real
 from gsjax.runtime.console import note, say
 
-_MOVIES = (".gif", ".webp", ".webm")
-_REJECTED = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".png", ".jpg", ".jpeg")
+_MOVIES = (".mp4", ".webm", ".webp", ".gif")
+_REJECTED = (".mov", ".m4v", ".avi", ".mkv", ".png", ".jpg", ".jpeg")
 
 
 @dataclass(kw_only=True)
@@ -21,7 +21,8 @@ class RenderCommand(HeavyCommand):
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
     """Folder of a run, or a .ply or .spz file."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|MOVIE")]
-    """Folder for the images, created if missing; or a movie: .gif, .webp or .webm."""
+    """Folder for the images, created if missing; or a movie: .mp4 (requires
+    gsjax[movies]), .webm, .webp or .gif."""
     cameras: Path | None = None
     """Cameras: a transforms.json (NeRF, instant-ngp, nerfstudio), or the folder of a
     dataset, whose photographs need not exist. With a dataset, --path selects its views

@@ -8,12 +8,10 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from gsjax.cli.common import HeavyCommand, check_output, start_jax
+from gsjax.cli.common import HeavyCommand, UsageError, check_output, start_jax
 from gsjax.cli.options import integer, real
+from gsjax.cli.page import PAGE_SUFFIXES, write_scene_page
 from gsjax.runtime.console import note, say
-
-_LARGE_PAGE = 32 * 2**20
-_THUMBNAIL = 160  # px, longest side of a photograph in a page
 
 
 @dataclass(kw_only=True)
@@ -33,6 +31,12 @@ class ViewCommand(HeavyCommand):
     max_gaussians: Annotated[int | None, integer(1)] = None
     """Maximum number of Gaussians in the browser; the largest and most opaque are
     kept."""
+    ordered: bool = False
+    """The file lists Gaussians by importance, which decides what is kept and what
+    appears first; default: opacity times area decides."""
+    parts: Annotated[int | None, integer(1, 8)] = None
+    """Number of parts in which the Gaussians of a page appear while it loads, the most
+    important first; default: two from 100,000 Gaussians on."""
     no_photos: bool = False
     """Show the cameras of a run without their photographs."""
     up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
@@ -51,7 +55,9 @@ class ViewCommand(HeavyCommand):
         from gsjax.viewer.viser_server import require_viser
 
         require_viser()
-        check_output("--html", self.html, self.overwrite, ".html", ".htm")
+        check_output("--html", self.html, self.overwrite, *PAGE_SUFFIXES)
+        if self.parts is not None and self.html is None:
+            raise UsageError("--parts goes with --html")
         start_jax()
         from gsjax.runs.scene_source import RASTER_PRESETS
         from gsjax.viewer.opening import load_content
@@ -64,34 +70,17 @@ class ViewCommand(HeavyCommand):
             max_gaussians=self.max_gaussians,
             with_mesh=self.mesh,
         )
-        views = () if self.no_photos else shown.views
-        if self.html is not None:
-            return self._write(self.html, shown.content, views)
-        return self._serve(shown.content, views)
-
-    def _write(self, path: Path, content, views) -> int:
-        from gsjax.viewer.opening import frusta_with_photos
-        from gsjax.viewer.page import write_page
-        from gsjax.viewer.splats import MIN_DRAWN_OPACITY
-
-        if views:
-            content.frusta = frusta_with_photos(views, _THUMBNAIL)
-        page = write_page(content, path, title=self.scene.stem)
-        missing = 0 if page.triangles else page.found - page.drawn
-        if missing and self.max_gaussians is None:
-            least = max(self.min_opacity, MIN_DRAWN_OPACITY)
-            why = f"opacity below {least:g}, or not finite"
-            note(f"{missing:,} of {page.found:,} Gaussians left out: {why}")
-        of_all = f" of {page.found:,}" if missing else ""
-        count = len(content.frusta)
-        cameras = f", {count} camera{'s' * (count != 1)}" if count else ""
-        size = f"{page.size / 2**20:.2f} MiB"
-        drawn, remedy = f"{page.drawn:,}{of_all} Gaussians", "--max-gaussians"
-        if page.triangles:
-            drawn, remedy = f"{page.triangles:,} triangles", "gsjax mesh --triangles"
-        say(f"{path}  {drawn}{cameras}, {size}")
-        if page.size > _LARGE_PAGE:
-            note(f"a page this large opens slowly; reduce it with {remedy}")
+        shown.content.ordered = self.ordered
+        with_photos = not self.no_photos
+        if self.html is None:
+            return self._serve(shown.content, shown.views if with_photos else ())
+        write_scene_page(
+            shown,
+            self.html,
+            title=self.scene.stem,
+            with_photos=with_photos,
+            parts=self.parts,
+        )
         return 0
 
     def _serve(self, content, views) -> int:

@@ -15,7 +15,8 @@ from scipy.special import expit, logit
 
 Rows = Mapping[str, np.ndarray]
 
-_MOST_BITS = 12  # left out of a number
+_MOST_BITS = 5  # left out of a number: curvature describes small changes only
+_MOST_OF_MEANS = 12
 _FINEST = 1 / 64  # steps of log scales and of colours in SOG, whose tables are free
 _TABLE = 256  # entries of a table of SOG
 _QUARTER = 0.25 / 255  # opacities of the bytes 0 and 255 are this far within
@@ -29,6 +30,7 @@ class Axis(NamedTuple):
       inverse: codes → values.
       low, high: least and greatest code.
       most: number of distinct values that the file can hold; 0 for no limit.
+      most_bits: largest k.
     """
 
     forward: Callable[[np.ndarray], np.ndarray]
@@ -36,13 +38,14 @@ class Axis(NamedTuple):
     low: float = -np.inf
     high: float = np.inf
     most: int = 0
+    most_bits: int = _MOST_BITS
 
 
 class Lattice(NamedTuple):
     """The axes of a format.
 
     Attributes:
-      means, log_scales, logit_opacities, colors: axes; colours are those of SH degree 0.
+      means, log_scales, logit_opacities, colors: axes; colours are SH degree 0.
       quats: axis of the three smaller components of a unit quaternion.
       has_palette: whether harmonics above degree 0 are an entry of a palette.
     """
@@ -65,7 +68,7 @@ def lattice_of(suffix: str, rows: Rows) -> Lattice | None:
 def _of_sog(rows: Rows) -> Lattice:
     means = np.asarray(rows["means"], np.float64)
     logs = np.sign(means) * np.log1p(np.abs(means))
-    low, high = (f(logs, axis=0, initial=None) for f in (np.min, np.max))
+    low, high = logs.min(axis=0), logs.max(axis=0)
     span = np.where(high > low, high - low, 1.0)
 
     def forward(values):
@@ -77,7 +80,7 @@ def _of_sog(rows: Rows) -> Lattice:
         return np.sign(logs) * np.expm1(np.abs(logs))
 
     return Lattice(
-        means=Axis(forward, inverse, 0, 65535),
+        means=Axis(forward, inverse, 0, 65535, most_bits=_MOST_OF_MEANS),
         log_scales=_uniform(_FINEST)._replace(most=_TABLE),
         logit_opacities=_OPACITY,
         colors=_uniform(_FINEST)._replace(most=_TABLE),
@@ -95,7 +98,7 @@ def _of_spz(rows: Rows) -> Lattice:
     largest = float(np.abs(rows["means"]).max(initial=0))
     bits = np.floor(np.log2((2**23 - 1) / largest)) if largest else 20
     return Lattice(
-        means=_uniform(2.0 ** -min(bits, 20)),
+        means=_uniform(2.0 ** -min(bits, 20))._replace(most_bits=_MOST_OF_MEANS),
         log_scales=Axis(lambda v: 16 * (v + 10), lambda c: c / 16 - 10, 0, 255),
         logit_opacities=_OPACITY,
         colors=Axis(
@@ -125,7 +128,11 @@ class Rounded(NamedTuple):
 
 
 def round_to(
-    axis: Axis, values: np.ndarray, curvature: np.ndarray, allowed: float
+    axis: Axis,
+    values: np.ndarray,
+    curvature: np.ndarray,
+    allowed: float,
+    coarsest: np.ndarray | float = np.inf,
 ) -> Rounded:
     """Round each value as coarsely as its error allows.
 
@@ -134,10 +141,11 @@ def round_to(
       values: [...] numbers.
       curvature: [...] error per squared change of each.
       allowed: mean error of a number; rounding to steps Δ adds curvature · Δ² / 12.
+      coarsest: largest step Δ, in the units of the values.
     """
     values = np.asarray(values, np.float64)
     codes = np.clip(axis.forward(values), axis.low, axis.high)
-    left_out = _bits_left_out(axis, codes, curvature, allowed)
+    left_out = _bits_left_out(axis, codes, curvature, allowed, coarsest)
     coarser = 0.0
     while True:
         unit = np.exp2(np.maximum(left_out, np.floor(coarser)))
@@ -150,7 +158,7 @@ def round_to(
 
 
 def _bits_left_out(
-    axis: Axis, codes: np.ndarray, curvature: np.ndarray, allowed: float
+    axis: Axis, codes: np.ndarray, curvature: np.ndarray, allowed: float, coarsest
 ) -> np.ndarray:
     """Return k of the largest step 2ᵏ whose error is about ``allowed``."""
     inner = np.clip(codes, axis.low + 0.5, axis.high - 0.5)
@@ -158,4 +166,5 @@ def _bits_left_out(
     error = curvature * np.square(step) / 12
     with np.errstate(divide="ignore"):
         bits = np.round(np.log2(allowed / np.maximum(error, 1e-300)) / 2)
-    return np.clip(bits, 0, _MOST_BITS)
+    most = np.floor(np.log2(coarsest / np.maximum(step, 1e-300)))
+    return np.clip(np.minimum(bits, most), 0, axis.most_bits)

@@ -16,7 +16,7 @@ NOMINAL_PSNR = 30.0  # of a scene whose photographs are not given, dB
 
 
 class Goal(NamedTuple):
-    """What a compressed scene must reach; exactly one is set.
+    """Goal of a compression; exactly one limit is set.
 
     Attributes:
       max_loss: largest loss of PSNR on the held-out pictures, dB.
@@ -64,7 +64,7 @@ class Quality(NamedTuple):
       psnr_before, ssim_before: against the pictures of the scene before compression;
         infinite and 1 for that scene itself.
       largest_error: largest error of a colour against those pictures.
-      seconds: median time to draw a picture.
+      seconds: mean time to draw a picture; NaN if it was not measured.
     """
 
     psnr: float | None

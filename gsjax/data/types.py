@@ -159,6 +159,14 @@ class Photo(NamedTuple):
     K: np.ndarray
     lens: Distortion | None = None
 
+    def over(self, background) -> np.ndarray:
+        """Return the photograph [H, W, 3] float32 in [0, 1] over an RGB background."""
+        truth = self.pixels.astype(np.float32) / 255
+        if self.alpha is None:
+            return truth
+        alpha = self.alpha[..., None].astype(np.float32) / 255
+        return truth * alpha + np.asarray(background, np.float32) * (1 - alpha)
+
     def require(self, name: str) -> None:
         """Raise `InputError`, for view ``name``, if an array is not as above."""
         size = np.shape(self.pixels)[:2]

@@ -1,12 +1,11 @@
-"""Movies to files: .gif, .webp, .webm (VP9), or a folder of PNGs, encoded by OpenCV.
+"""Movies to files: .mp4, .webm, .gif, .webp, or a folder of PNGs.
 
 A movie is written under a temporary name and then renamed: it appears complete or not
-at all.
+at all. `gsjax.io.video` encodes .mp4 and .webm, OpenCV the others.
 """
 
 import os
 import re
-import secrets
 import shutil
 from collections.abc import Iterable, Iterator
 from itertools import chain
@@ -15,10 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from gsjax.errors import InputError
-from gsjax.io import images
+from gsjax.io import images, video
 from gsjax.runtime.files import make_folder, reject_existing, write_file, writing
 
-MOVIE_KINDS = (".gif", ".webp", ".webm", ".png")
+VIDEO_KINDS = (".mp4", ".webm")  # frames are encoded one by one
+MOVIE_KINDS = (*VIDEO_KINDS, ".webp", ".gif")
 
 
 def check_movie(path: Path, *, overwrite: bool = False) -> None:
@@ -26,12 +26,18 @@ def check_movie(path: Path, *, overwrite: bool = False) -> None:
 
     Raises:
       InputError: if the suffix is unknown, or the movie exists.
+      MissingExtraError: if the package that encodes it is absent.
     """
-    if path.suffix.lower() not in (*MOVIE_KINDS, ""):
+    suffix = path.suffix.lower()
+    if suffix not in (*MOVIE_KINDS, ".png", ""):
         raise InputError(
-            f"{path}: expected a suffix of {', '.join(MOVIE_KINDS[:3])}, or .png (or "
-            f"none) for a folder of PNGs, got {path.suffix}; pass another name"
+            f"{path}: expected a suffix of {', '.join(MOVIE_KINDS)}, or .png (or none) "
+            f"for a folder of PNGs, got {path.suffix}; pass another name"
         )
+    if suffix == ".mp4":
+        video.pyav()
+    else:
+        images.opencv()
     folder = _png_folder(path)
     if folder is None:
         reject_existing([path], overwrite, "another name with -o")
@@ -49,12 +55,14 @@ def write_movie(
     """Write frames in the format of the suffix.
 
     Args:
-      path: .gif, .webp or .webm; ``name.png``, or a name without suffix, is the
-        folder ``name`` with frame_0001.png and so on. Missing folders are created.
-      frames: [H, W, 3] RGB uint8, all of one size, read one by one. For .webm, whose
-        size is even, an odd last column or row is repeated.
+      path: .mp4 (H.264), .webm (VP9), .webp or .gif; ``name.png``, or a name without
+        suffix, is the folder ``name`` with frame_0001.png and so on. Missing folders
+        are created.
+      frames: [H, W, 3] RGB uint8, all of one size, read one by one. For .mp4 and .webm,
+        whose sizes are even, an odd last column or row is repeated.
       fps: frames per second; ignored for folders. A GIF has times in 1/100 s, and at
-        most 50 frames per second, which is what browsers show.
+        most 50 frames per second, which is what browsers show. An .mp4 stores the
+        nearest fraction whose denominator is at most 1001, as 24000/1001.
       overwrite: replace an existing movie; a folder only if it holds nothing but
         frames.
 
@@ -64,12 +72,11 @@ def write_movie(
     Raises:
       InputError: if the suffix is unknown, the movie exists, there are no frames or
         frames of different sizes, or the file cannot be written.
-      MissingExtraError: if OpenCV is absent.
+      MissingExtraError: if OpenCV is absent, or PyAV for .mp4.
     """
     check_movie(path, overwrite=overwrite)
     if not 0.1 <= fps <= 1000:
         raise InputError(f"fps: expected 0.1 to 1000 frames per second, got {fps:g}")
-    images.opencv()
     checked = _checked(frames)
     first = next(checked, None)
     if first is None:
@@ -79,8 +86,9 @@ def write_movie(
     make_folder((folder or path).parent)
     if folder is not None:
         return _write_folder(folder, checked)
-    if suffix == ".webm":
-        return _write_vp9(path, checked, fps)
+    if suffix in VIDEO_KINDS:
+        encode = video.write_h264 if suffix == ".mp4" else video.write_vp9
+        return encode(path, checked, fps)
     pictures = list(checked)
     write_file(path, encode_animation(suffix, pictures, fps))
     return len(pictures)
@@ -146,7 +154,7 @@ def _refuse_folder(folder: Path, overwrite: bool) -> None:
 
 def _write_folder(folder: Path, frames: Iterable[np.ndarray]) -> int:
     """Write into a temporary folder beside it, and rename that."""
-    temporary, count = _temporary(folder), 0
+    temporary, count = video.temporary_name(folder), 0
     try:
         make_folder(temporary)
         for count, frame in enumerate(frames, start=1):
@@ -158,46 +166,3 @@ def _write_folder(folder: Path, frames: Iterable[np.ndarray]) -> int:
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     return count
-
-
-def _write_vp9(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
-    cv2, temporary = images.opencv(), _temporary(path)
-    writer, count = None, 0
-    try:
-        for frame in frames:
-            height, width = frame.shape[:2]
-            even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
-            writer = writer or _vp9_writer(temporary, even, fps)
-            writer.write(np.ascontiguousarray(even[..., ::-1]))
-            count += 1
-        if writer is not None:
-            writer.release()
-        # The encoder does not report a full disk; a truncated file has no duration.
-        written = cv2.VideoCapture(str(temporary)).get(cv2.CAP_PROP_FRAME_COUNT)
-        if abs(written - count) > 1:
-            some = f"only {written:g} of {count} frames could be written"
-            raise InputError(f"{path}: {some}; free some disk space")
-        with writing(path):
-            os.replace(temporary, path)
-    finally:
-        if writer is not None:
-            writer.release()
-        temporary.unlink(missing_ok=True)
-    return count
-
-
-def _vp9_writer(path: Path, frame: np.ndarray, fps: float):
-    cv2 = images.opencv()
-    size, code = (frame.shape[1], frame.shape[0]), cv2.VideoWriter.fourcc(*"VP90")
-    with images.captured_stderr():  # FFmpeg warns about a code that WebM does not use
-        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, fps, size)
-    if not writer.isOpened():
-        where = f"{path.parent}: OpenCV cannot write VP9 there"
-        raise InputError(f"{where}; check permissions, or use the suffix .webp")
-    return writer
-
-
-def _temporary(path: Path) -> Path:
-    """Return a name beside ``path``, absolute: FFmpeg takes "10:30.webm" for a URL."""
-    name = f".gsjax-{secrets.token_hex(6)}{path.suffix.lower()}"
-    return path.absolute().with_name(name)

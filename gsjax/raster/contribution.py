@@ -203,8 +203,8 @@ def _add(sums: _Sums, ranks: Array, more: _Sums) -> _Sums:
     """Add what a chunk [G, K] contributes at its ranks."""
 
     def one(name: str, values: Array, added: Array) -> Array:
-        at = values.at[ranks]
-        kwargs = {"mode": "promise_in_bounds"}
-        return at.max(added, **kwargs) if name == "largest" else at.add(added, **kwargs)
+        if name == "largest":
+            return values.at[ranks].max(added, mode="promise_in_bounds")
+        return values.at[ranks].add(added, mode="promise_in_bounds")
 
     return _Sums(*(one(k, v, a) for k, v, a in zip(sums._fields, sums, more)))

@@ -161,7 +161,7 @@ def render_movie(
     Args:
       source: the scene.
       entries: cameras of one size.
-      path: .gif, .webp or .webm file.
+      path: .mp4, .webm, .webp or .gif file.
       kind: "rgb", "alpha" or "depth".
       fps: frames per second.
       overwrite: replace an existing file.
@@ -169,7 +169,7 @@ def render_movie(
     Raises:
       InputError: as `write_movie`, or if the scene cannot be read.
       CapacityError: if a view needs more memory than can be addressed.
-      MissingExtraError: if OpenCV is absent.
+      MissingExtraError: if OpenCV is absent, or PyAV for .mp4.
     """
     images.opencv()
     check_movie(path, overwrite=overwrite)

@@ -124,7 +124,7 @@ def evaluate(
         result = render_exact(gaussians, camera, config, jnp.asarray(behind))
         assert result.rgb is not None
         image = np.clip(np.asarray(result.rgb, np.float32)[:rows, :cols], 0, 1)
-        truth, weight = _over(photo, behind), None
+        truth, weight = photo.over(behind), None
         if photo.valid is not None or len(sizes) > 1:
             weight = np.ones((rows, cols), np.float32)
             weight *= 1 if photo.valid is None else photo.valid
@@ -143,15 +143,6 @@ def evaluate(
             depth=np.asarray(result.depth, np.float32)[:rows, :cols],
             valid=photo.valid,
         )
-
-
-def _over(photo: Photo, background: np.ndarray) -> np.ndarray:
-    """Return the photograph in [0, 1] over the background."""
-    truth = photo.pixels.astype(np.float32) / 255
-    if photo.alpha is None:
-        return truth
-    alpha = photo.alpha[..., None].astype(np.float32) / 255
-    return truth * alpha + background * (1 - alpha)
 
 
 def summarise(results: Iterable[ViewResult]) -> Summary:

@@ -108,13 +108,15 @@ def movie(
     Args:
       frames: pictures of one size, as `picture` takes them.
       fps: frames per second.
-      kind: "webp", which every browser shows; "gif", which every program shows; or
-        "webm" (VP9), the smallest for many frames, with a control bar.
+      kind: "webp", which every browser shows; "gif", which every program shows; or,
+        smaller for many frames and with a control bar, "webm" (VP9) or "mp4" (H.264,
+        needs gsjax[movies]).
       width: at which it is shown, px; None for its own, or enlarged if it is small.
 
     Raises:
       InputError: as `picture` and `gsjax.io.movies.write_movie`, or if the kind is
         unknown.
+      MissingExtraError: as `gsjax.io.movies.write_movie`.
     """
     if kind not in MIME_TYPES:
         raise InputError(f"kind: expected one of {', '.join(MIME_TYPES)}, got {kind!r}")
@@ -133,6 +135,32 @@ def movie(
         data = path.read_bytes()
     zoom = width / shape[1] if width else max(1, MIN_SIZE // max(shape))
     return Movie(data, kind, count, (round(zoom * shape[1]), round(zoom * shape[0])))
+
+
+def save_movie(
+    path: str | PathLike[str],
+    frames: Iterable[Any],
+    fps: float = 24.0,
+    *,
+    overwrite: bool = False,
+) -> int:
+    """Write a movie and return the number of its frames.
+
+    ``gsjax.save_movie("a.mp4", (gsjax.render(gaussians, c) for c in cameras))``
+
+    Args:
+      path: .mp4 (H.264, needs gsjax[movies]), .webm (VP9), .webp or .gif, or a name
+        without suffix for a folder of PNGs.
+      frames: pictures of one size, as `picture` takes them, read one by one.
+      fps: frames per second.
+      overwrite: replace an existing movie.
+
+    Raises:
+      InputError: as `picture` and `gsjax.io.movies.write_movie`.
+      MissingExtraError: as `gsjax.io.movies.write_movie`.
+    """
+    pictures = (picture(frame).pixels for frame in frames)
+    return write_movie(Path(path), pictures, fps=fps, overwrite=overwrite)
 
 
 def live(

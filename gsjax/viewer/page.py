@@ -1,15 +1,27 @@
 """A scene as one HTML page that opens offline."""
 
 import html
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from gsjax.errors import InputError
+import numpy as np
+
+from gsjax.errors import InputError, MissingExtraError
 from gsjax.gaussians import num_active
 from gsjax.runtime import files
+from gsjax.viewer import page_parts
 from gsjax.viewer.cameras import add_cameras, frustum_size, set_viewpoint
 from gsjax.viewer.session import ViewerContent
-from gsjax.viewer.splats import Cut, most_important, pack, within
+from gsjax.viewer.splats import (
+    MANY,
+    MIN_DRAWN_OPACITY,
+    Cut,
+    importance_parts,
+    most_important,
+    pack,
+    within,
+)
 from gsjax.viewer.viser_server import (
     add_mesh,
     open_server,
@@ -77,7 +89,9 @@ class Page(NamedTuple):
     triangles: int = 0
 
 
-def write_page(content: ViewerContent, path: Path, *, title: str) -> Page:
+def write_page(
+    content: ViewerContent, path: Path, *, title: str, parts: int | None = 1
+) -> Page:
     """Write a scene, or its mesh, and its cameras into one HTML file.
 
     Args:
@@ -85,30 +99,26 @@ def write_page(content: ViewerContent, path: Path, *, title: str) -> Page:
         mesh, if there is one.
       path: of the file, replaced if it exists; its folder is created if missing.
       title: of the page.
+      parts: number of parts in which the Gaussians appear while the page loads, the
+        most important first, as `importance_parts` divides them. None chooses two for
+        `MANY` Gaussians and more, where viser supports it.
 
     Raises:
-      MissingExtraError: if viser is absent.
+      MissingExtraError: if viser is absent, or too old for several parts.
       InputError: if no Gaussian would be drawn, or the file cannot be written.
     """
     gaussians, mesh = content.gaussians, content.mesh
-    shown = within(gaussians, Cut(content.min_opacity))
-    splats = pack(gaussians, most_important(gaussians, shown, content.max_gaussians))
-    drawn, found = len(splats.centers), int(num_active(gaussians))
+    shown = within(gaussians, Cut(max(content.min_opacity, MIN_DRAWN_OPACITY)))
+    shown = most_important(gaussians, shown, content.max_gaussians, content.ordered)
+    drawn, found = int(shown.sum()), int(num_active(gaussians))
     if found and not drawn and mesh is None:
         what = f"none of {found:,} Gaussians is opaque enough to be drawn"
         raise InputError(f"{path}: {what}; lower --min-opacity")
+    count = _number_of_parts(parts, 0 if mesh is not None else drawn)
+    masks = importance_parts(gaussians, shown, count, content.ordered)
     server = open_server("127.0.0.1", 0)
     try:
-        set_viewpoint(server, content.viewpoint)
-        set_background(server.scene, content.renderer.background)
-        if mesh is not None:
-            add_mesh(server.scene, mesh)
-        elif drawn:
-            server.scene.add_gaussian_splats("/splats", **splats._asdict())
-        if content.frusta:
-            size = frustum_size(content.frusta, content.viewpoint.distance)
-            add_cameras(server.scene, content.frusta, size)
-        text = server.scene.as_html(dark_mode=True)
+        text, scripts = _recorded(server, content, masks)
     finally:
         stop_server(server)
     what = (
@@ -121,11 +131,62 @@ def write_page(content: ViewerContent, path: Path, *, title: str) -> Page:
         "Drag to rotate, drag with the right button to pan, scroll to zoom."
     )
     head, tail = text.rsplit("</body>", 1)
-    head = head.replace("<head>", f"<head>{_WORKERS}", 1)
     head = head.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>")
-    data = f"{head}{_CAPTION.format(caption)}</body>{tail}".encode()
+    before, after = _WORKERS, "".join(scripts)
+    if scripts:
+        first = f"{int(masks[0].sum()):,} are shown, the others load."
+        before, after = before + page_parts.HEAD, page_parts.START + after
+        caption += page_parts.STATUS.format(first)
+    head = head.replace("<head>", f"<head>{before}", 1)
+    data = f"{head}{_CAPTION.format(caption)}{after}</body>{tail}".encode()
     files.make_folder(path.parent)
     files.write_file(path, data)
     if mesh is not None:
         return Page(0, found, len(data), len(mesh.faces))
     return Page(drawn, found, len(data))
+
+
+def _number_of_parts(parts: int | None, drawn: int) -> int:
+    """Return the number of parts of a page; see `write_page`."""
+    possible = page_parts.parts_are_possible()
+    if parts is None:
+        return 2 if possible and drawn >= MANY else 1
+    if parts > 1 and not possible:
+        what = "the installed viser cannot load a page in parts"
+        raise MissingExtraError(f"{what}; pip install -U viser, or ask for one part")
+    return parts if drawn else 1
+
+
+def _recorded(
+    server: Any, content: ViewerContent, masks: list[np.ndarray]
+) -> tuple[str, list[str]]:
+    """Return the page of viser with the first part, and scripts with the others.
+
+    The cameras, with their photographs, are in the last part.
+    """
+    scene = server.scene
+    set_viewpoint(server, content.viewpoint)
+    set_background(scene, content.renderer.background)
+
+    def add(index: int) -> None:
+        if content.mesh is not None:
+            add_mesh(scene, content.mesh)
+        elif masks:
+            packed = pack(content.gaussians, masks[index])
+            name = f"/splats-{index + 1}" if index else "/splats"
+            scene.add_gaussian_splats(name, **packed._asdict())
+        if content.frusta and index + 1 >= len(masks):
+            size = frustum_size(content.frusta, content.viewpoint.distance)
+            add_cameras(scene, content.frusta, size)
+
+    add(0)
+    text = scene.as_html(dark_mode=True)
+    if len(masks) < 2:
+        return text, []
+    steps, so_far = [], int(masks[0].sum())
+    for index in range(1, len(masks)):
+        so_far += int(masks[index].sum())
+        last = index + 1 == len(masks)
+        status = "" if last else f"{so_far:,} are shown, the others load."
+        steps.append((partial(add, index), status))
+    return text, page_parts.record(server, steps)

@@ -12,7 +12,12 @@ from gsjax.io import images
 from gsjax.runtime.files import write_file
 
 MIN_SIZE = 240  # px: smaller pictures are displayed enlarged
-MIME_TYPES = {"webp": "image/webp", "gif": "image/gif", "webm": "video/webm"}
+MIME_TYPES = {
+    "webp": "image/webp",
+    "gif": "image/gif",
+    "mp4": "video/mp4",
+    "webm": "video/webm",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +62,7 @@ class Movie:
     """A movie that a notebook plays in a loop.
 
     Attributes:
-      data, kind: contents of the file, "webp", "gif" or "webm".
+      data, kind: contents of the file, and a key of `MIME_TYPES`.
       frames: number of frames.
       size: (width, height) in px at which it is shown.
     """
@@ -72,7 +77,7 @@ class Movie:
         width, height = self.size
         shape = f'width="{width}" height="{height}"'
         url = f'src="data:{MIME_TYPES[self.kind]};base64,{source}"'
-        if self.kind == "webm":
+        if MIME_TYPES[self.kind].startswith("video/"):
             switches = "autoplay loop muted playsinline controls"
             return f"<video {shape} {switches} {url}></video>"
         return f"<img {shape} {url}>"

@@ -21,6 +21,7 @@ from gsjax.viewer.viser_server import add_mesh, set_background
 
 _HEIGHTS = ("270", "360", "540", "720", "1080")
 _REST = 0.3  # seconds without motion after which "follow" renders
+_COLLECTED = 0.05  # seconds after which viser has sent a message
 _NOWHERE = "–"
 _SCENES = ("mesh", "splats", "splats and mesh")
 
@@ -35,6 +36,8 @@ class ViewerContent:
       status: a line about training, or "".
       max_gaussians: largest number in the browser; the most important ones are kept.
       min_opacity: initial value of the slider.
+      ordered: the scene lists its Gaussians by importance, the most important first;
+        otherwise `gsjax.viewer.splats.by_importance` estimates it.
       mesh: a mesh of the scene, shown in place of the splats at first; or None.
     """
 
@@ -45,6 +48,7 @@ class ViewerContent:
     status: str = ""
     max_gaussians: int | None = None
     min_opacity: float = 0.0
+    ordered: bool = False
     mesh: Mesh | None = None
 
 
@@ -211,20 +215,19 @@ class Session:
             limit = float(np.percentile(longest, self.scale.value))
         shown = splats.within(gaussians, splats.Cut(self.opacity.value, limit))
         self.scene_shown = gaussians, shown
-        sent = splats.most_important(gaussians, shown, content.max_gaussians)
-        packed = splats.pack(gaussians, sent)
-        if len(packed.centers):
-            self.splats = self.client.scene.add_gaussian_splats(
-                "/splats", **packed._asdict(), visible=self._shows("splats")
-            )
-        elif self.splats is not None:
-            self.splats.remove()
-            self.splats = None
+        drawn = shown & (splats.opacities_of(gaussians) >= splats.MIN_DRAWN_OPACITY)
+        ordered, most = content.ordered, content.max_gaussians
+        sent = splats.most_important(gaussians, drawn, most, ordered)
+        if self.splats is None and np.count_nonzero(sent) >= splats.MANY:
+            first = splats.importance_parts(gaussians, sent, 2, ordered)[0]
+            self._send(gaussians, first)
+            # viser collects messages for 1/60 s, and drops a node replaced meanwhile.
+            time.sleep(_COLLECTED)
+        self._send(gaussians, sent)
         found = np.count_nonzero(np.asarray(gaussians.active))
-        least = splats.MIN_DRAWN_OPACITY
-        faint = np.count_nonzero(splats.opacities_of(gaussians)[shown] < least)
+        least, faint = splats.MIN_DRAWN_OPACITY, np.count_nonzero(shown & ~drawn)
         lines = [
-            f"**{len(packed.centers):,}** of {found:,} Gaussians",
+            f"**{np.count_nonzero(sent):,}** of {found:,} Gaussians",
             f"{faint:,} of opacity below {least} in exact images only" if faint else "",
             f"scales up to {limit:.3g}" if limit < float("inf") else "",
             content.status,
@@ -232,6 +235,19 @@ class Session:
         self.counts.content = "<br/>".join(filter(None, lines))
         if self.follow.value:
             self.render()
+
+    def _send(self, gaussians: Gaussians, mask: np.ndarray) -> None:
+        """Replace the splats of the browser by those of a mask [N]."""
+        packed = splats.pack(gaussians, mask)
+        if self.closed:
+            return
+        if len(packed.centers):
+            self.splats = self.client.scene.add_gaussian_splats(
+                "/splats", **packed._asdict(), visible=self._shows("splats")
+            )
+        elif self.splats is not None:
+            self.splats.remove()
+            self.splats = None
 
     def _render(self) -> None:
         """Render for the present camera, and show the image or the error."""

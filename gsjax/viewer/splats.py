@@ -12,10 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.math.sh import dc_to_rgb
 
 MIN_DRAWN_OPACITY = 0.01
+FIRST_SHARE = 0.1  # of the Gaussians, which appears first
+MANY = 100_000  # Gaussians: from here on a part is shown first
 # Half precision has 11 bits from 6e-5 to 65504, which are scales of 0.008 to 255.
 _LARGEST, _TYPICAL = 250.0, 0.1
 
@@ -71,23 +74,64 @@ def within(gaussians: Gaussians, cut: Cut) -> np.ndarray:
     return shown & (longest_axes(gaussians) <= cut.max_scale)
 
 
+def by_importance(
+    gaussians: Gaussians, shown: np.ndarray, ordered: bool = False
+) -> np.ndarray:
+    """Return the indices [M] of those ``shown`` [N], the most important first.
+
+    Args:
+      gaussians, shown: the scene, and which of its slots to list.
+      ordered: the scene lists them by importance. Otherwise importance is opacity times
+        the area of the two longest axes, a heuristic that ignores cameras and
+        occlusion.
+    """
+    chosen = np.flatnonzero(shown)
+    if ordered:
+        return chosen
+    logs = np.asarray(gaussians.params.log_scales, np.float64)[chosen]
+    area = logs.sum(axis=1) - logs.min(axis=1)
+    with np.errstate(divide="ignore"):
+        weight = np.log(opacities_of(gaussians)[chosen]) + area
+    return chosen[np.argsort(-weight, kind="stable")]
+
+
 def most_important(
-    gaussians: Gaussians, shown: np.ndarray, count: int | None
+    gaussians: Gaussians, shown: np.ndarray, count: int | None, ordered: bool = False
 ) -> np.ndarray:
     """Return a mask [N] of the ``count`` (None: all) most important of those ``shown``.
 
-    Importance is opacity times the area of the two longest axes, a heuristic that
-    ignores cameras and occlusion.
+    Importance is that of `by_importance`.
     """
     if count is None or shown.sum() <= count:
         return shown
-    logs = np.asarray(gaussians.params.log_scales, np.float64)
-    area = logs.sum(axis=1) - logs.min(axis=1)
-    with np.errstate(divide="ignore"):
-        weight = np.where(shown, np.log(opacities_of(gaussians)) + area, -np.inf)
     kept = np.zeros_like(shown)
-    kept[np.argsort(-weight, kind="stable")[:count]] = True
+    kept[by_importance(gaussians, shown, ordered)[:count]] = True
     return kept
+
+
+def importance_parts(
+    gaussians: Gaussians, shown: np.ndarray, parts: int, ordered: bool = False
+) -> list[np.ndarray]:
+    """Return masks [N] that divide those ``shown`` [N] in parts of falling importance.
+
+    The first part is a tenth, and each further one multiplies the number so far by the
+    same factor: 10 % and 90 %, or 10, 22 and 68 %. Empty parts are left out.
+
+    Raises:
+      InputError: if ``parts`` is below 1.
+    """
+    if parts < 1:
+        raise InputError(f"parts: expected at least 1, got {parts}; pass 1 for a whole")
+    if parts == 1:
+        return [shown]
+    order = by_importance(gaussians, shown, ordered)
+    ends = np.rint(FIRST_SHARE ** np.linspace(1, 0, parts) * len(order)).astype(int)
+    masks = []
+    for some in np.split(order, np.maximum(ends[:-1], 1)):
+        mask = np.zeros_like(shown)
+        mask[some] = True
+        masks.append(mask)
+    return [mask for mask in masks if mask.any()] or [shown]
 
 
 def pack(gaussians: Gaussians, shown: np.ndarray) -> Splats:

@@ -312,7 +312,7 @@ ERRORS = [
     (2, "render DEMO/run --path test --cameras a -o o", "exclude each other"),
     (2, "render DEMO/run --path train --frames 5 -o o", "--frames goes with orbit"),
     (2, "render DEMO/run/splat.ply --cameras DEMO/dataset --path test -o o", "no test"),
-    (2, "render DEMO/run -o a.mp4", "or a movie: .gif, .webp, .webm"),
+    (2, "render DEMO/run -o a.mov", "or a movie: .mp4, .webm, .webp, .gif"),
     (2, "render DEMO/run -o o.png", "expected a folder for images"),
     (2, "render DEMO/run -o a.gif --what rgb,depth", "one kind of --what"),
     (2, "render DEMO/run -o a.gif --npy", "without --npy"),

@@ -1,5 +1,9 @@
 """Movies decode to their frames and appear complete or not at all; depth pictures."""
 
+import importlib.util
+import resource
+import sys
+from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -11,6 +15,10 @@ from captures import rejects
 import gsjax
 from gsjax.io.images import depth_picture
 from gsjax.io.movies import encode_animation, played_rate, write_movie
+
+needs_av = pytest.mark.skipif(
+    importlib.util.find_spec("av") is None, reason="needs gsjax[movies]"
+)
 
 
 def pictures(count=6, width=64, height=48):
@@ -34,6 +42,11 @@ def video_of(path):
     while (read := capture.read())[0]:
         frames.append(read[1][..., ::-1])
     return frames, capture.get(cv2.CAP_PROP_FPS)
+
+
+def psnr(found, expected) -> float:
+    apart = np.asarray(found, float) - np.asarray(expected)
+    return float(-10 * np.log10(np.mean(np.square(apart)) / 255**2))
 
 
 def assert_alike(found, expected, most):
@@ -82,6 +95,55 @@ def test_webm_is_vp9_of_even_size(tmp_path, capfd, width, height):
     assert [p.name for p in tmp_path.iterdir()] == ["a.webm"]
 
 
+@needs_av
+@pytest.mark.parametrize(("width", "height"), [(65, 47), (64, 48), (1, 1)])
+@pytest.mark.parametrize("fps", [12.5, 24000 / 1001, 0.1])
+def test_mp4_is_h264_of_even_size(tmp_path, width, height, fps):
+    expected = list(pictures(5, width, height))
+    path = tmp_path / "a.mp4"
+    assert write_movie(path, iter(expected), fps=fps) == 5
+    found, rate = video_of(path)
+    np.testing.assert_allclose(rate, fps, rtol=1e-12)
+    even = ((0, 0), (0, height % 2), (0, width % 2), (0, 0))
+    assert psnr(found, np.pad(expected, even, "edge")) > 28  # chroma of edges
+    head = path.read_bytes()
+    assert 0 < head.find(b"avc1") < head.find(b"mdat"), "the index comes first"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
+
+
+@needs_av
+def test_mp4_of_a_smooth_picture_shows_no_loss(tmp_path):
+    y, x, time = np.mgrid[:90, :160, :8] / 90
+    waves = 0.5 + 0.5 * np.sin([3 * x + 2 * time, 2 * y - time, 2 * x * y - time])
+    expected = np.rint(255 * waves.transpose(3, 1, 2, 0)).astype(np.uint8)
+    write_movie(tmp_path / "a.mp4", expected)
+    assert psnr(video_of(tmp_path / "a.mp4")[0], expected) > 41
+
+
+@needs_av
+def test_mp4_keeps_colours(tmp_path):
+    """BT.709, as it is tagged, also for the reader of another library."""
+    import av
+
+    values = np.random.default_rng(0).integers(0, 256, (6, 9, 3))
+    values[:2] = [[[0, 0, 0]], [[255, 255, 255]]]
+    frame = values.astype(np.uint8).repeat(16, 0).repeat(16, 1)
+    path = tmp_path / "a.mp4"
+    write_movie(path, [frame] * 3)
+    with av.open(str(path)) as file:
+        (stream,) = file.streams.video
+        tags = [stream.colorspace, stream.color_primaries, stream.color_trc]
+        assert [*tags, stream.color_range] == [1, 1, 1, 1]
+        planes = next(file.decode(video=0)).to_ndarray().astype(float)
+    for found in video_of(path)[0]:
+        middles = found[8::16, 8::16].astype(int)
+        assert np.abs(middles - values).max() <= 3
+        assert np.abs(middles - values).mean() <= 1
+    red, green, blue = np.moveaxis(frame / 255, -1, 0)  # of ITU-R BT.709
+    luma = 16 + 219 * (0.2126 * red + 0.7152 * green + 0.0722 * blue)
+    assert np.abs(planes[:96] - luma)[8::16, 8::16].max() <= 1
+
+
 @pytest.mark.parametrize("name", ["shots", "shots.png"])
 def test_folders_of_pngs(tmp_path, name):
     expected = list(pictures(3))
@@ -113,6 +175,49 @@ def test_an_existing_file_is_replaced_only_when_asked(tmp_path, monkeypatch):
     assert len(video_of(tmp_path / path)[0]) == 6
 
 
+@contextmanager
+def largest_file(size: int):
+    """Context in which no file can be larger, as if the disk were full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@needs_av
+def test_an_mp4_that_does_not_fit_is_refused(tmp_path):
+    """Whether the frames exceed the space, or the index alone."""
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 256, (96, 96, 3), np.uint8) for _ in range(8)]
+    path = tmp_path / "a.mp4"
+    write_movie(path, noise)
+    whole = path.read_bytes()
+    for size in (4096, len(whole) // 2, len(whole) - 1):
+        with (
+            largest_file(size),
+            pytest.raises(gsjax.InputError, match="cannot be written: File too large"),
+        ):
+            write_movie(path, noise, overwrite=True)
+        assert path.read_bytes() == whole
+        assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
+    with largest_file(len(whole)):
+        write_movie(path, noise, overwrite=True)
+    wide = [np.zeros((2, 17_000, 3), np.uint8)]
+    rejects(
+        "cannot encode frames of 17000 × 2 px", write_movie, tmp_path / "b.mp4", wide
+    )
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_without_av_the_error_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(gsjax.errors.MissingExtraError, match=r"gsjax\[movies\]"):
+        write_movie(tmp_path / "a.mp4", failing())
+    assert not list(tmp_path.iterdir())
+
+
 def failing():
     yield from pictures(2)
     raise RuntimeError("no more")
@@ -129,11 +234,14 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize("name", ["a.gif", "a.webm", "a.png", "a.mp4"])
+@pytest.mark.parametrize(
+    "name",
+    ["a.gif", "a.webm", "a.png", pytest.param("a.mp4", marks=needs_av), "a.mov"],
+)
 def test_refused_frames_leave_nothing(tmp_path, name):
     for frames, fps, error, message in REFUSED:
-        if name.endswith("mp4"):
-            error, message = ValueError, r"expected a suffix of \.gif, \.webp, \.webm"
+        if name.endswith("mov"):
+            error, message = ValueError, r"expected a suffix of \.mp4, \.webm, \.webp"
         with pytest.raises(error, match=message):
             write_movie(tmp_path / name, frames(), fps=fps)
     assert not list(tmp_path.iterdir())

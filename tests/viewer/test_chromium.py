@@ -1,5 +1,11 @@
 """The viewer in headless Chromium; skipped where it is not installed."""
 
+import contextlib
+import http.server
+import threading
+from collections.abc import Iterator
+
+import jax
 import numpy as np
 import pytest
 from conftest import LIGHT
@@ -10,6 +16,7 @@ from gsjax.cli.main import main
 from gsjax.math.sh import rgb_to_dc
 from gsjax.viewer.cameras import UPS, viewpoint_of_gaussians
 from gsjax.viewer.opening import load_content
+from gsjax.viewer.page import write_page
 from gsjax.viewer.server import ViewerServer
 
 pytestmark = [
@@ -84,6 +91,58 @@ def test_a_page_from_a_disk_makes_no_requests_and_sorts_its_splats(tmp_path, cap
     script = f"<script>new Image().src = '{elsewhere}'</script>"
     out.write_text(out.read_text().replace("<head>", f"<head>{script}", 1))
     assert page_requests(out.as_uri(), tmp_path)[1] == [elsewhere]
+
+
+@contextlib.contextmanager
+def halting(data: bytes, at: int) -> Iterator[tuple[str, threading.Event]]:
+    """Serve a page: its address, and an event that the rest of its bytes awaits."""
+    go_on = threading.Event()
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            self.wfile.write(data[:at])
+            if go_on.wait(120):
+                self.wfile.write(data[at:])
+
+        def log_message(self, format, *args):
+            del format, args
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/", go_on
+    finally:
+        go_on.set()
+        server.shutdown()
+        server.server_close()
+
+
+def test_a_page_shows_its_first_part_while_the_rest_loads(tmp_path):
+    """A large orange ball, and then many small green Gaussians around it as well."""
+    ball = directions(100) * 0.4
+    ring = directions(900) * [1.0, 0.05, 1.0]
+    sh = rgb_to_dc(np.repeat([ORANGE, GREEN], [100, 900], axis=0))[:, None]
+    scene = opaque(np.concatenate([ball, ring]), 0.06, sh)
+    logs = jax.numpy.log(np.repeat([0.2, 0.06], [100, 900])[:, None]) * np.ones(3)
+    scene = scene.replace(params=scene.params.replace(log_scales=logs))
+    gsjax.save(tmp_path / "a.ply", scene)
+    content = load_content(tmp_path / "a.ply").content
+    write_page(content, tmp_path / "a.html", title="ball", parts=2)
+    data = (tmp_path / "a.html").read_bytes()
+    first = data.index(b"<script>gsjaxParts.add(")
+    with halting(data, first) as (address, go_on):
+        pages = screenshots(address, tmp_path / "profile")
+        wait_for(lambda: share_of(ORANGE, next(pages)) > 0.02, 120)
+        assert share_of(GREEN, next(pages)) == 0
+        go_on.set()
+        wait_for(lambda: share_of(GREEN, next(pages)) > 0.01, 120)
+        assert share_of(ORANGE, next(pages)) > 0.02
+        pages.close()
 
 
 def test_a_browser_shows_the_splats_and_then_an_exact_image(tmp_path):

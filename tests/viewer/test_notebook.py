@@ -151,18 +151,25 @@ def test_nothing_is_drawn_without_values():
     assert not any(seen)
 
 
-@pytest.mark.parametrize("kind", ["webp", "gif", "webm"])
+@pytest.mark.parametrize("kind", ["webp", "gif", "webm", "mp4"])
 def test_a_movie_is_embedded(kind, tmp_path):
+    if kind == "mp4":
+        pytest.importorskip("av", reason="needs gsjax[movies]")
     frames = np.stack([random_picture(24, 32, seed) for seed in range(5)])
     made = movie(frames, fps=10, kind=kind)
     found = re.search(rf'src="data:(\w+)/{kind};base64,([^"]+)"', made._repr_html_())
-    assert found[1] == ("video" if kind == "webm" else "image")
+    video = kind in ("webm", "mp4")
+    assert found[1] == ("video" if video else "image")
+    assert ("<video" in made._repr_html_()) == video
     assert base64.b64decode(found[2]) == made.data
     assert (made.frames, made.size) == (5, (224, 168))
     path = tmp_path / f"a.{kind}"
     path.write_bytes(made.data)
+    again = tmp_path / f"b.{kind}"
+    assert gsjax.save_movie(again, iter(frames), fps=10) == 5
+    assert len(again.read_bytes()) == len(made.data)  # a .webm has a random number
     capture = cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)
-    assert (capture if kind == "webm" else cv2.imcount(str(path))) == 5
+    assert (capture if video else cv2.imcount(str(path))) == 5
 
 
 def test_live_updates_one_display(monkeypatch):

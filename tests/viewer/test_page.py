@@ -1,6 +1,8 @@
 """HTML pages of `gsjax view --html`, and the arguments of the command."""
 
 import base64
+import gzip
+import json
 import re
 import struct
 import sys
@@ -52,6 +54,30 @@ def decode(text: str) -> tuple[list[dict], np.ndarray]:
     return messages, packed
 
 
+def later(text: str) -> list[list[dict]]:
+    """Messages of the parts that follow, with arrays as a browser decodes them."""
+    found = []
+    for call in re.findall(r"<script>gsjaxParts\.add\((.*?)\)</script>", text):
+        messages, data, _ = json.loads(f"[{call}]")
+        raw = gzip.decompress(base64.b64decode(data))
+
+        def revived(value, raw=raw):
+            if "array" not in value:
+                return value
+            kind = {"Uint32Array": np.uint32, "Uint8Array": np.uint8}[value["array"]]
+            return np.frombuffer(raw, kind, value["length"], value["offset"])
+
+        found.append(json.loads(messages, object_hook=revived))
+    return found
+
+
+def splats_of(props: dict, packed: np.ndarray) -> np.ndarray:
+    """Means in world units, and colours with opacities [M, 7]."""
+    means = packed[:, :3].copy().view(np.float32) * props["scale"]
+    rgba = packed[:, 7:].copy().view(np.uint8)
+    return np.concatenate([means, rgba], axis=1)
+
+
 def about(messages: list[dict], kind: str, name: str) -> dict:
     """The only message of a kind about a node of the scene."""
     (found,) = (m for m in messages if m["type"] == kind and m["name"] == name)
@@ -64,7 +90,9 @@ def turned(wxyz) -> np.ndarray:
 
 def test_without_viser_the_error_names_the_package(ply, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    for args in (["view", str(ply)], ["train", "x", "-o", str(tmp_path), "--viewer"]):
+    page = ["export", str(ply), str(tmp_path / "a.html")]
+    training = ["train", "x", "-o", str(tmp_path), "--viewer"]
+    for args in (["view", str(ply)], page, training):
         assert main(args) == 6
         out, err = capsys.readouterr()
         assert out == ""
@@ -98,6 +126,71 @@ def test_a_page_holds_the_scene_and_loads_nothing(ply, tmp_path, capsys):
     args = ["--overwrite", "--min-opacity", "0.999"]
     assert main(["view", str(ply), "--html", str(out), *args]) == 3
     assert "lower --min-opacity" in capsys.readouterr().err
+
+
+def test_export_writes_the_page_of_view(ply, tmp_path, capsys):
+    pages, said = [tmp_path / "a.html", tmp_path / "b.HTM"], []
+    for words in (["view", ply, "--html", pages[0]], ["export", ply, pages[1]]):
+        assert main([*map(str, words), "--min-opacity", "0.2"]) == 0
+        out, err = capsys.readouterr()
+        said.append((out.split("  ")[1], err))
+    assert said[0] == said[1]
+    assert "Gaussians left out: opacity below 0.2" in said[0][1]
+    assert pages[0].read_text() == pages[1].read_text()
+    again = ["export", str(ply), str(pages[1])]
+    for more, code, message in (
+        ([], 3, "b.HTM: exists; pass --overwrite"),
+        (["--overwrite", "--sh-degree", "1"], 2, "a page has one colour"),
+        (["--overwrite", "--min-opacity", "0.999"], 3, "lower --min-opacity"),
+    ):
+        assert main([*again, *more]) == code
+        assert message in capsys.readouterr().err
+        assert pages[0].read_text() == pages[1].read_text()
+    assert main([*again, "--overwrite", "--sh-degree", "0"]) == 0
+
+
+@pytest.mark.parametrize("parts", [2, 3])
+def test_the_parts_of_a_page_are_the_whole(tmp_path, capsys, parts):
+    """The most important Gaussians come first, cameras and photographs last."""
+    run = run_at(tmp_path, TrainConfig())
+    gaussians = training.true_gaussians()
+    save_scene(run_files(run).splat, gaussians, training.dataset(), TrainConfig())
+    texts = []
+    for count in (1, parts):
+        out = tmp_path / f"{count}.html"
+        words = ["view", run, "--html", out, "--parts", count]
+        assert main(list(map(str, words))) == 0
+        texts.append(out.read_text())
+    whole, packed = decode(texts[0])
+    first, some = decode(texts[1])
+    added = later(texts[1])
+    assert len(added) == parts - 1
+    assert later(texts[0]) == []
+    shares = [some.shape[0]]
+    expected = splats_of(
+        about(whole, "GaussianSplatsMessage", "/splats")["props"], packed
+    )
+    found = [splats_of(about(first, "GaussianSplatsMessage", "/splats")["props"], some)]
+    for index, messages in enumerate(added, start=2):
+        name = f"/splats-{index}"
+        props = about(messages, "GaussianSplatsMessage", name)["props"]
+        found.append(splats_of(props, props["buffer"].reshape(-1, 8)))
+        shares.append(len(found[-1]))
+    rows = [each[np.lexsort(each.T)] for each in (np.concatenate(found), expected)]
+    np.testing.assert_allclose(*rows, rtol=1e-6)
+    assert shares[0] == round(0.1 * len(expected))
+    assert sorted(shares) == shares
+    names = [m["name"] for m in first if "CameraFrustum" in m["type"]]
+    assert names == []
+    for index in range(training.VIEWS):
+        name = f"/cameras/{index:04d}"
+        photos = [
+            about(messages, "CameraFrustumMessage", name)["props"]["_image_data"]
+            for messages in (whole, added[-1])
+        ]
+        assert bytes(photos[0]) == bytes(photos[1])
+    assert main(["view", str(run), "--parts", "2"]) == 2
+    assert "--parts goes with --html" in capsys.readouterr().err
 
 
 def test_a_page_of_a_run_holds_its_cameras_and_photographs(tmp_path, capsys):

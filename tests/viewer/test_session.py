@@ -29,7 +29,7 @@ from gsjax.viewer.cameras import frusta_of, photo_distances
 from gsjax.viewer.exact import ExactRenderer
 from gsjax.viewer.opening import make_content
 from gsjax.viewer.server import ViewerServer
-from gsjax.viewer.splats import MIN_DRAWN_OPACITY, longest_axes, opacities_of
+from gsjax.viewer.splats import MANY, MIN_DRAWN_OPACITY, longest_axes, opacities_of
 from gsjax.viewer.viser_server import open_server, stop_server
 
 pytest.importorskip("viser", reason="needs gsjax[viewer]")
@@ -99,6 +99,32 @@ def test_a_mesh_is_shown_first_and_splats_on_demand(server):
         assert (session.mesh.visible, session.splats.visible) == (False, False)
     finally:
         server.content.mesh = None
+        browser.close()
+
+
+def test_a_browser_first_receives_the_most_important_part(server):
+    """Only of a large scene, and once."""
+    count = MANY + 7
+    rng = np.random.default_rng(0)
+    large = gsjax.make_gaussians(
+        means=rng.normal(size=(count, 3)),
+        quats=rng.normal(size=(count, 4)),
+        log_scales=rng.normal(-4, 1, (count, 3)),
+        logit_opacities=rng.normal(size=count),
+        sh=np.zeros((count, 1, 3)),
+    )
+    drawn = int((opacities_of(large) >= MIN_DRAWN_OPACITY).sum())
+    server.content.gaussians = large
+    browser = Browser(server.url)
+    try:
+        wait_for(lambda: drawn in browser.splat_counts())
+        assert browser.splat_counts() == [round(0.1 * drawn), drawn]
+        server.show(scene())
+        wait_for(lambda: len(browser.splat_counts()) == 3)
+        server.show(large)
+        wait_for(lambda: len(browser.splat_counts()) == 4)
+        assert browser.splat_counts()[3] == drawn
+    finally:
         browser.close()
 
 

@@ -73,6 +73,34 @@ def test_thinning_keeps_the_most_important():
     np.testing.assert_array_equal(np.flatnonzero(kept), np.arange(COUNT - 9, COUNT))
 
 
+@pytest.mark.parametrize("ordered", [False, True])
+def test_parts_fall_in_importance(ordered):
+    gaussians = scene()
+    shown = within(gaussians, Cut(0.1))
+    count = shown.sum()
+    order = splats.by_importance(gaussians, shown, ordered)
+    np.testing.assert_array_equal(np.sort(order), np.flatnonzero(shown))
+    if ordered:
+        np.testing.assert_array_equal(order, np.flatnonzero(shown))
+    for parts, ends in (
+        (1, [1]),
+        (2, [0.1, 1]),
+        (4, 0.1 ** np.array([1, 2 / 3, 1 / 3, 0])),
+    ):
+        masks = splats.importance_parts(gaussians, shown, parts, ordered)
+        so_far = np.cumsum(masks, axis=0)
+        assert so_far.max() == 1
+        for mask, end in zip(so_far.astype(bool), np.rint(np.multiply(ends, count))):
+            np.testing.assert_array_equal(
+                mask, splats.most_important(gaussians, shown, int(end), ordered)
+            )
+        np.testing.assert_array_equal(so_far[-1], shown)
+    few = shown & (np.cumsum(shown) <= 3)
+    assert [m.sum() for m in splats.importance_parts(gaussians, few, 8)] == [1, 1, 1]
+    with pytest.raises(gsjax.InputError, match="parts: expected at least 1, got 0"):
+        splats.importance_parts(gaussians, shown, 0)
+
+
 def test_the_camera_of_a_browser():
     wxyz, position = np.array([0.9, -0.2, 0.3, 0.1]), np.array([1.0, 2, 3])
     camera = camera_of(wxyz, position, 0.8, 40, 30)

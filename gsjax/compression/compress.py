@@ -1,0 +1,139 @@
+"""The door of compression: `compress`."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from gsjax.cameras.camera import Camera
+from gsjax.compression.importance import measure_importance, sample_cameras
+from gsjax.compression.measure import Judge
+from gsjax.compression.quantise import as_gaussians, make_source, rows_of
+from gsjax.compression.search import Trial, search, write_and_read
+from gsjax.compression.types import CompressedScene, Goal, HeldOut
+from gsjax.errors import InputError
+from gsjax.gaussians import Gaussians, num_active, select
+from gsjax.planning.types import Reason
+from gsjax.raster.argument_checks import requires_concrete_values
+from gsjax.raster.types import RasterConfig
+
+DEFAULT_GOAL = Goal(max_loss=0.3)
+_SUFFIXES = (".sog", ".spz", ".compressed.ply", ".glb", ".ply")
+_JUDGED = 24  # held-out pictures
+
+
+@requires_concrete_values()
+def compress(
+    gaussians: Gaussians,
+    cameras: Camera | Sequence[Camera],
+    *,
+    goal: Goal = DEFAULT_GOAL,
+    suffix: str = ".sog",
+    config: RasterConfig | None = None,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    held_out: HeldOut | None = None,
+    mode: str | None = None,
+) -> CompressedScene:
+    """Return a scene as a small file, for a stated loss or size.
+
+    One price of a bit decides which Gaussians are left out, which harmonics are shared
+    or dropped, and how coarsely each number is rounded. The price is found by measuring
+    the file, read back, on held-out pictures. Call it outside of jit; it compiles a few
+    programs.
+
+    Args:
+      gaussians: N slots, concrete.
+      cameras: one, a batch, or several, of which at most 48 are used: views that matter
+        to the scene, such as those of training.
+      goal: what must be met.
+      suffix: file format: ".sog", ".spz", ".compressed.ply", ".glb" or ".ply". The
+        last three have no entropy coding: there only Gaussians and harmonics are
+        reduced.
+      config: settings of the render.
+      background: RGB behind the scene.
+      held_out: pictures to measure on, of at most 24 cameras; None for the cameras
+        themselves without photographs.
+      mode: render mode to record, see `gsjax.io.formats.render_mode`.
+
+    Raises:
+      InputError: if the goal cannot be reached, there is no Gaussian or no camera, the
+        format is unknown or cannot store the scene, or under a transformation of JAX.
+      CapacityError: as `render_exact`.
+    """
+    goal.check()
+    if suffix not in _SUFFIXES:
+        known = ", ".join(_SUFFIXES)
+        raise InputError(f"suffix: expected one of {known}, got {suffix!r}")
+    config = config or RasterConfig()
+    chosen = sample_cameras(cameras)
+    if not chosen:
+        raise InputError("cameras: expected at least one camera, got none")
+    rows = rows_of(_drawable(gaussians))
+    if not len(rows["means"]):
+        raise InputError("gaussians: expected at least one that can be drawn, got none")
+    scene = as_gaussians(rows)
+    judge = Judge(scene, _few(held_out, chosen), config, background)
+    before = judge.judge(scene, timed=True)
+    importance = measure_importance(scene, chosen, config, background)
+    source = make_source(rows, importance, suffix, 0)
+    best = search(source, judge, before, goal, mode)
+    after = judge.judge(best.gaussians, timed=True)
+    return CompressedScene(
+        gaussians=best.gaussians,
+        data=best.data,
+        suffix=suffix,
+        before=before,
+        after=after,
+        size_before=len(write_and_read(scene, ".ply", None)[0]),
+        reasons=_reasons(best, int(num_active(gaussians)), importance.largest),
+    )
+
+
+def _drawable(gaussians: Gaussians) -> Gaussians:
+    """Return the Gaussians without those that are never drawn."""
+    params = gaussians.params
+    valid = np.any(np.asarray(params.quats) != 0, axis=1)
+    for leaf in params.__dict__.values():
+        flat = np.asarray(leaf).reshape(gaussians.capacity, -1)
+        valid &= np.isfinite(flat).all(axis=1)
+    return select(gaussians, jnp.asarray(valid))
+
+
+def _few(held_out: HeldOut | None, cameras: Sequence[Camera]) -> HeldOut:
+    """Return at most `_JUDGED` pictures, evenly spaced."""
+    if held_out is None:
+        return HeldOut(sample_cameras(cameras, _JUDGED // 2))
+    count = len(held_out.cameras)
+    if not count:
+        raise InputError("held_out: expected at least one camera, got none")
+    places = np.linspace(0, count - 1, min(count, _JUDGED)).astype(int)
+    few = [
+        None if some is None else [some[place] for place in places] for some in held_out
+    ]
+    return HeldOut(*few)  # pyright: ignore[reportArgumentType]
+
+
+def _reasons(best: Trial, count: int, largest: np.ndarray) -> tuple[Reason, ...]:
+    scene = best.scene
+    kept, unseen = len(scene.kept), int(np.sum(largest < 1 / 255))
+    removed = f"{kept:,} of {count:,}; {unseen:,} never exceed 1/255 of a pixel"
+    bits = 8 * len(best.data) / kept
+    degree = best.gaussians.sh_degree
+    palette = f"degree {degree}" + f", {scene.entries:,} in a palette" * bool(degree)
+    reasons = [
+        Reason("Gaussians", removed, scene.errors["removal"], "estimate"),
+        Reason("harmonics", palette, scene.errors["harmonics"], "estimate"),
+    ]
+    for name, error in scene.errors.items():
+        if name not in ("removal", "harmonics"):
+            levels = len(np.unique(_numbers(scene.rows, name)))
+            why = f"{levels:,} distinct values"
+            reasons.append(Reason(name, why, error, "estimate"))
+    why = (
+        f"{bits:.0f} bits a Gaussian; a bit is worth {scene.price:.2g} of squared error"
+    )
+    return (*reasons, Reason("price", why))
+
+
+def _numbers(rows, name: str) -> np.ndarray:
+    return rows["sh"][:, 0] if name == "colors" else rows[name]

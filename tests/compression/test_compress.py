@@ -1,0 +1,134 @@
+"""Compressed scenes, measured anew: what is stated is what the file holds."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from captures import rejects
+from conftest import camera_of, frustum_points, gaussians_at
+
+import gsjax
+from gsjax import RasterConfig
+from gsjax.compression.quantise import rows_of
+from gsjax.compression.types import CompressedScene, Goal, HeldOut
+
+pytestmark = [
+    pytest.mark.usefixtures("float32"),
+    pytest.mark.filterwarnings("ignore:.*Gaussians have"),
+]
+CONFIG = RasterConfig(tile_size=8)
+BACKGROUND = (0.1, 0.2, 0.3)
+
+
+def make_scene(count: int = 300) -> gsjax.Gaussians:
+    """Overlapping, with harmonics that few Gaussians need, and inactive slots."""
+    rng = np.random.default_rng(0)
+    points = frustum_points(rng, count, far=6.0, spread=0.5)
+    scales = np.exp(rng.normal(-2.2, 0.4, (count, 3)))
+    gaussians = gaussians_at(points, scales, rng.uniform(0.1, 0.95, count))
+    sh = rng.normal(0, 0.03, (count, 4, 3))
+    sh[:, 0] = rng.normal(0, 0.8, (count, 3))
+    sh[::7, 1:] *= 4
+    params = gaussians.params.replace(sh=jnp.asarray(sh, jnp.float32))
+    return gaussians.replace(params=params, active=jnp.arange(count) % 10 != 3)
+
+
+@pytest.fixture(scope="module")
+def scene(float32) -> gsjax.Gaussians:
+    del float32
+    return make_scene()
+
+
+@pytest.fixture(scope="module")
+def cameras(float32) -> list[gsjax.Camera]:
+    del float32
+    shift = np.eye(4)
+    found = []
+    for x in np.linspace(-0.3, 0.3, 4):
+        shift = shift.copy()
+        shift[0, 3] = x
+        camera = camera_of(40, 30)
+        found.append(camera.replace(viewmat=jnp.asarray(shift @ camera.viewmat)))
+    return found
+
+
+def pictures(gaussians, cameras) -> np.ndarray:
+    behind = jnp.asarray(BACKGROUND, jnp.float32)
+    drawn = [gsjax.render_exact(gaussians, c, CONFIG, behind).rgb for c in cameras]
+    return np.clip(np.stack(drawn), 0, 1)
+
+
+def psnr(found, expected) -> float:
+    return float(-10 * np.log10(np.mean((found - expected) ** 2, (1, 2, 3))).mean())
+
+
+def compressed(scene, cameras, goal, **kwargs) -> CompressedScene:
+    return gsjax.compress(
+        scene, cameras, goal=goal, config=CONFIG, background=BACKGROUND, **kwargs
+    )
+
+
+def read_back(result: CompressedScene, folder: Path) -> gsjax.Gaussians:
+    path = folder / f"a{result.suffix}"
+    result.save(path)
+    assert path.read_bytes() == result.data
+    return gsjax.load(path)
+
+
+@pytest.mark.parametrize("suffix", [".sog", ".spz"])
+def test_the_loss_against_photographs_is_that_of_the_file(
+    scene, cameras, tmp_path, suffix
+):
+    rng = np.random.default_rng(1)
+    before = pictures(scene, cameras)
+    photos = np.clip(before + rng.normal(0, 0.02, before.shape), 0, 1)
+    held_out = HeldOut(cameras, [*photos.astype(np.float32)])
+    goal = Goal(max_loss=0.5)
+    result = compressed(scene, cameras, goal, suffix=suffix, held_out=held_out)
+    found = pictures(read_back(result, tmp_path), cameras)
+    loss = psnr(before, photos) - psnr(found, photos)
+    assert result.loss == pytest.approx(loss, abs=1e-3)
+    assert 0.1 < loss <= 0.5
+    assert result.after.psnr_before == pytest.approx(psnr(found, before), abs=0.01)
+    largest = np.abs(found - before).max()
+    assert result.after.largest_error == pytest.approx(largest, abs=1e-5)
+    gsjax.save(tmp_path / "all.ply", scene)
+    assert result.size_before == (tmp_path / "all.ply").stat().st_size
+    assert len(result.data) < result.size_before / 5
+    assert any(f"{result.loss:.3f} dB lost" in line for line in result.lines())
+
+
+def test_sizes_and_errors_are_met(scene, cameras, tmp_path):
+    small = compressed(scene, cameras, Goal(max_size=4000))
+    assert 2000 < len(small.data) <= 4000
+    fine = compressed(scene, cameras, Goal(max_error=8 / 255))
+    found = pictures(read_back(fine, tmp_path), cameras)
+    assert np.abs(found - pictures(scene, cameras)).max() <= 8.01 / 255
+    assert fine.after.psnr_before > small.after.psnr_before
+    # Without photographs: 10 log10 of the error of 30 dB and this one together.
+    error = 10 ** (-fine.after.psnr_before / 10)
+    assert fine.loss == pytest.approx(10 * np.log10(1 + error / 1e-3))
+
+
+def test_files_without_entropy_coding_lose_gaussians_only(scene, cameras, tmp_path):
+    result = compressed(scene, cameras, Goal(max_loss=0.5), suffix=".ply")
+    found, whole = rows_of(read_back(result, tmp_path)), rows_of(scene)
+    assert len(found["means"]) < len(whole["means"])
+    assert {*map(tuple, found["means"])} <= {*map(tuple, whole["means"])}
+
+
+def test_refusals(scene, cameras):
+    empty = gsjax.select(scene, np.zeros(scene.capacity, bool))
+    rows = [
+        ((scene, []), {}, "at least one camera"),
+        ((empty, cameras), {}, "at least one that can be drawn"),
+        ((scene, cameras), {"suffix": ".splat"}, "suffix: expected one of"),
+        ((scene, cameras), {"goal": Goal()}, "expected one goal, got none"),
+        ((scene, cameras), {"goal": Goal(0.1, 9)}, "got max_loss, max_size"),
+        ((scene, cameras), {"goal": Goal(max_loss=-1.0)}, "expected a positive"),
+        ((scene, cameras), {"held_out": HeldOut([])}, "held_out: expected at least"),
+        ((scene, cameras), {"goal": Goal(max_size=10)}, "got .* at the least"),
+    ]
+    for args, kwargs, message in rows:
+        rejects(message, gsjax.compress, *args, **{"config": CONFIG} | kwargs)
