@@ -58,20 +58,20 @@ def encode_scene(
     packed = pack_quats(rows["quats"][order], BYTE)
     texels = np.column_stack([packed.codes, FIRST_INDEX + packed.dropped])
     files["quats.webp"] = encode_rows(texels.astype(np.uint8))
-    scales, indices = _indexed(_stored_scales(rows["log_scales"][order], mode))
-    files["scales.webp"] = encode_rows(indices)
-    colors, indices = _indexed(rows["sh"][order, 0])
+    scales, axes = _indexed(_stored_scales(rows["log_scales"][order], mode))
+    files["scales.webp"] = encode_rows(axes)
+    colors, channels = _indexed(rows["sh"][order, 0])
     opacities = common.opacity_bytes(rows["logit_opacities"][order])
-    files["sh0.webp"] = encode_rows(np.column_stack([indices, opacities]))
+    files["sh0.webp"] = encode_rows(np.column_stack([channels, opacities]))
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "gsjax"}}
     meta["count"] = len(order)
     if mode in MODELS:
         meta["model"] = MODELS[mode]
     bounds = {"mins": mins.tolist(), "maxs": maxs.tolist()}
     meta["means"] = {**bounds, "files": ["means_l.webp", "means_u.webp"]}
-    meta["scales"] = {"codebook": _decimals(scales), "files": ["scales.webp"]}
+    meta["scales"] = {"codebook": _decimals(scales, axes), "files": ["scales.webp"]}
     meta["quats"] = {"files": ["quats.webp"]}
-    meta["sh0"] = {"codebook": _decimals(colors), "files": ["sh0.webp"]}
+    meta["sh0"] = {"codebook": _decimals(colors, channels), "files": ["sh0.webp"]}
     if rows["sh"].shape[1] > 1:
         meta["shN"] = _encode_harmonics(rows["sh"][order, 1:], files)
     files[META] = json.dumps(meta, separators=(",", ":"), allow_nan=False).encode()
@@ -111,21 +111,27 @@ def _indexed(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rarity(values: np.ndarray) -> np.ndarray:
-    """Return weights [M] of numbers: 1 / √ of the number of those about as large.
+    """Return weights [M] of numbers: n^-1/3 for n numbers that are about as large.
 
     With equal weights, rare values such as the largest scales have large errors.
     """
     low, extent = values.min(), np.ptp(values)
     share = (values - low) / (extent or 1)
     bins = np.minimum(share * _BINS, _BINS - 1).astype(int)
-    return 1 / np.sqrt(np.bincount(bins)[bins])
+    return np.bincount(bins)[bins] ** (-1 / 3)
 
 
-def _decimals(values: np.ndarray) -> list[float]:
-    """Return float32 numbers with as few decimals as tell them apart."""
-    short = [float(str(value)) for value in values.astype(np.float32)]
-    same = np.asarray(short).astype(np.float32) == values
-    return [a if good else float(b) for a, b, good in zip(short, values, same)]
+def _decimals(entries: np.ndarray, indices: np.ndarray) -> list[float]:
+    """Return a codebook [256] float32 with as few decimals as tell its entries apart.
+
+    Entries after the last of the ``indices`` are 0, which is short. Some programs
+    expect 256 numbers.
+    """
+    used = entries[: int(indices.max()) + 1]
+    short = [float(str(value)) for value in used]
+    same = np.asarray(short).astype(np.float32) == used
+    found = [a if good else float(b) for a, b, good in zip(short, used, same)]
+    return found + [0] * (ENTRIES - len(used))
 
 
 def palette_size(count: int) -> int:
@@ -159,7 +165,7 @@ def _encode_harmonics(rest: np.ndarray, files: dict[str, bytes]) -> dict[str, An
     return {
         "count": len(palette),
         "bands": degree_of(coefficients + 1),
-        "codebook": _decimals(entries),
+        "codebook": _decimals(entries, indices),
         "files": names,
     }
 

@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 
 from gsjax.errors import InputError
+from gsjax.math.levels import optimal_levels
 
 Array = jax.Array
 
@@ -21,7 +22,6 @@ _PER_GROUP = 256  # clusters of a group, on average
 _IN_GROUP = 4  # iterations within a group
 _SAMPLED = 4  # points per cluster among which the first centroids are chosen
 _LLOYD_STEPS = 40
-_BINS = 512  # more are noisy: each then holds few values
 
 
 class Clusters(NamedTuple):
@@ -256,9 +256,7 @@ def codebook(
     """Return a table of numbers that approximates values, and an index for each.
 
     The table is exact if there are at most ``count`` distinct values. Otherwise it is
-    the optimum of Lloyd's iterations from levels whose density is the cube root of that
-    of the values (Panter and Dite, "Quantization distortion in pulse-count
-    modulation", 1951).
+    that of `gsjax.math.levels.optimal_levels`, refined by Lloyd's iterations.
 
     Args:
       values: [M] finite numbers; M may be 0.
@@ -284,13 +282,7 @@ def codebook(
 
 def _levels(found: np.ndarray, mass: np.ndarray, count: int) -> np.ndarray:
     """Return [count] ascending levels for ascending values [M] with weights [M]."""
-    low, high = found[0], found[-1]
-    bins = np.minimum((found - low) / (high - low) * _BINS, _BINS - 1).astype(int)
-    density = np.cbrt(np.bincount(bins, mass, minlength=_BINS))
-    place = np.cumsum(density) / density.sum()
-    wanted = (np.arange(count) + 0.5) / count
-    edges = low + (high - low) * (np.arange(_BINS) + 1) / _BINS
-    levels = np.interp(wanted, place, edges)
+    levels = optimal_levels(found, mass, count)
     zero = np.zeros(1)
     sums = np.concatenate([zero, np.cumsum(mass)])
     moments = np.concatenate([zero, np.cumsum(mass * found)])
