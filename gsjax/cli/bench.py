@@ -19,7 +19,7 @@ class BenchCommand(HeavyCommand):
     The exit code is 1 if an error exceeds its theoretical bound."""
 
     scene: Annotated[Positional[str], arg(metavar="RUN|PLY|NAME")] = "knot"
-    """Folder of a run, a .ply or .spz file, or a built-in scene: knot, fog, needles or
+    """Folder of a run, a file of Gaussians, or a built-in scene: knot, fog, needles or
     huge."""
     cameras: Path | None = None
     """Use the first camera of this transforms.json; default: a camera of the scene, or

@@ -15,15 +15,14 @@ from gsjax.runtime.files import reject_existing
 
 @dataclass(kw_only=True)
 class ExportCommand(HeavyCommand):
-    """Write a scene as .ply, .spz or .splat, in the coordinates of its dataset, or as
-    an .html page."""
+    """Write a scene for other programs, in the coordinates of its dataset."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
-    """Folder of a run, or a .ply or .spz file."""
+    """Folder of a run, or a file of Gaussians: .ply, .sog, .spz, .glb and others."""
     out: Annotated[Positional[Path], arg(metavar="OUT.ply")]
-    """File to write: .ply; .spz, about a fifth of the size; .splat, without spherical
-    harmonics; or .html, the page of gsjax view --html. Its folder is created if
-    missing."""
+    """File to write: .ply; .compressed.ply; .sog, or meta.json for a SOG folder; .spz;
+    .glb; .splat, without spherical harmonics; or .html, the page of gsjax view --html.
+    Its folder is created if missing."""
     sh_degree: Literal[0, 1, 2, 3, 4] | None = None
     """SH degree to write: higher bands are dropped, missing ones are zero. Some viewers
     read degree 3 only. A page has degree 0."""

@@ -17,7 +17,7 @@ class InfoCommand(HeavyCommand):
     """Print statistics of a scene, and the progress and quality of its run."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
-    """Folder of a run, or a .ply or .spz file."""
+    """Folder of a run, or a file of Gaussians: .ply, .sog, .spz, .glb and others."""
     json: bool = False
     """Print JSON."""
     plot: Annotated[Path | None, arg(metavar="OUT.png")] = None

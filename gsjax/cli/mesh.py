@@ -16,7 +16,7 @@ class MeshCommand(HeavyCommand):
     """Make a triangle mesh of a scene, to print, measure or view."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
-    """Folder of a run, or a .ply or .spz file (with --sphere); surfels give the best
+    """Folder of a run, or a file of Gaussians (with --sphere); surfels give the best
     meshes (gsjax train --primitive surfel)."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="MESH")] = None
     """File to write: .ply, .glb, .obj or .stl (without colours). Default: mesh.ply in

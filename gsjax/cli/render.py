@@ -19,7 +19,7 @@ class RenderCommand(HeavyCommand):
     """Render a scene from given cameras or along a path, as images or a movie."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
-    """Folder of a run, or a .ply or .spz file."""
+    """Folder of a run, or a file of Gaussians: .ply, .sog, .spz, .glb and others."""
     out: Annotated[Path, arg(aliases=["-o"], metavar="DIR|MOVIE")]
     """Folder for the images, created if missing; or a movie: .mp4 (requires
     gsjax[movies]), .webm, .webp or .gif."""

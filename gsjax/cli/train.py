@@ -56,7 +56,7 @@ class TrainCommand(HeavyCommand):
     initial: Annotated[str | None, arg(metavar="points|dense|random|SCENE")] = None
     """Initialise from the points of the dataset (points), from those and points matched
     between photographs (dense, the default), from random points in view (random), or
-    from a scene of this dataset: the folder of a run, or a .ply or .spz file."""
+    from a scene of this dataset: the folder of a run, or a file of Gaussians."""
     antialias: bool = False
     """Compensate the opacity of splats smaller than a pixel, for renders at other
     sizes."""
@@ -231,7 +231,7 @@ class TrainCommand(HeavyCommand):
         if not given.suffix and not given.exists():
             raise UsageError(
                 f"--initial: expected {', '.join(_POINTS)}, the folder of a run, or a "
-                f".ply or .spz file, got {self.initial!r}"
+                f"file of Gaussians, got {self.initial!r}"
             )
         splat = splat_file(given).resolve()
         if splat == run_files(self.out).splat.resolve():

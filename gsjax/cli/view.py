@@ -19,7 +19,7 @@ class ViewCommand(HeavyCommand):
     """View a scene in the browser. Requires gsjax[viewer]."""
 
     scene: Annotated[Positional[Path], arg(metavar="RUN|PLY")]
-    """Folder of a run, or a .ply or .spz file."""
+    """Folder of a run, or a file of Gaussians: .ply, .sog, .spz, .glb and others."""
     html: Annotated[Path | None, arg(metavar="OUT.html")] = None
     """Write a page that opens offline, instead of serving."""
     mesh: bool = False

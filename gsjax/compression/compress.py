@@ -1,6 +1,7 @@
 """The door of compression: `compress`."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +14,8 @@ from gsjax.compression.search import Trial, search, write_and_read
 from gsjax.compression.types import CompressedScene, Goal, HeldOut
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, num_active, select
+from gsjax.io.common import warn
+from gsjax.io.formats import unrecorded_mode
 from gsjax.planning.types import Reason
 from gsjax.raster.argument_checks import requires_concrete_values
 from gsjax.raster.types import RasterConfig
@@ -53,7 +56,8 @@ def compress(
       background: RGB behind the scene.
       held_out: pictures to measure on, of at most 24 cameras; None for the cameras
         themselves without photographs.
-      mode: render mode to record, see `gsjax.io.formats.render_mode`.
+      mode: render mode to record, see `gsjax.io.formats.render_mode`; a format that
+        cannot record it causes a warning.
 
     Raises:
       InputError: if the goal cannot be reached, there is no Gaussian or no camera, the
@@ -68,6 +72,8 @@ def compress(
     chosen = sample_cameras(cameras)
     if not chosen:
         raise InputError("cameras: expected at least one camera, got none")
+    if (lost := unrecorded_mode(Path(f"scene{suffix}"), mode)) is not None:
+        warn(f"{suffix}: {lost}, which the measured loss leaves out")
     rows = rows_of(_drawable(gaussians))
     if not len(rows["means"]):
         raise InputError("gaussians: expected at least one that can be drawn, got none")

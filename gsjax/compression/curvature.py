@@ -3,8 +3,8 @@
 The diagonal of JᵀJ. For opacities it follows from the error of a removal. For the
 others, that error and the shape of a Gaussian give an estimate: with standardised
 offsets y from the centre and weights like exp(−y²), the mean of y² is 1/2, of y⁴ 3/4,
-and of y1² y2² 1/4. It is exact for one isolated Gaussian seen from all sides, and
-holds down the noise of what few random signs measure.
+and of y1² y2² 1/4. For one isolated Gaussian seen from all sides it is within a factor
+of 2. It reduces the noise of measurements by few random signs.
 
 Axis legend: N Gaussians, V views.
 """

@@ -36,8 +36,10 @@ class Importance(NamedTuple):
         pixels and channels: the error per squared change of the colour (summed over
         channels) if all Gaussians of a pixel change alike.
       centres: [V, 3] centres of the cameras.
+      energy: [N] sum of the squared weights over all pixels, over their number and that
+        of the channels: the error per squared change of the colour if the Gaussians of
+        a pixel change independently.
       largest: [N] largest weight in a pixel.
-      energy: [N] the same if they change independently: the sum of squared weights.
       removal: [N] error if this Gaussian alone is removed.
       curvature: error per squared change of a number, by the names and in the shapes
         of `GaussianParams` without harmonics: the diagonal of JᵀJ.
@@ -45,8 +47,8 @@ class Importance(NamedTuple):
 
     shares: np.ndarray
     centres: np.ndarray
-    largest: np.ndarray
     energy: np.ndarray
+    largest: np.ndarray
     removal: np.ndarray
     curvature: dict[str, np.ndarray]
 
@@ -106,7 +108,7 @@ def measure_importance(
     The diagonal of JᵀJ is measured by one reverse pass in each of some pictures, with a
     random sign in each pixel and channel as cotangent: the expected square of the
     gradient is the sum of squares (Hutchinson, "A stochastic estimator of the trace",
-    1989). See `gsjax.compression.curvature` for what holds down the noise.
+    1989). `gsjax.compression.curvature` reduces the noise.
 
     Args:
       gaussians: N slots, concrete.

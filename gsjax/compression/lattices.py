@@ -47,7 +47,6 @@ class Lattice(NamedTuple):
     Attributes:
       means, log_scales, logit_opacities, colors: axes; colours are SH degree 0.
       quats: axis of the three smaller components of a unit quaternion.
-      has_palette: whether harmonics above degree 0 are an entry of a palette.
     """
 
     means: Axis
@@ -55,14 +54,16 @@ class Lattice(NamedTuple):
     logit_opacities: Axis
     colors: Axis
     quats: Axis
-    has_palette: bool
+
+
+def has_lattice(suffix: str) -> bool:
+    """Return whether a format has entropy coding, and so a lattice."""
+    return suffix in _LATTICES
 
 
 def lattice_of(suffix: str, rows: Rows) -> Lattice | None:
     """Return the lattice of a format for these Gaussians, or None if it has none."""
-    if suffix == ".sog":
-        return _of_sog(rows)
-    return _of_spz(rows) if suffix == ".spz" else None
+    return _LATTICES[suffix](rows) if has_lattice(suffix) else None
 
 
 def _of_sog(rows: Rows) -> Lattice:
@@ -90,7 +91,6 @@ def _of_sog(rows: Rows) -> Lattice:
             0,
             255,
         ),
-        has_palette=True,
     )
 
 
@@ -105,7 +105,6 @@ def _of_spz(rows: Rows) -> Lattice:
             lambda v: 255 * (0.5 + 0.15 * v), lambda c: (c / 255 - 0.5) / 0.15, 0, 255
         ),
         quats=_uniform(np.sqrt(0.5) / 511),
-        has_palette=True,
     )
 
 
@@ -118,6 +117,9 @@ def _opacity_of(codes: np.ndarray) -> np.ndarray:
 
 
 _OPACITY = Axis(lambda v: 255 * expit(v), _opacity_of, 0, 255)
+
+
+_LATTICES = {".sog": _of_sog, ".spz": _of_spz}
 
 
 class Rounded(NamedTuple):

@@ -87,8 +87,8 @@ class Judge:
         return Quality(
             psnr=scores[0],
             ssim=scores[1],
-            psnr_before=float(before[0] or 0),
-            ssim_before=float(before[1] or 0),
+            psnr_before=before[0],
+            ssim_before=before[1],
             largest_error=float(max(largest)),
             seconds=seconds if timed else float("nan"),
         )
@@ -103,4 +103,7 @@ class Judge:
                 truth = np.asarray(truth, np.float32)
                 both = _psnr(picture, truth, weight), _ssim(picture, truth, weight)
                 scores.append([float(one) for one in both])
-        return tuple(np.mean(scores, 0)) if scores else (np.nan, np.nan)
+        if not scores:
+            return float("nan"), float("nan")
+        quality, similarity = np.mean(scores, 0)
+        return float(quality), float(similarity)

@@ -14,14 +14,22 @@ import numpy as np
 
 from gsjax.compression.harmonics import ViewedHarmonics
 from gsjax.compression.importance import Importance
-from gsjax.compression.lattices import Lattice, Rows, lattice_of, round_to
+from gsjax.compression.lattices import (
+    Lattice,
+    Rows,
+    has_lattice,
+    lattice_of,
+    round_to,
+)
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.math.clustering import Clusters, codebook, kmeans, nearest_by_cost
+from gsjax.math.sh import degree_of, num_bases
 
 _PER_BIT = 1 / (2 * np.log(2))
 _SPHERE = 4 * np.pi  # a coefficient adds the square of its change over 4 π, on average
-_GAUSSIAN_BITS = 100.0  # of one Gaussian without harmonics, before it is known
+_GAUSSIAN_BITS = 100.0  # of one Gaussian without harmonics, about
 _ENTRY_BITS = 6.0  # of a coefficient in the palette
+_PLAIN_BITS = 32.0  # of a coefficient in a format without entropy coding, at most
 _PALETTES, _LARGEST_PALETTE = (64, 256, 1024, 4096, 16384), 65536
 _SH_TABLE = 256
 
@@ -183,11 +191,14 @@ def _harmonics(
 ) -> tuple[np.ndarray, int, float]:
     """Return the harmonics [N, K, 3], the entries of the palette, and the error.
 
-    Of the palettes and none, the one with the least error plus price of its bits.
+    Of the palettes and none, the one with the least error plus price of its bits. A
+    format without entropy coding gains nothing from a palette.
     """
     seen, rest = source.harmonics.rows(kept), source.simplified[kept]
     weights = source.importance.shares[:, kept].sum(0, dtype=np.float64) / _SPHERE
     nothing = np.zeros_like(seen.sh[:, 1:])
+    if not has_lattice(source.suffix):
+        return _by_degree(seen, price)
     base, errors = seen.refitted(nothing)
     best = _Choice(float(errors.sum()), base, nothing, 0, float(errors.sum()))
     without = base, errors
@@ -200,6 +211,21 @@ def _harmonics(
         return best.base[:, None], 0, best.error
     sh = np.concatenate([best.base[:, None], best.rest], 1)
     return sh, best.entries, best.error
+
+
+def _by_degree(seen: ViewedHarmonics, price: float) -> tuple[np.ndarray, int, float]:
+    """Return the harmonics up to the degree that is worth its bits, and the error."""
+    bases = seen.sh.shape[1]
+    best = (np.inf, seen.sh, 0.0)
+    for degree in range(degree_of(bases) + 1):
+        stored = num_bases(degree)
+        rest = np.array(seen.sh[:, 1:])
+        rest[:, stored - 1 :] = 0
+        base, errors = seen.refitted(rest)
+        sh = np.concatenate([base[:, None], rest[:, : stored - 1]], 1)
+        cost = errors.sum() + price * _PLAIN_BITS * 3 * stored * len(sh)
+        best = min(best, (cost, sh, float(errors.sum())), key=lambda one: one[0])
+    return best[1], 0, best[2]
 
 
 class _Choice(NamedTuple):

@@ -24,6 +24,7 @@ from gsjax.runtime.console import note
 
 _TRIALS = 8
 _ENOUGH = 0.9  # share of the goal that is near enough
+_COARSEST, _HALVINGS = 10.0, 30  # first price, of an even share of the error
 _FACTORS = 0.05, 50.0  # limits of what corrects an estimate
 _WIDEST = 16.0  # factor of the price from one trial to the next, at most
 
@@ -149,17 +150,13 @@ def _first_price(source: Source, before: Quality, goal: Goal) -> float:
         target = (goal.max_error / 8) ** 2
     else:
         target = 10 ** (-psnr / 10) / 15
-    count = len(source.rows["means"])
-    low, high = 1e-6 * target / count, 1e2 * target / count
-    for _ in range(12):
-        middle = np.sqrt(low * high)
-        if sum(quantise(source, middle).errors.values()) < target:
-            low = middle
-        else:
-            high = middle
-        if high < 2 * low:
+    # From coarse to fine: fine prices ask for large palettes, which take long to make.
+    price = _COARSEST * target / len(source.rows["means"])
+    for _ in range(_HALVINGS):
+        if sum(quantise(source, price).errors.values()) < target:
             break
-    return float(np.sqrt(low * high))
+        price /= 2
+    return price
 
 
 def calibrated(source: Source, judge: Judge, price: float) -> Source:

@@ -83,6 +83,15 @@ def read_exactly(file: BinaryIO, size: int, path: Path, what: str) -> bytes:
     return raw
 
 
+def require_degree(path: Path, degree: int, most: int) -> None:
+    """Raise `InputError` if a format cannot store harmonics of this degree."""
+    if degree > most:
+        raise InputError(
+            f"{path}: expected SH degree 0 to {most}, got {degree}; cut it with "
+            "gsjax.with_sh_degree (--sh-degree)"
+        )
+
+
 def to_bytes(values: np.ndarray) -> np.ndarray:
     """Round to the nearest whole numbers from 0 to 255."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)

@@ -71,8 +71,7 @@ def save(
     if mode is not None and not {mode, ANY_MODE}.isdisjoint(form.modes):
         options["mode"] = mode
     elif mode is not None and mode != DEFAULT_MODE:
-        lost = f"{form.name} files do not record the render mode {mode!r}"
-        warn(f"{path}: {lost}; other programs draw the scene as ordinary ellipsoids")
+        warn(f"{path}: {_lost_mode(form, mode)}")
     form.save(path, gaussians, **options)
 
 
@@ -90,6 +89,23 @@ def render_mode(
     """
     path, form = _chosen(path, formats, "load")
     return None if form.mode is None else form.mode(path)
+
+
+def unrecorded_mode(path: Path, mode: str | None) -> str | None:
+    """Return what is lost if a file of this name cannot record a render mode, or None.
+
+    Raises:
+      InputError: if the suffix is unknown.
+    """
+    form = _chosen(path, FORMATS, "save")[1]
+    if mode in (None, DEFAULT_MODE) or not {mode, ANY_MODE}.isdisjoint(form.modes):
+        return None
+    return _lost_mode(form, mode)
+
+
+def _lost_mode(form: Format, mode: str | None) -> str:
+    lost = f"{form.name} files do not record the render mode {mode!r}"
+    return f"{lost}; other programs draw the scene as ordinary ellipsoids"
 
 
 def keeps_every_bit(path: Path) -> bool:

@@ -50,11 +50,7 @@ def write_glb(
     path = Path(path)
     common.require_new(path, overwrite)
     degree, slots = gaussians.sh_degree, gaussians.capacity
-    if degree > MAX_DEGREE:
-        expected = f"expected SH degree 0 to {MAX_DEGREE}, got {degree}"
-        raise InputError(
-            f"{path}: {expected}; cut it with gsjax.with_sh_degree (--sh-degree)"
-        )
+    common.require_degree(path, degree, MAX_DEGREE)
     estimate = Estimate(
         {"values to be written": slots * (300 + 32 * num_bases(degree))}
     )

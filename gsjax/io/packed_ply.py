@@ -203,11 +203,7 @@ def write_packed_ply(
     path = Path(path)
     common.require_new(path, overwrite)
     degree = gaussians.sh_degree
-    if degree > _MAX_DEGREE:
-        raise InputError(
-            f"{path}: expected SH degree 0 to {_MAX_DEGREE}, got {degree}; cut it with "
-            "gsjax.with_sh_degree (--sh-degree)"
-        )
+    common.require_degree(path, degree, _MAX_DEGREE)
     slots, bases = gaussians.capacity, num_bases(degree)
     estimate = Estimate({"values to be written": slots * (500 + 60 * bases)})
     remedy = "leave some out (export --min-opacity), or write a .ply"

@@ -94,11 +94,7 @@ def write_sog(
     path = Path(path)
     common.require_new(path, overwrite)
     slots, degree = gaussians.capacity, gaussians.sh_degree
-    if degree > MAX_DEGREE:
-        expected = f"expected SH degree 0 to {MAX_DEGREE}, got {degree}"
-        raise InputError(
-            f"{path}: {expected}; cut it with gsjax.with_sh_degree (--sh-degree)"
-        )
+    common.require_degree(path, degree, MAX_DEGREE)
     each = 500 + 32 * num_bases(degree)
     remedy = "leave some out (export --min-opacity), or write a .ply"
     estimate = Estimate({"values to be written": slots * each})

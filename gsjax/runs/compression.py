@@ -76,7 +76,7 @@ def compress_scene(
       CapacityError: as `compress`.
     """
     reject_existing([out], overwrite)
-    inputs = _of_run(source) if is_run(source) else _of_file(source, cameras)
+    inputs = run_inputs(source) if is_run(source) else _of_file(source, cameras)
     result = compress(
         inputs.gaussians,
         inputs.cameras,
@@ -104,7 +104,12 @@ def file_suffix(path: Path) -> str:
     )
 
 
-def _of_run(path: Path) -> CompressionInputs:
+def run_inputs(path: Path) -> CompressionInputs:
+    """Return the scene of a run with its training and held-out views.
+
+    Raises:
+      InputError: as `load_split`, or if the run has no scene yet.
+    """
     settings = run_folder.load_settings(path)
     files, config = run_folder.run_files(path), settings.config
     given = run_folder.load_split(settings)

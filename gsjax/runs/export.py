@@ -25,7 +25,7 @@ def export_scene(
     """Write the Gaussians of a file or run to ``out``, in their own coordinates.
 
     Args:
-      source: a .ply or .spz file, or the folder of a run.
+      source: a file of Gaussians, or the folder of a run.
       out: the file; its folder is created if missing.
       sh_degree: SH degree to write: higher bands are dropped, missing ones zero.
       min_opacity: Gaussians below this opacity are left out.

@@ -104,7 +104,7 @@ def mesh_of_run(
     """Write the mesh of a run, or of a file of Gaussians.
 
     Args:
-      path: folder of the run, or a .ply or .spz file, which is seen from a sphere.
+      path: folder of the run, or a file of Gaussians, which is seen from a sphere.
       out: .ply, .glb, .obj or .stl; its folder is created if missing.
       settings: how it is made.
       overwrite: replace an existing file.

@@ -92,7 +92,7 @@ def open_scene_source(
     """Open a scene by its file or run.
 
     Args:
-      path: a .ply or .spz file, or the folder of a run.
+      path: a file of Gaussians, or the folder of a run.
       origin: [3] to subtract from the file's coordinates, as `load_dataset` and
         `load_near_transforms` do from those of the cameras.
       raster: render settings, except ``dilation``, ``antialias`` and ``primitive``,

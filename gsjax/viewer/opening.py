@@ -42,7 +42,7 @@ def load_content(
     If the dataset is missing, the cameras are left out with a warning.
 
     Args:
-      path: a .ply or .spz file, or the folder of a run.
+      path: a file of Gaussians, or the folder of a run.
       up: up direction of the world, a key of `UPS`; None takes it from the cameras, or
         −y without cameras, as in most scenes from COLMAP.
       raster: as `open_scene_source`.

@@ -21,7 +21,9 @@ from snippets import ROOT, blocks, commands
 
 import gsjax
 from gsjax.cli.main import main
+from gsjax.compression.measure import Judge
 from gsjax.gaussians import activate
+from gsjax.runs.compression import run_inputs
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("float32", "shared_programs")]
 
@@ -245,6 +247,18 @@ def test_mesh(demo, tmp_path, capsys):
     nowhere = [*map(str, words), "--overwrite", "--box=90,90,90,91,91,91"]
     assert main(nowhere) == 3
     assert "check the box" in capsys.readouterr().err
+
+
+def test_the_loss_of_a_compression_is_measured_on_the_held_out_views(demo):
+    """With the cameras and photographs of `gsjax eval`."""
+    inputs = run_inputs(demo / "run")
+    judge = Judge(inputs.gaussians, inputs.held_out, inputs.config, inputs.background)
+    quality = judge.judge(inputs.gaussians)
+    expected = json.loads((demo / "run" / "eval.json").read_text())
+    assert len(inputs.held_out.cameras) == expected["views"] == len(HELD_OUT)
+    assert len(inputs.cameras) == PHOTOS - len(HELD_OUT)
+    assert quality.psnr == pytest.approx(expected["psnr"], abs=0.01)
+    assert quality.ssim == pytest.approx(expected["ssim"], abs=1e-4)
 
 
 def test_mesh_of_a_file(demo, tmp_path, capsys):
