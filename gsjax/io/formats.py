@@ -47,6 +47,7 @@ def save(
     overwrite: bool = False,
     mode: str | None = None,
     formats: Sequence[Format] = FORMATS,
+    **options,
 ) -> None:
     """Write the active Gaussians to a file.
 
@@ -59,6 +60,7 @@ def save(
       mode: render mode to record, see `render_mode`. A format that cannot record it
         causes a warning.
       formats: the known formats, as for `load`.
+      **options: of the writer of the format, such as ``version`` of `write_spz`.
 
     Raises:
       InputError: if the suffix is unknown, the file exists and ``overwrite`` is
@@ -67,7 +69,7 @@ def save(
     path, form = _chosen(path, formats, "save")
     check_gaussians(gaussians)
     assert form.save is not None
-    options: dict = {"overwrite": overwrite}
+    options["overwrite"] = overwrite
     if mode is not None and not {mode, ANY_MODE}.isdisjoint(form.modes):
         options["mode"] = mode
     elif mode is not None and mode != DEFAULT_MODE:

@@ -34,7 +34,7 @@ _COMMON_DEGREE = 3  # more is not read by most programs
 # A mean is an integer of 24 bits divided by 2 to the power of ``fraction``.
 _MAX_FRACTION, _MAX_MEAN = 20, 2**23 - 1
 _COLOR, _SCALE, _SHIFT = 0.15, 16, 10
-_BITS = (6, 5)  # kept of harmonics of degree 1, and above; zero bits compress well
+_BITS = (6, 5)  # of harmonics of degree 1, and above; zero bits compress well
 _LEVELS = 1022  # of a component of a quaternion: a sign and 9 bits
 # Signs of x, y and z by the name of the axes: right up back, right down forward.
 _AXES = {"rub": (1, -1, -1), "rdf": (1, 1, 1)}
@@ -175,12 +175,13 @@ def write_spz(
     overwrite: bool = False,
     mode: str | None = None,
     version: int = container.PLAIN_VERSION,
+    harmonic_bits: tuple[int, int] = _BITS,
 ) -> None:
     """Write the active Gaussians as an SPZ file of version 3 or 4.
 
     Means are rounded to 2⁻²⁰, or to 2⁻²³ of the largest; log scales to 1/16 from -10
-    to 5.9; opacities and colours to 8 bits; harmonics to 6 bits of -1 to 1 in degree 1,
-    5 above. Values out of range are clipped with a warning, and so is SH degree 4
+    to 5.9; opacities and colours to 8 bits; harmonics to the given bits of -1 to 1.
+    Values out of range are clipped with a warning, and so is SH degree 4
     warned about, which most programs reject. The axes are right, up, back.
 
     Args:
@@ -188,6 +189,8 @@ def write_spz(
       mode: "mip" records that the scene was trained with antialiasing.
       version: 4 is what Niantic's library and splat-transform write, and is smaller. 3
         is read by Spark and by programs older than version 4, not by PlayCanvas.
+      harmonic_bits: bits that are kept of harmonics of degree 1, and above, 1 to 8; the
+        default is that of Niantic's library.
 
     Raises:
       InputError: as `write_ply`; if a value is NaN, or infinite and not a logit, if a
@@ -198,6 +201,8 @@ def write_spz(
     if version not in container.VERSIONS[1:]:
         known, remedy = container.VERSIONS[1:], "pass one of them"
         raise InputError(f"version: expected one of {known}, got {version!r}; {remedy}")
+    if not all(1 <= bits <= 8 for bits in harmonic_bits):
+        raise InputError(f"harmonic_bits: expected 1 to 8, got {harmonic_bits}")
     common.require_new(path, overwrite)
     rows, fraction = _checked_rows(path, gaussians)
     _warn_of_losses(path, rows, fraction)
@@ -215,7 +220,7 @@ def write_spz(
         "quats": _packed(rows["quats"]),
     }
     blocks = {name: iter([array.tobytes()]) for name, array in arrays.items()}
-    blocks["sh"] = _harmonics(rows["sh"], degree)
+    blocks["sh"] = _harmonics(rows["sh"], degree, harmonic_bits)
     with replacing(path, durable=True) as file:
         container.write_spz_content(file, header, blocks)
 
@@ -245,10 +250,10 @@ def _checked_rows(
     return rows, min(_MAX_FRACTION, math.floor(fraction))
 
 
-def _harmonics(sh: np.ndarray, degree: int) -> Iterator[bytes]:
+def _harmonics(sh: np.ndarray, degree: int, bits: tuple[int, int]) -> Iterator[bytes]:
     """Yield the bytes of harmonics [N, K, 3]: 128 (1 + value), to the bits kept."""
     signs = _signs(degree, _AXES["rub"])[1:, None]
-    first, above = _BITS
+    first, above = bits
     steps = np.full(signs.shape, 2.0 ** (8 - above))
     steps[:3] = 2.0 ** (8 - first)
     for start in range(0, len(sh), CHUNK_ROWS):

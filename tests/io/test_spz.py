@@ -103,9 +103,20 @@ def test_empty_scenes(tmp_path):
             assert blocks in (None, 5 * bool(keep.any()))
 
 
+@pytest.mark.parametrize("bits", [(6, 5), (8, 8), (1, 7)])
+def test_harmonics_keep_the_given_bits(tmp_path, bits):
+    given = np.asarray(scene(2, 200).params.sh)[:, 1:]
+    gsjax.save(tmp_path / "a.spz", scene(2, 200), harmonic_bits=bits)
+    found = np.asarray(gsjax.load(tmp_path / "a.spz").params.sh)[:, 1:]
+    for some, kept in ((slice(0, 3), bits[0]), (slice(3, None), bits[1])):
+        error = np.abs(found - given)[:, some].max()
+        assert 0.8 < error * 2**kept <= 1.01
+
+
 REFUSED: list[tuple[Callable, str]] = [
     (lambda path: read_spz(path, frame="luf"), r"frame: expected .*'rub', 'rdf'.*luf"),
     (lambda path: write_spz(path, scene(), version=2), r"version: .*\(3, 4\), got 2;"),
+    (lambda path: write_spz(path, scene(), harmonic_bits=(0, 8)), "expected 1 to 8"),
     (lambda path: write_spz(path, scene(), version=5), r"version: .*\(3, 4\), got 5;"),
 ]
 
