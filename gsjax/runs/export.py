@@ -9,9 +9,10 @@ import numpy as np
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians, num_active, select, with_sh_degree
 from gsjax.io.formats import keeps_every_bit, load, render_mode, save
-from gsjax.runs.folder import load_settings, ply_mode
+from gsjax.runs.folder import load_settings
 from gsjax.runs.scene_source import is_run, splat_file
 from gsjax.runtime.files import make_folder, reject_existing
+from gsjax.train.config import render_mode_of
 
 
 def export_scene(
@@ -55,7 +56,7 @@ def export_scene(
 def scene_mode(source: Path) -> str | None:
     """Return the render mode of a run or file."""
     if is_run(source):
-        return ply_mode(load_settings(source).config.raster)
+        return render_mode_of(load_settings(source).config.raster)
     return render_mode(source)  # also a word that is not ours
 
 

@@ -31,12 +31,11 @@ from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.io.formats import load
 from gsjax.io.ply import write_ply
-from gsjax.raster.types import RasterConfig
 from gsjax.runs.config_json import check_types, config_from_json
 from gsjax.runs.history import read_metrics
 from gsjax.runs.refined_cameras import load_cameras
 from gsjax.runtime.files import read_json, write_json
-from gsjax.train.config import TrainConfig, is_mip_raster
+from gsjax.train.config import TrainConfig, render_mode_of
 
 _FORMAT = 1
 
@@ -238,21 +237,11 @@ def save_scene(
 
     Replaces an existing file.
     """
-    options: dict = {"overwrite": True, "mode": ply_mode(config.raster)}
+    options: dict = {"overwrite": True, "mode": render_mode_of(config.raster)}
     if not np.any(dataset.origin):
         return write_ply(path, gaussians, **options)
     with jax.enable_x64(True):
         write_ply(path, _moved(gaussians, dataset.origin), **options)
-
-
-def ply_mode(raster: RasterConfig) -> str | None:
-    """Return the render mode that a PLY file of a scene is marked with.
-
-    See `gsjax.io.ply.render_mode`.
-    """
-    if raster.draws_surfels:
-        return "2dgs"
-    return "mip" if is_mip_raster(raster) else None
 
 
 def _moved(gaussians: Gaussians, offset: np.ndarray) -> Gaussians:

@@ -71,6 +71,16 @@ def is_mip_raster(raster: RasterConfig) -> bool:
     return not raster.draws_surfels and mip_raster(raster) == raster
 
 
+def render_mode_of(raster: RasterConfig) -> str | None:
+    """Return the render mode that files of a scene record.
+
+    See `gsjax.io.formats.render_mode`.
+    """
+    if raster.draws_surfels:
+        return "2dgs"
+    return "mip" if is_mip_raster(raster) else None
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """Settings of a training run; the defaults are those of Kerbl et al. 2023.
