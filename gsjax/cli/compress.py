@@ -8,7 +8,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from gsjax.cli.common import HeavyCommand, UsageError, start_jax
-from gsjax.cli.options import OptionSpec, option
+from gsjax.cli.options import OptionSpec, integer, option
 from gsjax.runtime.console import say
 
 _UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9}
@@ -75,11 +75,19 @@ class CompressCommand(HeavyCommand):
     """Largest error of a colour against the scene before, such as 4/255."""
     cameras: Annotated[Path | None, arg(metavar="FILE.json")] = None
     """Cameras of a file of Gaussians, a transforms.json. Default: a sphere about it."""
+    finetune: Annotated[int | None, integer(1)] = None
+    """Train what is kept for this many steps on the photographs of a run, with the
+    rounding in the loop, in each of up to four trials: smaller files, more time."""
+    lod: Annotated[int, integer(1, 8)] = 1
+    """Level of detail: number of files, OUT-1.sog, OUT-2.sog, …. The first holds the
+    most important tenth of the Gaussians, which already shows the scene; the limits are
+    those of all files together."""
     overwrite: bool = False
     """Replace an existing file."""
 
     def run(self) -> int:
         start_jax()
+        from gsjax.compression.parts import part_path
         from gsjax.compression.types import Goal
         from gsjax.runs.compression import compress_scene
 
@@ -91,15 +99,18 @@ class CompressCommand(HeavyCommand):
         given = {name: value for name, value in goals.items() if value is not None}
         if len(given) > 1:
             raise UsageError("pass one of --max-loss, --max-size and --budget")
-        goal = Goal(**(given or {"max_loss": 0.3}))
+        goal = Goal(**(given or {"max_loss": 0.3}), parts=self.lod)
         result = compress_scene(
             self.scene,
             self.out,
             goal,
             cameras=self.cameras,
+            finetune_steps=self.finetune or 0,
             overwrite=self.overwrite,
         )
         for line in result.lines():
             say(line)
-        say(f"{self.out}  {len(result.data) / 1e6:.2f} MB")
+        for part, data in enumerate(result.files, 1):
+            path = part_path(self.out, part, len(result.files))
+            say(f"{path}  {len(data) / 1e6:.2f} MB")
         return 0

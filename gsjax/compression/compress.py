@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.cameras.camera import Camera
+from gsjax.compression.finetune import Finetuning
 from gsjax.compression.importance import measure_importance, sample_cameras
 from gsjax.compression.measure import Judge
 from gsjax.compression.quantise import as_gaussians, make_source, rows_of
@@ -19,6 +20,8 @@ from gsjax.io.formats import unrecorded_mode
 from gsjax.planning.types import Reason
 from gsjax.raster.argument_checks import requires_concrete_values
 from gsjax.raster.types import RasterConfig
+from gsjax.runtime.console import decibels
+from gsjax.train.config import render_mode_of
 
 DEFAULT_GOAL = Goal(max_loss=0.3)
 _SUFFIXES = (".sog", ".spz", ".compressed.ply", ".glb", ".ply")
@@ -35,7 +38,7 @@ def compress(
     config: RasterConfig | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     held_out: HeldOut | None = None,
-    mode: str | None = None,
+    finetuning: Finetuning | None = None,
 ) -> CompressedScene:
     """Return a scene as a small file, for a stated loss or size.
 
@@ -52,12 +55,13 @@ def compress(
       suffix: file format: ".sog", ".spz", ".compressed.ply", ".glb" or ".ply". The
         last three have no entropy coding: there only Gaussians and harmonics are
         reduced.
-      config: settings of the render.
+      config: settings of the render. Their render mode (surfels, antialiasing) is
+        recorded in the file; a format that cannot record it causes a warning.
       background: RGB behind the scene.
       held_out: pictures to measure on, of at most 24 cameras; None for the cameras
         themselves without photographs.
-      mode: render mode to record, see `gsjax.io.formats.render_mode`; a format that
-        cannot record it causes a warning.
+      finetuning: train what is kept on photographs, with the quantisation in the loop;
+        None not to. For a loss or a size.
 
     Raises:
       InputError: if the goal cannot be reached, there is no Gaussian or no camera, the
@@ -68,7 +72,11 @@ def compress(
     if suffix not in _SUFFIXES:
         known = ", ".join(_SUFFIXES)
         raise InputError(f"suffix: expected one of {known}, got {suffix!r}")
+    if finetuning is not None and goal.max_error is not None:
+        remedy = "set max_loss or max_size: training changes colours"
+        raise InputError(f"finetuning: expected another goal than max_error; {remedy}")
     config = config or RasterConfig()
+    mode = render_mode_of(config)
     chosen = sample_cameras(cameras)
     if not chosen:
         raise InputError("cameras: expected at least one camera, got none")
@@ -81,17 +89,20 @@ def compress(
     judge = Judge(scene, _few(held_out, chosen), config, background)
     before = judge.judge(scene, timed=True)
     importance = measure_importance(scene, chosen, config, background)
-    source = make_source(rows, importance, suffix, 0)
-    best = search(source, judge, before, goal, mode)
+    source = make_source(rows, importance, suffix, goal.parts)
+    best = search(source, judge, before, goal, mode, finetuning)
     after = judge.judge(best.gaussians, timed=True)
     return CompressedScene(
         gaussians=best.gaussians,
-        data=best.data,
+        files=best.files,
         suffix=suffix,
         before=before,
         after=after,
         size_before=len(write_and_read(scene, ".ply", None)[0]),
-        reasons=_reasons(best, int(num_active(gaussians)), importance.largest),
+        reasons=(
+            *_reasons(best, int(num_active(gaussians)), importance.largest),
+            *_parts(best, judge),
+        ),
     )
 
 
@@ -123,12 +134,14 @@ def _reasons(best: Trial, count: int, largest: np.ndarray) -> tuple[Reason, ...]
     scene = best.scene
     kept, unseen = len(scene.kept), int(np.sum(largest < 1 / 255))
     removed = f"{kept:,} of {count:,}; {unseen:,} never exceed 1/255 of a pixel"
-    bits = 8 * len(best.data) / kept
-    degree = best.gaussians.sh_degree
-    palette = f"degree {degree}" + f", {scene.entries:,} in a palette" * bool(degree)
+    bits = 8 * best.size / kept
+    used = best.scene.coding.palette
+    harmonics = f"degree {best.gaussians.sh_degree}"
+    if used is not None and used.used:
+        harmonics += f", {used.used:,} in a palette"
     reasons = [
         Reason("Gaussians", removed, scene.errors["removal"], "estimate"),
-        Reason("harmonics", palette, scene.errors["harmonics"], "estimate"),
+        Reason("harmonics", harmonics, scene.errors["harmonics"], "estimate"),
     ]
     for name, error in scene.errors.items():
         if name not in ("removal", "harmonics"):
@@ -139,6 +152,19 @@ def _reasons(best: Trial, count: int, largest: np.ndarray) -> tuple[Reason, ...]
         f"{bits:.0f} bits a Gaussian; a bit is worth {scene.price:.2g} of squared error"
     )
     return (*reasons, Reason("price", why))
+
+
+def _parts(best: Trial, judge: Judge) -> list[Reason]:
+    """Return what the first files show, if there are several."""
+    reasons, shown = [], None
+    for part, data in enumerate(best.files if len(best.files) > 1 else ()):
+        count = int(np.sum(best.scene.part <= part))
+        places = jnp.arange(best.gaussians.capacity) < count
+        shown = judge.judge(select(best.gaussians, places))
+        quality = shown.psnr_before if shown.psnr is None else shown.psnr
+        why = f"{len(data) / 1e6:.2f} MB; with those before it {count:,} Gaussians"
+        reasons.append(Reason(f"part {part + 1}", f"{why}, {decibels(quality)}"))
+    return reasons
 
 
 def _numbers(rows, name: str) -> np.ndarray:

@@ -4,9 +4,10 @@ The diagonal of JᵀJ. For opacities it follows from the error of a removal. For
 others, that error and the shape of a Gaussian give an estimate: with standardised
 offsets y from the centre and weights like exp(−y²), the mean of y² is 1/2, of y⁴ 3/4,
 and of y1² y2² 1/4. For one isolated Gaussian seen from all sides it is within a factor
-of 2. It reduces the noise of measurements by few random signs.
+of 2. Derivatives measured by random signs (Hutchinson 1989) in twelve views were no
+better: they compiled 20 s longer, and files became as small or larger.
 
-Axis legend: N Gaussians, V views.
+Axis legend: N Gaussians.
 """
 
 from collections.abc import Mapping
@@ -15,30 +16,6 @@ import numpy as np
 from scipy.special import expit
 
 _SEEN = 2 / 3  # mean squared share of an axis that lies in the picture
-_PRIOR = 4.0  # measurements that the estimate counts for
-
-
-def shrunk(
-    measured: Mapping[str, np.ndarray],
-    prior: Mapping[str, np.ndarray],
-    times: np.ndarray,
-) -> dict[str, np.ndarray]:
-    """Return measured values, drawn to the estimate where there are few of them.
-
-    Args:
-      measured: means over random signs, as `shape_curvature` names and shapes them.
-      prior: the estimates.
-      times: [N] number of measurements that went into each mean.
-    """
-    result = {}
-    for name, estimate in prior.items():
-        if name not in measured:
-            result[name] = estimate
-            continue
-        count = times.reshape(-1, *(1,) * (estimate.ndim - 1))
-        total = count * np.nan_to_num(measured[name]) + _PRIOR * estimate
-        result[name] = total / (count + _PRIOR)
-    return result
 
 
 def shape_curvature(

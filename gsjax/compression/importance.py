@@ -4,7 +4,6 @@ Axis legend: N Gaussians (capacity), V views, H W image.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -12,18 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.cameras.camera import Camera, resize_camera
-from gsjax.compression.curvature import shape_curvature, shrunk
+from gsjax.compression.curvature import shape_curvature
 from gsjax.gaussians import Gaussians
 from gsjax.raster.contribution import contribution
 from gsjax.raster.exact import exact_config
-from gsjax.raster.render import render
 from gsjax.raster.types import RasterConfig
 from gsjax.runtime.console import progress
 
 MAX_VIEWS = 48
 MAX_SIZE = 480  # px of the longer side, of pictures from which importance is measured
-_GRADIENTS = 12  # views of which gradients are taken
-_MEASURED = ("means", "quats", "log_scales")
 
 
 class Importance(NamedTuple):
@@ -42,7 +38,7 @@ class Importance(NamedTuple):
       largest: [N] largest weight in a pixel.
       removal: [N] error if this Gaussian alone is removed.
       curvature: error per squared change of a number, by the names and in the shapes
-        of `GaussianParams` without harmonics: the diagonal of JᵀJ.
+        of `GaussianParams` without harmonics, by `shape_curvature`.
     """
 
     shares: np.ndarray
@@ -100,62 +96,54 @@ def measure_importance(
     cameras: Sequence[Camera],
     config: RasterConfig,
     background: Sequence[float] = (0.0, 0.0, 0.0),
-    *,
-    seed: int = 0,
 ) -> Importance:
     """Measure the importance of Gaussians on the pictures of some cameras.
-
-    The diagonal of JᵀJ is measured by one reverse pass in each of some pictures, with a
-    random sign in each pixel and channel as cotangent: the expected square of the
-    gradient is the sum of squares (Hutchinson, "A stochastic estimator of the trace",
-    1989). `gsjax.compression.curvature` reduces the noise.
 
     Args:
       gaussians: N slots, concrete.
       cameras: single cameras, see `sample_cameras`.
       config: render settings.
       background: RGB behind the scene.
-      seed: seed of the signs.
 
     Raises:
       InputError, CapacityError: as `render_exact`.
     """
     behind = jnp.asarray(background, gaussians.params.means.dtype)
-    config = config.replace(outputs=("rgb",), absgrad=False, num_size_buckets=1)
-    with_gradient = set(np.linspace(0, len(cameras) - 1, _GRADIENTS).astype(int))
+    config = _fitted(gaussians, cameras, config)
     found = []
-    squares = {
-        name: np.zeros(getattr(gaussians.params, name).shape) for name in _MEASURED
-    }
-    for place, camera in enumerate(progress(cameras, "importance")):
+    for camera in progress(cameras, "importance"):
         one = contribution(gaussians, camera, config, behind)
         found.append([np.asarray(values, np.float32) for values in one])
-        if place in with_gradient:
-            fitted = exact_config(gaussians, camera, config.replace(order="center"))
-            key = jax.random.fold_in(jax.random.key(seed), place)
-            gradient = _of_signs(gaussians, camera, behind, key, fitted)
-            for name in _MEASURED:
-                square = np.square(np.asarray(getattr(gradient, name), np.float64))
-                squares[name] += square
     total, largest, energy, removal = (np.stack(some) for some in zip(*found))
     numbers = sum(3 * camera.width * camera.height for camera in cameras)
-    sampled = sum(3 * cameras[k].width * cameras[k].height for k in with_gradient)
     removal = removal.sum(0, dtype=np.float64) / numbers
     params = gaussians.params.__dict__
-    prior = shape_curvature(
+    curvature = shape_curvature(
         {name: np.asarray(values) for name, values in params.items()},
         removal,
         config.dilation * _pixel_areas(gaussians, cameras, total),
     )
-    measured = {name: values / sampled for name, values in squares.items()}
-    times = np.count_nonzero(total[sorted(with_gradient)], axis=0)
     return Importance(
         shares=total / np.float32(numbers),
         centres=np.stack([_centre(camera) for camera in cameras]),
         largest=largest.max(0),
         energy=energy.sum(0, dtype=np.float64) / numbers,
         removal=removal,
-        curvature=shrunk(measured, prior, times),
+        curvature=curvature,
+    )
+
+
+def _fitted(
+    gaussians: Gaussians, cameras: Sequence[Camera], config: RasterConfig
+) -> RasterConfig:
+    """Return settings with capacities for all cameras: one program serves them all."""
+    config = config.replace(
+        outputs=("rgb",), order="center", absgrad=False, num_size_buckets=1
+    )
+    each = [exact_config(gaussians, camera, config) for camera in cameras]
+    return config.replace(
+        pair_capacity=max(one.pair_capacity or 1 for one in each),
+        visible_capacity=max(one.visible_capacity or 1 for one in each),
     )
 
 
@@ -176,17 +164,3 @@ def _centre(camera: Camera) -> np.ndarray:
     """Return the centre [3] of a single camera in the world."""
     viewmat = np.asarray(camera.viewmat, np.float64)
     return -viewmat[:3, :3].T @ viewmat[:3, 3]
-
-
-@partial(jax.jit, static_argnums=4)
-def _of_signs(gaussians: Gaussians, camera: Camera, behind, key, config: RasterConfig):
-    """Return the gradient of the picture times random signs, as `GaussianParams`."""
-
-    def picture(params):
-        scene = gaussians.replace(params=params)  # pyright: ignore
-        return render(scene, camera, config, behind).rgb
-
-    image, pull = jax.vjp(picture, gaussians.params)
-    assert image is not None
-    signs = jax.random.rademacher(key, image.shape, image.dtype)
-    return pull(signs)[0]

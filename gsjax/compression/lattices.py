@@ -4,14 +4,19 @@ A number is stored as a whole code, ``forward(value)`` rounded. Where an error i
 tolerated, a multiple of 2ᵏ is stored instead, which takes k bits less after entropy
 coding. Formats without entropy coding have no lattice: there nothing is gained.
 
+Codes are computed for NumPy arrays, and for JAX arrays in training.
+
 Axis legend: N Gaussians.
 """
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from scipy.special import expit, logit
+
+from gsjax.math.clustering import codebook
 
 Rows = Mapping[str, np.ndarray]
 
@@ -61,24 +66,38 @@ def has_lattice(suffix: str) -> bool:
     return suffix in _LATTICES
 
 
-def lattice_of(suffix: str, rows: Rows) -> Lattice | None:
-    """Return the lattice of a format for these Gaussians, or None if it has none."""
-    return _LATTICES[suffix](rows) if has_lattice(suffix) else None
+def lattice_of(
+    suffix: str, rows: Rows, part: np.ndarray | None = None
+) -> Lattice | None:
+    """Return the lattice of a format for these Gaussians, or None if it has none.
+
+    ``part`` [N] is the file in which each is stored; None for one file.
+    """
+    if not has_lattice(suffix):
+        return None
+    count = len(rows["means"])
+    return _LATTICES[suffix](rows, np.zeros(count, int) if part is None else part)
 
 
-def _of_sog(rows: Rows) -> Lattice:
+def _of_sog(rows: Rows, part: np.ndarray) -> Lattice:
     means = np.asarray(rows["means"], np.float64)
     logs = np.sign(means) * np.log1p(np.abs(means))
-    low, high = logs.min(axis=0), logs.max(axis=0)
-    span = np.where(high > low, high - low, 1.0)
+    # Each file has a box of its own.
+    low, span = np.empty_like(logs), np.empty_like(logs)
+    for one in np.unique(part):
+        inside = part == one
+        low[inside] = logs[inside].min(0)
+        width = logs[inside].max(0) - logs[inside].min(0)
+        span[inside] = np.where(width > 0, width, 1.0)
 
     def forward(values):
-        logs = np.sign(values) * np.log1p(np.abs(values))
-        return (logs - low) / span * 65535
+        xp = module_of(values)
+        return (xp.sign(values) * xp.log1p(xp.abs(values)) - low) / span * 65535
 
     def inverse(codes):
+        xp = module_of(codes)
         logs = low + codes / 65535 * span
-        return np.sign(logs) * np.expm1(np.abs(logs))
+        return xp.sign(logs) * xp.expm1(xp.abs(logs))
 
     return Lattice(
         means=Axis(forward, inverse, 0, 65535, most_bits=_MOST_OF_MEANS),
@@ -94,7 +113,8 @@ def _of_sog(rows: Rows) -> Lattice:
     )
 
 
-def _of_spz(rows: Rows) -> Lattice:
+def _of_spz(rows: Rows, part: np.ndarray) -> Lattice:
+    del part  # steps are powers of two: those of all hold in each file
     largest = float(np.abs(rows["means"]).max(initial=0))
     bits = np.floor(np.log2((2**23 - 1) / largest)) if largest else 20
     return Lattice(
@@ -112,20 +132,55 @@ def _uniform(step: float) -> Axis:
     return Axis(lambda v: v / step, lambda c: c * step)
 
 
-def _opacity_of(codes: np.ndarray) -> np.ndarray:
-    return logit(np.clip(codes / 255, _QUARTER, 1 - _QUARTER))
+def _opacity_code(logits):
+    return 255 * (1 + module_of(logits).tanh(logits / 2)) / 2
 
 
-_OPACITY = Axis(lambda v: 255 * expit(v), _opacity_of, 0, 255)
+def _opacity_of(codes):
+    xp = module_of(codes)
+    opacities = xp.clip(codes / 255, _QUARTER, 1 - _QUARTER)
+    return xp.log(opacities) - xp.log1p(-opacities)
+
+
+_OPACITY = Axis(_opacity_code, _opacity_of, 0, 255)
 
 
 _LATTICES = {".sog": _of_sog, ".spz": _of_spz}
 
 
+def module_of(values: Any) -> Any:
+    """Return `jax.numpy` for JAX arrays, else NumPy."""
+    return jnp if isinstance(values, jax.Array) else np
+
+
+def snap(axis: Axis, values, steps):
+    """Return values whose codes are multiples of ``steps``."""
+    xp = module_of(values)
+    codes = xp.clip(axis.forward(values), axis.low, axis.high)
+    return axis.inverse(xp.clip(xp.rint(codes / steps) * steps, axis.low, axis.high))
+
+
+def snap_quats(axis: Axis, quats, steps):
+    """Return unit quaternions [N, 4] whose three smaller components are snapped."""
+    xp = module_of(quats)
+    rounded = snap(axis, quats, steps)
+    largest = xp.abs(quats).argmax(1)[:, None] == xp.arange(4)
+    rest = 1 - xp.sum(xp.where(largest, 0, xp.square(rounded)), 1, keepdims=True)
+    most = xp.sqrt(xp.maximum(0, rest))
+    return xp.where(largest, xp.where(quats < 0, -most, most), rounded)
+
+
 class Rounded(NamedTuple):
-    """Rounded values, and the squared error that they add: Σ curvature · change²."""
+    """Result of `round_to`.
+
+    Attributes:
+      values: multiples of the steps, or those of a table if the file can hold too few.
+      steps: of the codes, powers of two.
+      error: squared error that they add, Σ curvature · change².
+    """
 
     values: np.ndarray
+    steps: np.ndarray
     error: float
 
 
@@ -148,15 +203,21 @@ def round_to(
     values = np.asarray(values, np.float64)
     codes = np.clip(axis.forward(values), axis.low, axis.high)
     left_out = _bits_left_out(axis, codes, curvature, allowed, coarsest)
-    coarser = 0.0
+    coarser = 0
     while True:
-        unit = np.exp2(np.maximum(left_out, np.floor(coarser)))
-        found = np.clip(np.rint(codes / unit) * unit, axis.low, axis.high)
-        if not axis.most or len(np.unique(found)) <= axis.most:
+        steps = np.exp2(np.maximum(left_out, coarser))
+        rounded = snap(axis, values, steps)
+        if not axis.most or len(np.unique(rounded)) <= axis.most:
             break
         coarser += 1
-    rounded = axis.inverse(found)
-    return Rounded(rounded, float(np.sum(curvature * np.square(rounded - values))))
+    error = float(np.sum(curvature * np.square(rounded - values)))
+    if coarser:  # not as fine as allowed: a table of other values may err less
+        table, indices = codebook(values, axis.most, weights=curvature.ravel())
+        other = table[indices].reshape(values.shape)
+        other_error = float(np.sum(curvature * np.square(other - values)))
+        if other_error < error:
+            return Rounded(other, steps, other_error)
+    return Rounded(rounded, steps, error)
 
 
 def _bits_left_out(

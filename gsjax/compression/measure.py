@@ -21,6 +21,12 @@ from gsjax.train.metrics import psnr, ssim
 _FEW = 4  # pictures from which estimates are corrected
 _MARGIN = 1.2  # spare room for pairs, so that few programs are compiled
 
+
+def squared_error(pictures: list[np.ndarray], others: list[np.ndarray]) -> float:
+    """Return the mean squared difference of pictures."""
+    return float(np.mean([np.mean(np.square(a - b)) for a, b in zip(pictures, others)]))
+
+
 _psnr, _ssim = jax.jit(psnr), jax.jit(ssim)
 
 
@@ -52,12 +58,13 @@ class Judge:
         )
         self.pictures = self.draw(gaussians)
 
-    def error(self, gaussians: Gaussians) -> float:
-        """Return the mean squared error of some pictures against those before."""
-        few = np.unique(np.linspace(0, len(self.pictures) - 1, _FEW).astype(int))
-        found = self.draw(gaussians, few)
-        pairs = zip(found, (self.pictures[place] for place in few))
-        return float(np.mean([np.mean(np.square(a - b)) for a, b in pairs]))
+    def few(self, gaussians: Gaussians | None = None) -> list[np.ndarray]:
+        """Return some pictures of a scene; None for that before compression."""
+        count = len(self.pictures)
+        places = np.unique(np.linspace(0, count - 1, _FEW).astype(int))
+        if gaussians is None:
+            return [self.pictures[place] for place in places]
+        return self.draw(gaussians, places)
 
     def draw(self, gaussians: Gaussians, places=None) -> list[np.ndarray]:
         """Return the pictures of a scene, or those at ``places``, clipped to [0, 1]."""

@@ -20,7 +20,9 @@ from gsjax.compression.lattices import (
     has_lattice,
     lattice_of,
     round_to,
+    snap_quats,
 )
+from gsjax.compression.parts import divide
 from gsjax.gaussians import Gaussians, make_gaussians
 from gsjax.math.clustering import Clusters, codebook, kmeans, nearest_by_cost
 from gsjax.math.sh import degree_of, num_bases
@@ -30,12 +32,13 @@ _SPHERE = 4 * np.pi  # a coefficient adds the square of its change over 4 π, on
 _GAUSSIAN_BITS = 100.0  # of one Gaussian without harmonics, about
 _ENTRY_BITS = 6.0  # of a coefficient in the palette
 _PLAIN_BITS = 32.0  # of a coefficient in a format without entropy coding, at most
-_PALETTES, _LARGEST_PALETTE = (64, 256, 1024, 4096, 16384), 65536
+_PALETTES, _LARGEST_PALETTE = (64, 256, 1024, 4096), 16384
+_SAMPLED = 64  # Gaussians per cluster from which a palette is made
 _SH_TABLE = 256
 
 
 class Palettes:
-    """Clusters of harmonics, each about four times as many as before.
+    """Clusters of harmonics, each four times as many as before.
 
     They are made when first used: large ones take long, and few goals need them.
     """
@@ -47,14 +50,25 @@ class Palettes:
         self._sizes = [size for size in _PALETTES if size < most] + [most]
         self._made: list[Clusters] = []
 
-    def __iter__(self) -> Iterator[Clusters]:
-        """Yield the clusters, fewest first; none without harmonics."""
-        for place, size in enumerate(self._sizes if self._points.shape[1] else ()):
+    def first(self, count: int) -> Iterator[Clusters]:
+        """Yield the smallest of them, fewest clusters first; none without harmonics."""
+        sizes = self._sizes[:count] if self._points.shape[1] else ()
+        for place, size in enumerate(sizes):
             if place == len(self._made):
-                weights, seed = self._weights, self._seed
-                made = kmeans(self._points, size, weights=weights, seed=seed)
-                self._made.append(made)
+                self._made.append(self._make(size))
             yield self._made[place]
+
+    def _make(self, size: int) -> Clusters:
+        points, weights = self._points, self._weights
+        total = weights.sum()
+        if len(points) <= _SAMPLED * size or total <= 0:
+            return kmeans(points, size, weights=weights, seed=self._seed)
+        rng = np.random.default_rng(self._seed)
+        some = rng.choice(len(points), _SAMPLED * size, p=weights / total)
+        centroids = kmeans(points[some], size, seed=self._seed).centroids
+        free = np.zeros(len(centroids))
+        labels = nearest_by_cost(points, centroids, np.ones(len(points)), free)
+        return Clusters(centroids, labels)
 
 
 class Source(NamedTuple):
@@ -67,14 +81,48 @@ class Source(NamedTuple):
       simplified: [N, D] harmonics above degree 0 that look nearly the same.
       palettes: clusters of them.
       suffix: of the file format.
+      parts: number of files.
     """
 
     rows: Rows
     importance: Importance
     harmonics: ViewedHarmonics
     simplified: np.ndarray
-    palettes: "Palettes"
+    palettes: Palettes
     suffix: str
+    parts: int = 1
+
+
+class Palette(NamedTuple):
+    """Harmonics above degree 0 that Gaussians share.
+
+    Attributes:
+      entries: [C, K - 1, 3] coefficients; the first are zero.
+      labels: [N] entry of each Gaussian.
+    """
+
+    entries: np.ndarray
+    labels: np.ndarray
+
+    @property
+    def used(self) -> int:
+        """Number of entries that are used, without zero."""
+        return len(np.setdiff1d(self.labels, [0]))
+
+
+class Coding(NamedTuple):
+    """Coding of the numbers of a scene in files.
+
+    Attributes:
+      lattice: numbers that the format can store, or None if it is without entropy
+        coding.
+      steps: steps of the codes of each number, by the names of `Lattice`.
+      palette: of the harmonics, or None if each Gaussian has its own.
+    """
+
+    lattice: Lattice | None
+    steps: dict[str, np.ndarray]
+    palette: Palette | None
 
 
 class Quantised(NamedTuple):
@@ -85,17 +133,29 @@ class Quantised(NamedTuple):
       kept: indices of them in the source.
       errors: mean squared error that each kind of change adds, by estimate: "removal",
         "harmonics", "colors", and the numbers by their names in `GaussianParams`.
-      entries: number of palette entries that are used; 0 without a palette.
       price: of a bit.
       harmonics: [N, K, 3] coefficients before those of degree 0 are rounded.
+      coding: how the numbers are stored.
+      part: [N] file in which each is stored, see `gsjax.compression.parts.divide`.
     """
 
     rows: Rows
     kept: np.ndarray
     errors: dict[str, float]
-    entries: int
     price: float
     harmonics: np.ndarray
+    coding: Coding
+    part: np.ndarray
+
+    def files(self) -> list[Gaussians]:
+        """Return the Gaussians of each file; empty ones are left out."""
+        rows = self.rows
+        return [
+            as_gaussians(
+                {name: array[self.part == one] for name, array in rows.items()}
+            )
+            for one in np.unique(self.part)
+        ]
 
     def with_change(self, source: Source, kind: str) -> Gaussians:
         """Return the kept Gaussians of the source with one kind of change alone."""
@@ -110,15 +170,17 @@ class Quantised(NamedTuple):
         return as_gaussians(rows)
 
 
-def make_source(rows: Rows, importance: Importance, suffix: str, seed: int) -> Source:
-    """Cluster the harmonics of a scene, weighted by what its Gaussians contribute."""
+def make_source(
+    rows: Rows, importance: Importance, suffix: str, parts: int = 1, *, seed: int = 0
+) -> Source:
+    """Return a scene with clusters of harmonics, weighted by what each contributes."""
     harmonics = ViewedHarmonics(
         rows["sh"], rows["means"], importance.centres, importance.shares
     )
     simplified = harmonics.simplified()[:, 1:].reshape(len(rows["sh"]), -1)
     weights = importance.shares.sum(0, dtype=np.float64)
     palettes = Palettes(simplified, weights, seed)
-    return Source(rows, importance, harmonics, simplified, palettes, suffix)
+    return Source(rows, importance, harmonics, simplified, palettes, suffix, parts)
 
 
 def scaled(source: Source, factors: Mapping[str, float]) -> Source:
@@ -128,8 +190,14 @@ def scaled(source: Source, factors: Mapping[str, float]) -> Source:
     return source._replace(importance=importance, harmonics=harmonics)
 
 
-def quantise(source: Source, price: float) -> Quantised:
-    """Return the scene at a price of a bit, in mean squared error per bit."""
+def quantise(
+    source: Source, price: float, *, palettes: int = len(_PALETTES) + 1
+) -> Quantised:
+    """Return the scene at a price of a bit, in mean squared error per bit.
+
+    At most that many palettes are tried; without any, all harmonics above degree 0 are
+    left out.
+    """
     removal = source.importance.removal
     kept = np.flatnonzero(removal > price * _GAUSSIAN_BITS)
     if not len(kept):
@@ -137,12 +205,16 @@ def quantise(source: Source, price: float) -> Quantised:
     rows = {name: np.asarray(array)[kept] for name, array in source.rows.items()}
     importance = source.importance.rows(kept)
     errors = {"removal": float(removal.sum() - importance.removal.sum())}
-    harmonics, entries, errors["harmonics"] = _harmonics(source, kept, price)
-    rows["sh"] = harmonics
-    lattice = lattice_of(source.suffix, rows)
+    rows["sh"], palette, errors["harmonics"] = _harmonics(source, kept, price, palettes)
+    before, steps = rows["sh"], {}
+    part = divide(importance.shares.sum(0), source.parts)
+    lattice = lattice_of(source.suffix, rows, part)
     if lattice is not None:
-        _round_all(rows, lattice, importance, price * _PER_BIT, errors)
-    return Quantised(rows, kept, errors, entries, price, harmonics)
+        allowed = price * _PER_BIT
+        steps, more = _round_all(rows, lattice, importance, allowed)
+        errors |= more
+    coding = Coding(lattice, steps, palette)
+    return Quantised(rows, kept, errors, price, before, coding, part)
 
 
 def _round_all(
@@ -150,70 +222,67 @@ def _round_all(
     lattice: Lattice,
     importance: Importance,
     allowed: float,
-    errors: dict[str, float],
-) -> None:
-    """Round the numbers of each kind, in place."""
+) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Round the numbers of each kind, in place; return the steps and the errors."""
     curvature = importance.curvature
-    energy = importance.energy
+    steps, errors = {}, {}
     for name in ("means", "log_scales", "logit_opacities"):
         axis = getattr(lattice, name)
         coarsest = np.inf
         if name == "means":  # half of the longest axis
             coarsest = np.exp(rows["log_scales"].max(1, keepdims=True)) / 2
         rounded = round_to(axis, rows[name], curvature[name], allowed, coarsest)
-        rows[name], errors[name] = rounded.values.astype(np.float32), rounded.error
-    weights = np.repeat(energy[:, None], 3, 1) / _SPHERE
+        rows[name] = rounded.values.astype(np.float32)
+        steps[name], errors[name] = rounded.steps, rounded.error
+    weights = np.repeat(importance.energy[:, None], 3, 1) / _SPHERE
     rounded = round_to(lattice.colors, rows["sh"][:, 0], weights, allowed)
     rows["sh"] = np.array(rows["sh"], np.float32)
     rows["sh"][:, 0], errors["colors"] = rounded.values, rounded.error
-    rows["quats"], errors["quats"] = _round_quats(
-        lattice, rows["quats"], curvature["quats"], allowed
-    )
-
-
-def _round_quats(
-    lattice: Lattice, quats: np.ndarray, curvature: np.ndarray, allowed: float
-) -> tuple[np.ndarray, float]:
-    """Round the three smaller components of unit quaternions [N, 4]."""
-    quats = np.asarray(quats, np.float64)
-    rounded = round_to(lattice.quats, quats, curvature, allowed).values
-    largest = np.abs(quats).argmax(1)[:, None]
-    np.put_along_axis(rounded, largest, 0, 1)
-    rest = np.sqrt(np.maximum(0, 1 - np.sum(rounded**2, 1, keepdims=True)))
-    sign = np.sign(np.take_along_axis(quats, largest, 1))
-    np.put_along_axis(rounded, largest, np.where(sign < 0, -rest, rest), 1)
-    error = float(np.sum(curvature * np.square(rounded - quats)))
-    return rounded.astype(np.float32), error
+    quats = np.asarray(rows["quats"], np.float64)
+    steps["colors"] = rounded.steps
+    steps["quats"] = round_to(lattice.quats, quats, curvature["quats"], allowed).steps
+    found = snap_quats(lattice.quats, quats, steps["quats"])
+    errors["quats"] = float(np.sum(curvature["quats"] * np.square(found - quats)))
+    rows["quats"] = found.astype(np.float32)
+    return steps, errors
 
 
 def _harmonics(
-    source: Source, kept: np.ndarray, price: float
-) -> tuple[np.ndarray, int, float]:
-    """Return the harmonics [N, K, 3], the entries of the palette, and the error.
+    source: Source, kept: np.ndarray, price: float, palettes: int
+) -> tuple[np.ndarray, Palette | None, float]:
+    """Return the harmonics [N, K, 3], their palette, and the error.
 
     Of the palettes and none, the one with the least error plus price of its bits. A
     format without entropy coding gains nothing from a palette.
     """
     seen, rest = source.harmonics.rows(kept), source.simplified[kept]
     weights = source.importance.shares[:, kept].sum(0, dtype=np.float64) / _SPHERE
-    nothing = np.zeros_like(seen.sh[:, 1:])
+    none = Palette(np.zeros_like(seen.sh[:1, 1:]), np.zeros(len(kept), np.int32))
     if not has_lattice(source.suffix):
         return _by_degree(seen, price)
-    base, errors = seen.refitted(nothing)
-    best = _Choice(float(errors.sum()), base, nothing, 0, float(errors.sum()))
-    without = base, errors
-    for palette in source.palettes:
-        found = _with_palette(palette, rest, weights, price, seen, without)
-        if found.cost > best.cost and best.entries:
+    base, errors = seen.refitted(np.zeros_like(seen.sh[:, 1:]))
+    best = _Choice(float(errors.sum()), base, none, float(errors.sum()), 0.0)
+    without, last = (base, errors), best.error
+    for clusters in source.palettes.first(palettes):
+        clusters = clusters._replace(labels=clusters.labels[kept])
+        found = _with_palette(clusters, rest, weights, price, seen, without)
+        if found.cost > best.cost and best.palette is not none:
             break  # larger ones cost even more
-        best = min(best, found, key=lambda one: one.cost)
-    if not best.entries:
-        return best.base[:, None], 0, best.error
-    sh = np.concatenate([best.base[:, None], best.rest], 1)
-    return sh, best.entries, best.error
+        # The next one is four times as large. Of the error it leaves the same share as
+        # this one did, about, and takes two times as many bits more, at the least.
+        gain = found.error * (1 - min(found.error / max(last, 1e-300), 1))
+        best, last = min(best, found, key=lambda one: one.cost), found.error
+        if gain < 2 * price * found.stored:
+            break
+    if best.palette is none:
+        none = none._replace(entries=none.entries[:, :0])
+        return best.base[:, None], none, best.error
+    rest = best.palette.entries[best.palette.labels]
+    sh = np.concatenate([best.base[:, None], rest], 1)
+    return sh, best.palette, best.error
 
 
-def _by_degree(seen: ViewedHarmonics, price: float) -> tuple[np.ndarray, int, float]:
+def _by_degree(seen: ViewedHarmonics, price: float) -> tuple[np.ndarray, None, float]:
     """Return the harmonics up to the degree that is worth its bits, and the error."""
     bases = seen.sh.shape[1]
     best = (np.inf, seen.sh, 0.0)
@@ -225,51 +294,62 @@ def _by_degree(seen: ViewedHarmonics, price: float) -> tuple[np.ndarray, int, fl
         sh = np.concatenate([base[:, None], rest[:, : stored - 1]], 1)
         cost = errors.sum() + price * _PLAIN_BITS * 3 * stored * len(sh)
         best = min(best, (cost, sh, float(errors.sum())), key=lambda one: one[0])
-    return best[1], 0, best[2]
+    return best[1], None, best[2]
 
 
 class _Choice(NamedTuple):
-    """Harmonics [N, K - 1, 3] with degree 0 [N, 3]; error, and it plus the bits."""
+    """A palette with degree 0 [N, 3]; its error, and that plus the price of all bits.
+
+    ``stored`` are the bits of the palette.
+    """
 
     cost: float
     base: np.ndarray
-    rest: np.ndarray
-    entries: int
+    palette: Palette
     error: float
+    stored: float
 
 
 def _with_palette(
-    palette: Clusters, rest, weights, price: float, seen: ViewedHarmonics, without
+    clusters: Clusters, rest, weights, price: float, seen: ViewedHarmonics, without
 ) -> _Choice:
     """Return the harmonics with one palette, one entry of which is zero.
 
     Labels are chosen by error plus price of their bits, as in entropy-constrained
     vector quantisation (Chou, Lookabaugh and Gray 1989).
     """
-    entries = np.concatenate([np.zeros_like(rest[:1]), palette.centroids])
-    bits = np.zeros(len(entries))
-    labels = nearest_by_cost(rest, entries, weights, bits)
+    entries = np.concatenate([np.zeros_like(rest[:1]), clusters.centroids])
+    labels = clusters.labels + 1
     for _ in range(2):
         bits = _bits(labels, len(entries))
         labels = nearest_by_cost(rest, entries, weights, price * bits)
     bits = _bits(labels, len(entries))
     mass = np.bincount(labels, weights, minlength=len(entries))
     entries = _truncated(entries, mass, price)
-    least = 1e-6 * mass.max() + 1e-300
-    shares = np.repeat(mass + least, entries.shape[1])
-    table, indices = codebook(entries.ravel(), _SH_TABLE, weights=shares)
-    table[np.abs(table).argmin()] = 0  # a dropped band stays dropped
-    entries = table[indices].reshape(entries.shape)
-    found = entries[labels].reshape(len(rest), -1, 3)
-    base, errors = seen.refitted(found)
+    entries = with_table(entries.reshape(len(entries), -1, 3), mass)
+    base, errors = seen.refitted(entries[labels])
     dear = without[1] - errors < price * (bits[labels] - bits[0])
     labels = np.where(dear, 0, labels)
-    found[dear], base[dear], errors[dear] = 0, without[0][dear], without[1][dear]
-    used = np.unique(labels)
-    stored = _ENTRY_BITS * np.count_nonzero(entries[used])
+    base[dear], errors[dear] = without[0][dear], without[1][dear]
+    stored = _ENTRY_BITS * np.count_nonzero(entries[np.unique(labels)])
     total = float(np.sum(_bits(labels, len(entries))[labels])) + stored
+    palette = Palette(entries, labels)
     error = float(errors.sum())
-    return _Choice(error + price * total, base, found, int(np.sum(used > 0)), error)
+    return _Choice(error + price * total, base, palette, error, stored)
+
+
+def with_table(entries: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """Return entries [C, K - 1, 3] of numbers from a table of 256, one of them zero.
+
+    Args:
+      entries: the entries; bands that are zero stay zero.
+      mass: [C] weights of them.
+    """
+    least = 1e-6 * mass.max() + 1e-300
+    shares = np.repeat(mass + least, entries[0].size)
+    table, indices = codebook(entries.ravel(), _SH_TABLE, weights=shares)
+    table[np.abs(table).argmin()] = 0
+    return table[indices].reshape(entries.shape)
 
 
 def _bits(labels: np.ndarray, count: int) -> np.ndarray:

@@ -3,30 +3,41 @@
 import tempfile
 import warnings
 from collections.abc import Callable
+from functools import partial, reduce
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from gsjax.compression.measure import Judge
+from gsjax.compression.finetune import Finetuning, finetune
+from gsjax.compression.measure import Judge, squared_error
 from gsjax.compression.quantise import (
     Quantised,
     Source,
-    as_gaussians,
     quantise,
     scaled,
 )
 from gsjax.compression.types import NOMINAL_PSNR, Goal, Quality
 from gsjax.errors import InputError
-from gsjax.gaussians import Gaussians
+from gsjax.gaussians import Gaussians, concatenate
 from gsjax.io.formats import load, save
 from gsjax.runtime.console import note
 
 _TRIALS = 8
+_TUNED = 4  # trials with fine-tuning
+_COARSER = 2.0  # first price with fine-tuning, of that without
 _ENOUGH = 0.9  # share of the goal that is near enough
-_COARSEST, _HALVINGS = 10.0, 30  # first price, of an even share of the error
-_FACTORS = 0.05, 50.0  # limits of what corrects an estimate
+_STRIDE, _STRIDES = 6.0, 16  # from one estimate to the next, of the price
+# Rounding less costs little: harmonics of a palette are repeated.
+_OPTIONS: dict[str, dict[str, Any]] = {".spz": {"harmonic_bits": (8, 8)}}
+_SMALL = 2  # palettes that are tried before errors are known
+_WITHOUT_HARMONICS = 0.7  # share of the error, for the first price
+_FACTORS = 0.05, 100.0  # limits of what corrects an estimate
 _WIDEST = 16.0  # factor of the price from one trial to the next, at most
+
+
+class UnreachableError(InputError):
+    """No price meets the goal."""
 
 
 class Trial(NamedTuple):
@@ -35,16 +46,21 @@ class Trial(NamedTuple):
     Attributes:
       scene: what was written.
       gaussians: what was read.
-      data: bytes of the file.
+      files: bytes of each file.
       quality: measured on the held-out pictures.
       value: what the goal limits: loss in dB, bytes, or error.
     """
 
     scene: Quantised
     gaussians: Gaussians
-    data: bytes
+    files: tuple[bytes, ...]
     quality: Quality
     value: float
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files."""
+        return sum(map(len, self.files))
 
 
 def search(
@@ -53,6 +69,7 @@ def search(
     before: Quality,
     goal: Goal,
     mode: str | None,
+    finetuning: Finetuning | None = None,
 ) -> Trial:
     """Return the trial that meets a goal with the smallest file or loss.
 
@@ -61,42 +78,58 @@ def search(
       judge, before: measure quality, and that of the scene before.
       goal: what must be met.
       mode: render mode to record in the file.
+      finetuning: how scenes are trained further, in a second search from the result of
+        the first; None not to.
 
     Raises:
-      InputError: if no price meets the goal.
+      UnreachableError: if no price meets the goal.
     """
-    limit = next(float(v) for v in goal if v is not None)
+    ((name, limit),) = goal.limits.items()
     by_size = goal.max_size is not None
 
-    def at(price: float) -> Trial:
-        trial = _trial(source, judge, price, mode)
+    def at(price: float, tune: Finetuning | None = None) -> Trial:
+        trial = _trial(quantise(source, price), source.suffix, judge, mode, tune)
         value = {
             "max_loss": trial.quality.loss(before),
-            "max_size": float(len(trial.data)),
+            "max_size": float(trial.size),
             "max_error": trial.quality.largest_error,
         }
-        name = next(k for k, v in goal._asdict().items() if v is not None)
         trial = trial._replace(value=value[name])
         note(
             f"price {price:.2e}: {len(trial.scene.kept):,} Gaussians, "
-            f"{len(trial.data) / 1e6:.2f} MB, {value['max_loss']:.3f} dB lost"
+            f"{trial.size / 1e6:.2f} MB, {value['max_loss']:.3f} dB lost"
         )
         return trial
 
-    source = calibrated(source, judge, _first_price(source, before, goal))
-    return _bisect(at, _first_price(source, before, goal), limit, by_size)
+    price = _first_price(source, before, goal)
+    source = calibrated(source, judge, price)
+    best = _bisect(at, _first_price(source, before, goal, price), limit, by_size)
+    if finetuning is None:
+        return best
+    note(f"{finetuning.steps} steps of fine-tuning in each of up to {_TUNED} trials")
+    tuned = partial(at, tune=finetuning)
+    start = best.scene.price * (1 if by_size else _COARSER)
+    try:
+        found = _bisect(tuned, start, limit, by_size, _TUNED)
+    except UnreachableError:
+        return best
+    return found if _better(found, best, by_size) else best
 
 
 def _bisect(
-    at: Callable[[float], Trial], price: float, limit: float, by_size: bool
+    at: Callable[[float], Trial],
+    price: float,
+    limit: float,
+    by_size: bool,
+    trials: int = _TRIALS,
 ) -> Trial:
     """Return the best trial. Values rise with the price, or fall if ``by_size``."""
     best: Trial | None = None
     low, high = 0.0, np.inf  # prices that meet the goal, and that do not
-    tried: list[Trial] = []
-    for _ in range(_TRIALS):
+    tried: list[tuple[float, float]] = []  # (price, value): trials take memory
+    for _ in range(trials):
         trial = at(price)
-        tried.append(trial)
+        tried.append((price, trial.value))
         meets = trial.value <= limit
         if meets and (best is None or _better(trial, best, by_size)):
             best = trial
@@ -110,24 +143,29 @@ def _bisect(
         if high < low * 1.03:
             break
     if best is None:
-        least = min(tried, key=lambda trial: trial.value)
-        raise InputError(
-            f"goal: expected {limit:g} to be reached, got {least.value:g} at the least "
-            f"with {len(least.data):,} bytes; allow more, or choose another format"
+        least = min(value for _, value in tried)
+        raise UnreachableError(
+            f"goal: expected {limit:g} to be reached, got {least:g} at the least; "
+            "allow more, or choose another format"
         )
     return best
 
 
 def _better(trial: Trial, best: Trial, by_size: bool) -> bool:
-    if by_size:
-        return trial.quality.psnr_before > best.quality.psnr_before
-    return len(trial.data) < len(best.data)
+    if not by_size:
+        return trial.size < best.size
+    one, other = trial.quality, best.quality
+    if one.psnr is not None and other.psnr is not None:
+        return one.psnr > other.psnr
+    return one.psnr_before > other.psnr_before
 
 
-def _next_price(tried: list[Trial], limit: float, low: float, high: float) -> float:
+def _next_price(
+    tried: list[tuple[float, float]], limit: float, low: float, high: float
+) -> float:
     """Return a price between the bounds, by the logarithms of the last trials."""
     target = np.log(0.96 * limit)
-    points = [(np.log(t.scene.price), np.log(max(t.value, 1e-12))) for t in tried]
+    points = [(np.log(price), np.log(max(value, 1e-12))) for price, value in tried]
     points.sort(key=lambda point: abs(point[1] - target))
     (x, y), slope = points[0], 1.0
     if len(points) > 1 and points[1][0] != x:
@@ -141,8 +179,13 @@ def _next_price(tried: list[Trial], limit: float, low: float, high: float) -> fl
     return float(price)
 
 
-def _first_price(source: Source, before: Quality, goal: Goal) -> float:
-    """Return a price whose estimated error is about that of the goal."""
+def _first_price(
+    source: Source, before: Quality, goal: Goal, start: float | None = None
+) -> float:
+    """Return a price whose estimated error is about that of the goal, or less.
+
+    ``start`` is a price near it, if one is known.
+    """
     psnr = before.psnr if before.psnr is not None else NOMINAL_PSNR
     if goal.max_loss is not None:
         target = 10 ** (-psnr / 10) * (10 ** (goal.max_loss / 10) - 1)
@@ -150,13 +193,32 @@ def _first_price(source: Source, before: Quality, goal: Goal) -> float:
         target = (goal.max_error / 8) ** 2
     else:
         target = 10 ** (-psnr / 10) / 15
-    # From coarse to fine: fine prices ask for large palettes, which take long to make.
-    price = _COARSEST * target / len(source.rows["means"])
-    for _ in range(_HALVINGS):
-        if sum(quantise(source, price).errors.values()) < target:
-            break
-        price /= 2
+    target *= _WITHOUT_HARMONICS
+    price = start or target / len(source.rows["means"])
+    error = _estimate(source, price)
+    finer = error > target
+    for _ in range(_STRIDES):
+        last = price, error
+        price = price / _STRIDE if finer else price * _STRIDE
+        error = _estimate(source, price)
+        if (error > target) != finer:
+            x, y = np.log([last, (price, error)]).T
+            return float(np.exp(np.interp(np.log(target), *_ascending(y, x))))
     return price
+
+
+def _ascending(keys: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    order = np.argsort(keys)
+    return keys[order], values[order]
+
+
+def _estimate(source: Source, price: float) -> float:
+    """Return the estimated error at a price, without that of harmonics.
+
+    Palettes take long to make, and a price that is far too low asks for large ones.
+    """
+    errors = quantise(source, price, palettes=0).errors
+    return max(sum(errors.values()) - errors["harmonics"], 1e-300)
 
 
 def calibrated(source: Source, judge: Judge, price: float) -> Source:
@@ -166,21 +228,32 @@ def calibrated(source: Source, judge: Judge, price: float) -> Source:
     same light, and those that change places in the order of depth are in no gradient.
     Each kind of change at this price is drawn by itself.
     """
-    scene, factors = quantise(source, price), {}
-    removed = judge.error(scene.with_change(source, "removal"))
+    scene, factors = quantise(source, price, palettes=_SMALL), {}
+    removed = judge.few(scene.with_change(source, "removal"))
     for kind, estimate in scene.errors.items():
-        error = removed
-        if kind != "removal":
-            error = judge.error(scene.with_change(source, kind)) - removed
+        if kind == "removal":
+            error = squared_error(removed, judge.few())
+        else:  # against the pictures after the removal, whose error may be far larger
+            changed = judge.few(scene.with_change(source, kind))
+            error = squared_error(changed, removed)
         if estimate > 0:
             factors[kind] = float(np.clip(error / estimate, *_FACTORS))
     return scaled(source, factors)
 
 
-def _trial(source: Source, judge: Judge, price: float, mode: str | None) -> Trial:
-    scene = quantise(source, price)
-    data, gaussians = write_and_read(as_gaussians(scene.rows), source.suffix, mode)
-    return Trial(scene, gaussians, data, judge.judge(gaussians), float("nan"))
+def _trial(
+    scene: Quantised,
+    suffix: str,
+    judge: Judge,
+    mode: str | None,
+    finetuning: Finetuning | None,
+) -> Trial:
+    if finetuning is not None:
+        scene = finetune(scene, finetuning)
+    found = [write_and_read(one, suffix, mode) for one in scene.files()]
+    files, read = zip(*found)
+    gaussians = reduce(concatenate, read)
+    return Trial(scene, gaussians, files, judge.judge(gaussians), float("nan"))
 
 
 def write_and_read(
@@ -193,5 +266,5 @@ def write_and_read(
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         path = Path(folder) / f"scene{suffix}"
-        save(path, gaussians, mode=mode)
+        save(path, gaussians, mode=mode, **_OPTIONS.get(suffix, {}))
         return path.read_bytes(), load(path)

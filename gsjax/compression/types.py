@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsjax.cameras.camera import Camera
+from gsjax.compression.parts import part_path
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.planning.types import Reason
@@ -16,21 +17,31 @@ NOMINAL_PSNR = 30.0  # of a scene whose photographs are not given, dB
 
 
 class Goal(NamedTuple):
-    """Goal of a compression; exactly one limit is set.
+    """Goal of a compression; exactly one limit is set, for all files together.
 
     Attributes:
       max_loss: largest loss of PSNR on the held-out pictures, dB.
       max_size: largest size of the file, bytes.
       max_error: largest error of a colour against the scene before, in (0, 1).
+      parts: number of files. Each holds other Gaussians, the first the most important
+        tenth, which already shows the scene; see `gsjax.compression.parts`.
     """
 
     max_loss: float | None = None
     max_size: int | None = None
     max_error: float | None = None
+    parts: int = 1
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """The limits that are set, by name."""
+        limits = self._asdict()
+        del limits["parts"]
+        return {name: float(v) for name, v in limits.items() if v is not None}
 
     def check(self) -> None:
-        """Raise `InputError` unless exactly one goal is set, to a positive number."""
-        given = {k: v for k, v in self._asdict().items() if v is not None}
+        """Raise `InputError` unless one limit is set, and the numbers are positive."""
+        given = self.limits
         if len(given) != 1:
             names = ", ".join(given) or "none"
             remedy = "set one of max_loss, max_size and max_error"
@@ -38,6 +49,8 @@ class Goal(NamedTuple):
         ((name, value),) = given.items()
         if not 0 < value < np.inf:
             raise InputError(f"{name}: expected a positive number, got {value}")
+        if self.parts < 1:
+            raise InputError(f"parts: expected at least 1, got {self.parts}")
 
 
 class HeldOut(NamedTuple):
@@ -89,8 +102,8 @@ class CompressedScene(NamedTuple):
     """Result of `compress`.
 
     Attributes:
-      gaussians: the scene as the file holds it, read back.
-      data: the bytes of the file.
+      gaussians: the scene as the files hold it, read back.
+      files: the bytes of each file.
       suffix: its format, such as ".sog".
       before, after: quality on the held-out pictures.
       size_before: bytes of the scene as a PLY.
@@ -98,7 +111,7 @@ class CompressedScene(NamedTuple):
     """
 
     gaussians: Gaussians
-    data: bytes
+    files: tuple[bytes, ...]
     suffix: str
     before: Quality
     after: Quality
@@ -110,16 +123,28 @@ class CompressedScene(NamedTuple):
         """Loss of PSNR in dB, see `Quality.loss`."""
         return self.after.loss(self.before)
 
-    def save(self, path: Path) -> None:
-        """Write the file, complete or not at all."""
-        write_file(Path(path), self.data, durable=True)
+    @property
+    def size(self) -> int:
+        """Bytes of all files."""
+        return sum(map(len, self.files))
+
+    def save(self, path: Path) -> list[Path]:
+        """Write the files, each complete or not at all; return their paths.
+
+        One has the given path; the parts of ``scene.sog`` are ``scene-1.sog``, ….
+        """
+        count = len(self.files)
+        paths = [part_path(Path(path), k + 1, count) for k in range(count)]
+        for one, data in zip(paths, self.files):
+            write_file(one, data, durable=True)
+        return paths
 
     def lines(self) -> list[str]:
         """Return a table of size and quality, then the reasons, one a line."""
         rows = [("", "size", "PSNR", "SSIM", "largest error", "time to draw")]
         for name, size, quality in (
             ("before", self.size_before, self.before),
-            ("after", len(self.data), self.after),
+            ("after", self.size, self.after),
         ):
             photos = quality.psnr is not None
             rows.append(
@@ -134,7 +159,7 @@ class CompressedScene(NamedTuple):
             )
         widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
         lines = ["  ".join(f"{v:<{w}}" for v, w in zip(row, widths)) for row in rows]
-        ratio = self.size_before / len(self.data)
+        ratio = self.size_before / self.size
         kind = "" if self.before.psnr is not None else ", an estimate without photos"
         lines.append(f"{ratio:.1f} times smaller, {self.loss:.3f} dB lost{kind}")
         lines.append(

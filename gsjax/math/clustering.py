@@ -17,7 +17,7 @@ from gsjax.math.levels import optimal_levels
 Array = jax.Array
 
 _CHUNK = 2048  # points whose distances to all centroids are held at a time
-_MAX_FLAT = 4096  # clusters from which points are first divided into groups
+_MAX_FLAT = 512  # clusters from which points are first divided into groups
 _PER_GROUP = 256  # clusters of a group, on average
 _IN_GROUP = 4  # iterations within a group
 _SAMPLED = 4  # points per cluster among which the first centroids are chosen
@@ -48,7 +48,7 @@ def kmeans(
 
     Lloyd's iterations from a sample of distant points; a cluster that loses all points
     moves to the point with the largest weighted error. If there are at most ``count``
-    distinct points, they are the centroids, and nothing is lost. For more than 4096
+    distinct points, they are the centroids, and nothing is lost. For more than 512
     clusters the points are first divided into groups, which are clustered one by one.
 
     Lloyd, "Least squares quantization in PCM", IEEE Trans. Inf. Theory, 1982.

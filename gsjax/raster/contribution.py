@@ -31,9 +31,10 @@ from gsjax.raster.compositing.blending import (
     tables_of,
 )
 from gsjax.raster.compositing.chunked import take_rows
-from gsjax.raster.exact import exact_config, render_exact
+from gsjax.raster.exact import exact_config
 from gsjax.raster.lists import binning
 from gsjax.raster.primitives.table import with_primitive
+from gsjax.raster.render import render
 from gsjax.raster.render_camera import project_camera
 from gsjax.raster.tile_render import device_count
 from gsjax.raster.types import Array, Inputs, Projection, RasterConfig
@@ -77,29 +78,38 @@ def contribution(
     """Return the contribution of each Gaussian to the picture of one camera.
 
     Gaussians are blended in the order of their centres, whatever ``config.order`` is.
-    Call it outside of jit: capacities are fitted to the view. No derivative is taken.
+    Call it outside of jit. No derivative is taken.
 
     Args:
       gaussians: N slots, concrete.
       camera: a single camera.
-      config: static settings of the render; its outputs are not used.
+      config: static settings of the render; its outputs are not used. Without a pair
+        capacity, or if it is too small, the capacities are fitted to the view.
       background: [3] RGB behind the scene; None for black.
 
     Raises:
       InputError, CapacityError: as `render_exact`.
     """
     config = config.replace(outputs=("rgb",), order="center", absgrad=False)
-    config = exact_config(gaussians, camera, config)
-    image = render_exact(gaussians, camera, config, background).rgb
-    config = with_primitive(config)
-    return _of_view(Inputs(gaussians, camera), image, config, platform_name())
+    if config.pair_capacity is None:
+        config = exact_config(gaussians, camera, config)
+    inputs, platform = Inputs(gaussians, camera), platform_name()
+    result, overflowed = _of_view(inputs, background, config, platform)
+    if bool(overflowed):
+        config = exact_config(gaussians, camera, config)
+        result, _ = _of_view(inputs, background, config, platform)
+    return result
 
 
 @partial(jax.jit, static_argnums=(2, 3))
 def _of_view(
-    inputs: Inputs, image: Array, config: RasterConfig, platform: str
-) -> Contribution:
+    inputs: Inputs, background: Array | None, config: RasterConfig, platform: str
+) -> tuple[Contribution, Array]:
+    """Return the contribution, and whether the capacities were too small."""
     del platform  # part of the key of the compiled program: stages depend on it
+    drawn = render(inputs.gaussians, inputs.camera, config, background)
+    image, config = drawn.rgb, with_primitive(config)
+    assert image is not None
     out, order, _, _ = project_camera(inputs, config)
     devices = device_count(config)
     size = inputs.camera.width, inputs.camera.height
@@ -115,7 +125,8 @@ def _of_view(
             return nothing.at[order].max(jnp.max(values, 0), mode="drop")
         return nothing.at[order].add(jnp.sum(values, 0), mode="drop")
 
-    return Contribution(**{k: by_slot(k, v[:, :-1]) for k, v in sums._asdict().items()})
+    result = {k: by_slot(k, v[:, :-1]) for k, v in sums._asdict().items()}
+    return Contribution(**result), drawn.overflowed
 
 
 def _of_device(

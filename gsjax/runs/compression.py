@@ -10,12 +10,15 @@ import numpy as np
 from gsjax.cameras.camera import Camera, make_camera
 from gsjax.cameras.distortion import lens_fields
 from gsjax.compression.compress import compress
+from gsjax.compression.finetune import Finetuning
+from gsjax.compression.parts import part_path
 from gsjax.compression.types import CompressedScene, Goal, HeldOut
 from gsjax.data.photos import load_photos
 from gsjax.data.transforms import load_near_transforms
 from gsjax.data.types import Photo, View
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
+from gsjax.io.common import warn
 from gsjax.planning.types import Reason
 from gsjax.raster.types import RasterConfig
 from gsjax.runs import folder as run_folder
@@ -26,8 +29,9 @@ from gsjax.runs.scene_source import is_run, open_scene_source, splat_file
 from gsjax.runs.trajectories import view_entries
 from gsjax.runtime.console import note
 from gsjax.runtime.files import make_folder, reject_existing
-from gsjax.train.config import TrainConfig
+from gsjax.train.config import TrainConfig, render_mode_of
 from gsjax.train.frames import with_shutter_of
+from gsjax.train.loop import subset
 
 _ON_SPHERE, _HELD_OUT = 24, 7  # views of a file without cameras
 _OUTSIDE = 0.02  # share of the Gaussians beyond each side of the box about them
@@ -58,16 +62,19 @@ def compress_scene(
     goal: Goal,
     *,
     cameras: Path | None = None,
+    finetune_steps: int = 0,
     overwrite: bool = False,
 ) -> CompressedScene:
-    """Write a scene as a small file, and return it as read back.
+    """Write a scene as small files, and return it as read back.
 
     Args:
       source: folder of a run, whose held-out views measure the loss; or a file of
         Gaussians.
       out: the file; its suffix selects the format. Its folder is created if missing.
-      goal: what must be met.
+      goal: what must be met, and the number of files, see `CompressedScene.save`.
       cameras: cameras of a file (transforms.json); None for a sphere about it.
+      finetune_steps: number of steps for which the scene of a run is trained further in
+        each trial; 0 for none.
       overwrite: replace an existing file.
 
     Raises:
@@ -75,8 +82,16 @@ def compress_scene(
         `compress`.
       CapacityError: as `compress`.
     """
-    reject_existing([out], overwrite)
-    inputs = run_inputs(source) if is_run(source) else _of_file(source, cameras)
+    paths = [part_path(out, k + 1, goal.parts) for k in range(max(goal.parts, 1))]
+    reject_existing(paths, overwrite)
+    if finetune_steps and not is_run(source):
+        remedy = "pass the folder of a run, which has photographs"
+        raise InputError(f"{source}: expected a run for fine-tuning; {remedy}")
+    inputs = compression_inputs(source, cameras)
+    finetuning = run_finetuning(source, finetune_steps) if finetune_steps else None
+    mode = scene_mode(source)
+    if mode != render_mode_of(inputs.config):
+        warn(f"{source}: its render mode {mode!r} is not known, and not recorded")
     result = compress(
         inputs.gaussians,
         inputs.cameras,
@@ -85,7 +100,7 @@ def compress_scene(
         config=inputs.config,
         background=inputs.background,
         held_out=inputs.held_out,
-        mode=scene_mode(source),
+        finetuning=finetuning,
     )
     if np.any(inputs.origin):
         place = ", ".join(f"{x:g}" for x in inputs.origin)
@@ -104,12 +119,20 @@ def file_suffix(path: Path) -> str:
     )
 
 
-def run_inputs(path: Path) -> CompressionInputs:
-    """Return the scene of a run with its training and held-out views.
+def compression_inputs(source: Path, cameras: Path | None = None) -> CompressionInputs:
+    """Return the scene of a run with its training and held-out views, or of a file.
+
+    Args:
+      source, cameras: as `compress_scene`.
 
     Raises:
-      InputError: as `load_split`, or if the run has no scene yet.
+      InputError: as `load_split`, if the run has no scene yet, or if the file cannot be
+        read.
     """
+    return _of_run(source) if is_run(source) else _of_file(source, cameras)
+
+
+def _of_run(path: Path) -> CompressionInputs:
     settings = run_folder.load_settings(path)
     files, config = run_folder.run_files(path), settings.config
     given = run_folder.load_split(settings)
@@ -135,6 +158,19 @@ def run_inputs(path: Path) -> CompressionInputs:
         config=config.raster,
         background=background,
         origin=split.dataset.origin,
+    )
+
+
+def run_finetuning(path: Path, steps: int) -> Finetuning:
+    """Return the training views of a run, as refined, with their photographs."""
+    settings = run_folder.load_settings(path)
+    files, config = run_folder.run_files(path), settings.config
+    given = run_folder.load_split(settings)
+    split = run_folder.with_refined_cameras(given, files)
+    before, dataset = given.views("train"), subset(split.dataset, split.train)
+    photos = load_photos(before, config.max_size, undistort=config.undistort)
+    return Finetuning(
+        dataset, refine_photos(photos, before, dataset.views), config, steps
     )
 
 

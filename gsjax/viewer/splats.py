@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gsjax.compression.parts import part_ends
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.math.sh import dc_to_rgb
 
 MIN_DRAWN_OPACITY = 0.01
-FIRST_SHARE = 0.1  # of the Gaussians, which appears first
 MANY = 100_000  # Gaussians: from here on a part is shown first
 # Half precision has 11 bits from 6e-5 to 65504, which are scales of 0.008 to 255.
 _LARGEST, _TYPICAL = 250.0, 0.1
@@ -114,8 +114,7 @@ def importance_parts(
 ) -> list[np.ndarray]:
     """Return masks [N] that divide those ``shown`` [N] in parts of falling importance.
 
-    The first part is a tenth, and each further one multiplies the number so far by the
-    same factor: 10 % and 90 %, or 10, 22 and 68 %. Empty parts are left out.
+    Their sizes are those of `part_ends`. Empty parts are left out.
 
     Raises:
       InputError: if ``parts`` is below 1.
@@ -125,9 +124,8 @@ def importance_parts(
     if parts == 1:
         return [shown]
     order = by_importance(gaussians, shown, ordered)
-    ends = np.rint(FIRST_SHARE ** np.linspace(1, 0, parts) * len(order)).astype(int)
     masks = []
-    for some in np.split(order, np.maximum(ends[:-1], 1)):
+    for some in np.split(order, part_ends(len(order), parts)[:-1]):
         mask = np.zeros_like(shown)
         mask[some] = True
         masks.append(mask)

@@ -23,7 +23,7 @@ import gsjax
 from gsjax.cli.main import main
 from gsjax.compression.measure import Judge
 from gsjax.gaussians import activate
-from gsjax.runs.compression import run_inputs
+from gsjax.runs.compression import compression_inputs
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("float32", "shared_programs")]
 
@@ -251,7 +251,7 @@ def test_mesh(demo, tmp_path, capsys):
 
 def test_the_loss_of_a_compression_is_measured_on_the_held_out_views(demo):
     """With the cameras and photographs of `gsjax eval`."""
-    inputs = run_inputs(demo / "run")
+    inputs = compression_inputs(demo / "run")
     judge = Judge(inputs.gaussians, inputs.held_out, inputs.config, inputs.background)
     quality = judge.judge(inputs.gaussians)
     expected = json.loads((demo / "run" / "eval.json").read_text())

@@ -15,6 +15,7 @@ from gsjax.cli.main import main
 from gsjax.compression.quantise import rows_of
 from gsjax.compression.types import CompressedScene, Goal, HeldOut
 from gsjax.data.transforms import CameraEntry, transforms_json
+from gsjax.train.config import mip_raster
 
 pytestmark = [
     pytest.mark.usefixtures("float32"),
@@ -75,7 +76,7 @@ def compressed(scene, cameras, goal, **kwargs) -> CompressedScene:
 def read_back(result: CompressedScene, folder: Path) -> gsjax.Gaussians:
     path = folder / f"a{result.suffix}"
     result.save(path)
-    assert path.read_bytes() == result.data
+    assert (path.read_bytes(),) == result.files
     return gsjax.load(path)
 
 
@@ -98,13 +99,30 @@ def test_the_loss_against_photographs_is_that_of_the_file(
     assert result.after.largest_error == pytest.approx(largest, abs=1e-5)
     gsjax.save(tmp_path / "all.ply", scene)
     assert result.size_before == (tmp_path / "all.ply").stat().st_size
-    assert len(result.data) < result.size_before / 4
+    assert result.size < result.size_before / 4
     assert any(f"{result.loss:.3f} dB lost" in line for line in result.lines())
 
 
 def test_sizes_and_errors_are_met(scene, cameras, tmp_path):
     small = compressed(scene, cameras, Goal(max_size=4000))
-    assert 2000 < len(small.data) <= 4000
+    assert 2000 < small.size <= 4000
+    parts = compressed(scene, cameras, Goal(max_size=11_000, parts=3))
+    assert 6000 < parts.size <= 11_000
+    paths = parts.save(tmp_path / "scene.sog")
+    assert [path.name for path in paths] == [f"scene-{k}.sog" for k in (1, 2, 3)]
+    read = [gsjax.load(path) for path in paths]
+    counts = [int(gsjax.num_active(one)) for one in read]
+    assert sum(counts) == int(gsjax.num_active(parts.gaussians))
+    np.testing.assert_allclose(np.cumsum(counts) / sum(counts), [0.1, 0.32, 1], 0.03)
+    whole = pictures(parts.gaussians, cameras)
+    union = gsjax.concatenate(gsjax.concatenate(read[0], read[1]), read[2])
+    np.testing.assert_allclose(pictures(union, cameras), whole, atol=1e-5)
+    # The first tenth shows more than the tenth after it.
+    errors = [np.mean((pictures(one, cameras) - whole) ** 2) for one in read[:2]]
+    assert errors[0] < errors[1]
+    assert [r.what for r in parts.reasons if "part" in r.what] == [
+        f"part {k}" for k in (1, 2, 3)
+    ]
     fine = compressed(scene, cameras, Goal(max_error=8 / 255))
     found = pictures(read_back(fine, tmp_path), cameras)
     assert np.abs(found - pictures(scene, cameras)).max() <= 8.01 / 255
@@ -148,6 +166,8 @@ def test_the_command(scene, cameras, tmp_path, capsys):
     assert f"{out}  {out.stat().st_size / 1e6:.2f} MB" in text
     assert main([*map(str, words)]) == 3
     assert "exists; pass --overwrite" in capsys.readouterr().err
+    assert main([*map(str, words), "--overwrite", "--finetune", "5"]) == 3
+    assert "expected a run for fine-tuning" in capsys.readouterr().err
     for wrong, message in (
         (["--max-loss", "x"], "such as 0.3dB"),
         (["--max-size", "0MB"], "such as 5MB"),
@@ -159,8 +179,12 @@ def test_the_command(scene, cameras, tmp_path, capsys):
 
 
 def test_a_render_mode_that_is_lost_is_reported(scene, cameras):
+    empty = gsjax.select(scene, np.zeros(scene.capacity, bool))
+    mip = mip_raster(CONFIG)
     with pytest.warns(UserWarning, match="do not record the render mode 'mip'"):
-        compressed(scene, cameras, Goal(max_loss=0.5), suffix=".glb", mode="mip")
+        rejects(
+            "at least one", gsjax.compress, empty, cameras, suffix=".glb", config=mip
+        )
 
 
 def test_refusals(scene, cameras):
@@ -173,6 +197,7 @@ def test_refusals(scene, cameras):
         ((scene, cameras), {"goal": Goal(0.1, 9)}, "got max_loss, max_size"),
         ((scene, cameras), {"goal": Goal(max_loss=-1.0)}, "expected a positive"),
         ((scene, cameras), {"held_out": HeldOut([])}, "held_out: expected at least"),
+        ((scene, cameras), {"goal": Goal(0.1, parts=0)}, "parts: expected at least 1"),
         ((scene, cameras), {"goal": Goal(max_size=10)}, "got .* at the least"),
     ]
     for args, kwargs, message in rows:

@@ -1,5 +1,6 @@
 """Estimates of errors and bits, compared with sums written out and with derivatives."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,14 +9,14 @@ from scipy.spatial.transform import Rotation
 
 import gsjax
 from gsjax import RasterConfig
-from gsjax.compression.curvature import shape_curvature, shrunk
+from gsjax.compression.curvature import shape_curvature
 from gsjax.compression.harmonics import ViewedHarmonics
 from gsjax.compression.lattices import lattice_of, round_to
 from gsjax.math.clustering import nearest_by_cost
 from gsjax.math.sh import eval_sh
 from gsjax.raster.contribution import contribution
 
-CONFIG = RasterConfig(tile_size=8, alpha_min=1e-6, outputs=("rgb",))
+CONFIG = RasterConfig(tile_size=8, alpha_min=1e-6, pair_capacity=64, outputs=("rgb",))
 
 
 def test_curvature_of_one_gaussian_seen_from_all_sides():
@@ -24,11 +25,9 @@ def test_curvature_of_one_gaussian_seen_from_all_sides():
     quat = np.asarray([[0.8, 0.1, -0.5, 0.3]])
     params = scene.params.replace(quats=quat / np.linalg.norm(quat))
     scene, camera = scene.replace(params=params), camera_of(24, 24, focal=(30, 30))
-    names, removal, step = (
-        ("means", "quats", "log_scales", "logit_opacities"),
-        0.0,
-        1e-4,
-    )
+    names = "means", "quats", "log_scales", "logit_opacities"
+    removal, step = np.zeros(1), 1e-4
+    draw = jax.jit(lambda *view: gsjax.render(*view, CONFIG).rgb)
     sums = {name: 0 * np.asarray(getattr(scene.params, name)) for name in names}
     for turn in Rotation.random(16, rng=0).as_matrix():
         viewmat = np.eye(4)
@@ -37,7 +36,7 @@ def test_curvature_of_one_gaussian_seen_from_all_sides():
 
         def picture(params, seen=seen):
             moved = scene.replace(params=params)
-            return np.asarray(gsjax.render_exact(moved, seen, CONFIG).rgb)
+            return np.asarray(draw(moved, seen))
 
         for name in names:
             value = np.asarray(getattr(scene.params, name))
@@ -49,19 +48,13 @@ def test_curvature_of_one_gaussian_seen_from_all_sides():
                     ends.append(picture(scene.params.replace(**{name: moved})))
                 slope = (ends[0] - ends[1]) / (2 * step)
                 sums[name][place] += np.sum(slope**2)
-        removal = removal + np.asarray(contribution(scene, seen, CONFIG).removal)
+        removal += np.asarray(contribution(scene, seen, CONFIG).removal)
     rows = {name: np.asarray(value) for name, value in vars(scene.params).items()}
     found = shape_curvature(rows, removal, np.full(1, 0.3 * (4 / 30) ** 2))
     # Exact for the opacity, an estimate for the rest.
     np.testing.assert_allclose(found["logit_opacities"], sums["logit_opacities"], 0.01)
     for name in ("means", "log_scales", "quats"):
         assert 0.5 < found[name].sum() / sums[name].sum() < 2
-
-
-def test_few_measurements_count_less_than_the_estimate():
-    measured, prior = {"means": np.asarray([[8.0], [8.0]])}, {"means": np.ones((2, 1))}
-    found = shrunk(measured, prior, np.asarray([0, 1000]))["means"][:, 0]
-    np.testing.assert_allclose(found, [1, 8], rtol=0.01)
 
 
 @pytest.fixture
@@ -138,7 +131,8 @@ def test_tables_of_sog_hold_all_distinct_values():
     axis = lattice_of(".sog", {"means": values}).log_scales
     found = round_to(axis, values, np.full(values.shape, 1e9), 1e-12).values
     assert 128 <= len(np.unique(found)) <= 256
-    assert np.abs(found - values).max() < 0.15
+    # Max 1960: σ² 2.72 / 256²; even steps would lose five times as much.
+    assert np.mean(np.square(found - values)) < 1.2 * 25 * 2.72 / 256**2
 
 
 def test_labels_of_least_cost():

@@ -39,8 +39,13 @@ def test_sums_are_those_of_single_features(config, lens):
     """The picture of a feature that one Gaussian has shows the weights of that one."""
     gaussians, camera = scene(), camera_of(*SIZE, lens=lens)
     found = contribution(gaussians, camera, config, BACKGROUND)
-    features = jnp.eye(gaussians.capacity)
-    weights = gsjax.render_exact(gaussians, camera, config, features=features).rgb
+    config = gsjax.exact_config(gaussians, camera, config)
+    features = np.split(np.eye(gaussians.capacity), gaussians.capacity // 3, axis=1)
+    drawn = [
+        gsjax.render(gaussians, camera, config, features=jnp.asarray(some)).rgb
+        for some in features
+    ]
+    weights = jnp.concatenate(drawn, -1)
     np.testing.assert_allclose(found.total, weights.sum((0, 1)), rtol=1e-9)
     np.testing.assert_allclose(found.largest, weights.max((0, 1)), rtol=1e-9)
     np.testing.assert_allclose(found.energy, (weights**2).sum((0, 1)), rtol=1e-9)
