@@ -109,6 +109,14 @@ def aliasing(folder: Path) -> None:
     write("aliasing.webp", np.concatenate(rows, axis=0))
 
 
+def rate_distortion() -> None:
+    """Copy the plot of benchmarks/rate_distortion.py."""
+    kept = Path(__file__).parents[1] / "benchmarks" / "results" / "rate_distortion.png"
+    pixels = cv2.imread(str(kept))
+    assert pixels is not None
+    write("rate_distortion.webp", pixels[..., ::-1] / 255)
+
+
 def order() -> None:
     """Draw two splats beside each other, one in front, then the other."""
     K = [[240, 0, 140], [0, 240, 100], [0, 0, 1]]
@@ -303,4 +311,5 @@ if __name__ == "__main__":
         lenses()
         order()
         pipeline()
+        rate_distortion()
         turning()

@@ -172,6 +172,33 @@ def training(page: Path) -> list[Row]:
     return rows
 
 
+def compression(page: Path) -> list[Row]:
+    """Return the sizes of compressed scenes at a loss of 0.3 dB, and of others."""
+    data = result("rate_distortion")
+    rows = []
+    for name in dict.fromkeys(row["scene"] for row in data["rows"]):
+        some = [row for row in data["rows"] if row["scene"] == name]
+
+        def size(way: str, goal: str, some=some) -> str:
+            found = [r for r in some if r["way"] == way and goal in r["goal"]]
+            return f"{found[0]['bytes'] / 1e6:.2f} MB" if found else "–"
+
+        rows.append(
+            (
+                f"{name}, degree {some[0]['degree']}",
+                f"{some[0]['Gaussians']:,}",
+                size("plain PLY", ""),
+                size("splat-transform .sog", ""),
+                size("gsjax .sog", "foreign"),
+                size("gsjax .sog", "0.3 dB"),
+                size("gsjax .sog, 300 steps", "0.3 dB"),
+                machine(data),
+                link(page, "rate_distortion"),
+            )
+        )
+    return rows
+
+
 TABLES = {
     "headline": (headline, ("what", "result", "machine", "program")),
     "rendering": (
@@ -187,6 +214,13 @@ TABLES = {
         (
             *("capture", "strategy", "PSNR", "SSIM", "Gaussians", "time"),
             *("machine", "program"),
+        ),
+    ),
+    "compression": (
+        compression,
+        (
+            *("scene", "Gaussians", "PLY", "splat-transform", "gsjax, equal loss"),
+            *("0.3 dB lost", "fine-tuned", "machine", "program"),
         ),
     ),
 }
