@@ -11,6 +11,7 @@ installs the tool in a temporary folder, or keeps it in that of ``--tool``.
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 import subprocess
 import sys
@@ -170,6 +171,13 @@ class Tool:
         if done.returncode:
             sys.exit(f"cannot install {PACKAGE}: {done.stderr.strip()}")
 
+    @property
+    def package(self) -> str:
+        """Name and version of what is installed."""
+        name = PACKAGE.rpartition("@")[0]
+        file = self.program.parents[1] / name / "package.json"
+        return f"{name}@{json.loads(file.read_text())['version']}"
+
     def convert(self, source: Path, out: Path) -> str:
         """Convert a file, and return the error, or ""."""
         options = ["--quiet", "--overwrite", "--gpu", "cpu"]
@@ -225,12 +233,13 @@ def main() -> int:
     rows = []
     with tempfile.TemporaryDirectory() as name:
         tool = Tool(given.tool or Path(name) / "tool")
+        package = tool.package
         for label, scene in scenes.items():
             for suffix in suffixes:
                 rows.append(row(label, scene, suffix, tool, Path(name)))
                 print(rows[-1])
     bounds = {"all formats": BOUNDS, **KNOWN}
-    measure.save("formats", rows, claim=__doc__, package=PACKAGE, bounds=bounds)
+    measure.save("formats", rows, claim=__doc__, package=package, bounds=bounds)
     compared = [r for r in rows if r["exceeded"] != "not compared"]
     return int(not compared or any(r["exceeded"] for r in compared))
 

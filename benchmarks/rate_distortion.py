@@ -203,13 +203,12 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         folder = given.tool or Path(folder)
         tool = formats.Tool(folder)
+        package = tool.package
         for name, path in paths.items():
             rows += scene_rows(name, path, tool, folder)
             jax.clear_caches()
     whole = whole or told.get("whole")
-    measure.save(
-        "rate_distortion", rows, claim=__doc__, package=formats.PACKAGE, whole=whole
-    )
+    measure.save("rate_distortion", rows, claim=__doc__, package=package, whole=whole)
     draw()
     return int(not all(row["met"] for row in rows))
 
