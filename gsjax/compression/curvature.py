@@ -4,8 +4,7 @@ The diagonal of JᵀJ. For opacities it follows from the error of a removal. For
 others, that error and the shape of a Gaussian give an estimate: with standardised
 offsets y from the centre and weights like exp(−y²), the mean of y² is 1/2, of y⁴ 3/4,
 and of y1² y2² 1/4. For one isolated Gaussian seen from all sides it is within a factor
-of 2. Derivatives measured by random signs (Hutchinson 1989) in twelve views were no
-better: they compiled 20 s longer, and files became as small or larger.
+of 2.
 
 Axis legend: N Gaussians.
 """

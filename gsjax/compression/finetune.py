@@ -17,13 +17,8 @@ import numpy as np
 from jax import lax
 
 from gsjax.compression.lattices import Lattice, snap, snap_quats
-from gsjax.compression.quantise import (
-    Palette,
-    Quantised,
-    as_gaussians,
-    rows_of,
-    with_table,
-)
+from gsjax.compression.palettes import Palette, with_table
+from gsjax.compression.quantise import Quantised, as_gaussians, rows_of
 from gsjax.data.extent import extent_of
 from gsjax.data.types import Dataset, Photo
 from gsjax.densify.fixed import FIXED
