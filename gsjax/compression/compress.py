@@ -156,14 +156,17 @@ def _reasons(best: Trial, count: int, largest: np.ndarray) -> tuple[Reason, ...]
 
 def _parts(best: Trial, judge: Judge) -> list[Reason]:
     """Return what the first files show, if there are several."""
-    reasons, shown = [], None
-    for part, data in enumerate(best.files if len(best.files) > 1 else ()):
+    reasons = []
+    parts = np.unique(best.scene.part)  # empty ones have no file
+    if len(parts) == 1:
+        return []
+    for place, (part, data) in enumerate(zip(parts, best.files), 1):
         count = int(np.sum(best.scene.part <= part))
         places = jnp.arange(best.gaussians.capacity) < count
         shown = judge.judge(select(best.gaussians, places))
         quality = shown.psnr_before if shown.psnr is None else shown.psnr
         why = f"{len(data) / 1e6:.2f} MB; with those before it {count:,} Gaussians"
-        reasons.append(Reason(f"part {part + 1}", f"{why}, {decibels(quality)}"))
+        reasons.append(Reason(f"part {place}", f"{why}, {decibels(quality)}"))
     return reasons
 
 

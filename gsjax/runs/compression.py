@@ -19,6 +19,7 @@ from gsjax.data.types import Photo, View
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.io.common import warn
+from gsjax.io.formats import DEFAULT_MODE
 from gsjax.planning.types import Reason
 from gsjax.raster.types import RasterConfig
 from gsjax.runs import folder as run_folder
@@ -90,7 +91,7 @@ def compress_scene(
     inputs = compression_inputs(source, cameras)
     finetuning = run_finetuning(source, finetune_steps) if finetune_steps else None
     mode = scene_mode(source)
-    if mode != render_mode_of(inputs.config):
+    if mode not in (render_mode_of(inputs.config), DEFAULT_MODE):
         warn(f"{source}: its render mode {mode!r} is not known, and not recorded")
     result = compress(
         inputs.gaussians,
@@ -106,6 +107,9 @@ def compress_scene(
         place = ", ".join(f"{x:g}" for x in inputs.origin)
         why = f"coordinates are relative to ({place}), where the numbers are exact"
         result = result._replace(reasons=(*result.reasons, Reason("origin", why)))
+    if len(result.files) < goal.parts:  # a small scene, whose files have other names
+        count = len(result.files)
+        reject_existing([part_path(out, k + 1, count) for k in range(count)], overwrite)
     make_folder(out.parent)
     result.save(out)
     return result

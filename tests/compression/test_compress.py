@@ -8,20 +8,22 @@ import numpy as np
 import pytest
 from captures import rejects
 from conftest import camera_of, frustum_points, gaussians_at
+from training import dataset
 
 import gsjax
 from gsjax import RasterConfig
 from gsjax.cli.main import main
+from gsjax.compression.finetune import Finetuning
 from gsjax.compression.quantise import rows_of
 from gsjax.compression.types import CompressedScene, Goal, HeldOut
 from gsjax.data.transforms import CameraEntry, transforms_json
-from gsjax.train.config import mip_raster
+from gsjax.train.config import mip_raster, preset
 
 pytestmark = [
     pytest.mark.usefixtures("float32"),
     pytest.mark.filterwarnings("ignore:.*Gaussians have"),
 ]
-CONFIG = RasterConfig(tile_size=8)
+CONFIG, FAST = RasterConfig(tile_size=8), preset("fast")
 BACKGROUND = (0.1, 0.2, 0.3)
 
 
@@ -198,6 +200,14 @@ def test_refusals(scene, cameras):
         ((scene, cameras), {"goal": Goal(max_loss=-1.0)}, "expected a positive"),
         ((scene, cameras), {"held_out": HeldOut([])}, "held_out: expected at least"),
         ((scene, cameras), {"goal": Goal(0.1, parts=0)}, "parts: expected at least 1"),
+        (
+            (scene, cameras),
+            {
+                "goal": Goal(max_error=0.1),
+                "finetuning": Finetuning(dataset(), [], FAST),
+            },
+            "finetuning: expected another goal",
+        ),
         ((scene, cameras), {"goal": Goal(max_size=10)}, "got .* at the least"),
     ]
     for args, kwargs, message in rows:
