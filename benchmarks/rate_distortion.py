@@ -101,6 +101,7 @@ def scene_rows(name: str, path: Path, tool: formats.Tool, folder: Path) -> list[
         add(way, found.size, found.quality, label, found.value <= limit)
         return found
 
+    half = plain.stat().st_size // 50  # if the loss below is not reached
     for suffix in FOREIGN:
         for loss in LOSSES:
             found = ours(suffix, Goal(max_loss=loss), f"{loss} dB")
