@@ -7,10 +7,11 @@ the host until `make_camera`.
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -31,11 +32,26 @@ from gsjax.errors import InputError
 _MAX_NAME_BYTES = 180
 
 
-class CameraEntry(NamedTuple):
-    """A camera and a unique name, safe as a file name, without suffix."""
+@dataclass(frozen=True)
+class CameraEntry:
+    """A camera with its name and time; unpacks as (name, camera).
+
+    Attributes:
+      name: unique, safe as a file name, without suffix.
+      camera: a single camera.
+      time: of the exposure; None if it is unknown.
+    """
 
     name: str
     camera: Camera
+    time: float | None = None
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.name, self.camera))
+
+    def replace(self, **changes) -> "CameraEntry":
+        """Return a copy with some attributes changed."""
+        return replace(self, **changes)
 
 
 def load_transforms(
@@ -93,7 +109,8 @@ def _load(
     used: dict[str, int] = {}
     for index, (frame, (viewmat, _)) in enumerate(zip(frames, poses)):
         camera = _camera(frame, shifted(viewmat, origin), size, near)
-        entries.append(CameraEntry(_unique_name(frame, index, used), camera))
+        name = _unique_name(frame, index, used)
+        entries.append(CameraEntry(name, camera, frame.number("time")))
     factors = enumerate(factor for _, factor in poses)
     warn_of_scaled(path, [(index, factor) for index, factor in factors if factor != 1])
     return entries, origin
@@ -159,7 +176,7 @@ def transforms_json(
     shared = {
         key: value
         for key, value in (frames[0].items() if frames else ())
-        if key not in ("file_path", "transform_matrix")
+        if key not in ("file_path", "transform_matrix", "time")
         and all(frame.get(key) == value for frame in frames)
     }
     frames = [{k: v for k, v in f.items() if k not in shared} for f in frames]
@@ -177,6 +194,7 @@ def _frame_of(entry: CameraEntry) -> dict:
     matrix = inverted(viewmat[:3, :3], viewmat[:3, 3])
     matrix[:3, 1:3] *= -1  # OpenCV axes to OpenGL axes
     K = np.asarray(camera.K, np.float64)
+    time = {} if entry.time is None else {"time": entry.time}
     return {
         **lens_keys(camera),
         "w": camera.width,
@@ -186,5 +204,6 @@ def _frame_of(entry: CameraEntry) -> dict:
         "cx": K[0, 2],
         "cy": K[1, 2],
         "file_path": f"{entry.name}.png",
+        **time,
         "transform_matrix": matrix.tolist(),
     }

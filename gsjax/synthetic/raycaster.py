@@ -6,7 +6,7 @@ shadow and a sky; all surfaces are diffuse. Right-handed, z up, floor at z = 0.
 Axis legend: R rays or points ([3, R] arrays), H W image, M points, F cameras.
 """
 
-from functools import cache
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -18,13 +18,12 @@ from gsjax.data.transforms import CameraEntry, transforms_json
 from gsjax.errors import InputError
 from gsjax.io import images
 from gsjax.runtime.files import make_folder, reject_existing, write_file
-from gsjax.synthetic import albedo
 from gsjax.synthetic.optics import PINHOLE, Optics, exposures, local_rays
-from gsjax.synthetic.shapes import Solid, box, disc, dot, sphere, torus
+from gsjax.synthetic.shapes import Solid, dot
+from gsjax.synthetic.still_life import solids
 
 BACKGROUND = (0.0, 0.0, 0.0)
 TARGET = np.asarray([0.0, 0.0, 0.10])
-GROUND_RADIUS = 2.1
 
 _SUN = np.asarray([0.52, -0.40, 0.76]) / np.linalg.norm([0.52, -0.40, 0.76])
 _PENUMBRA = 0.12  # tangent of the apparent diameter of the sun
@@ -62,6 +61,7 @@ def cast(
     *,
     background=BACKGROUND,
     optics: Optics = PINHOLE,
+    scene: Sequence[Solid] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a photograph of the still life and its depth.
 
@@ -72,6 +72,7 @@ def cast(
       samples: a pixel is the mean of samples × samples rays on a regular grid.
       background: RGB in [0, 1] of pixels without a surface.
       optics: lens and shutter.
+      scene: solids, the floor first; default `solids`, the still life.
 
     Returns:
       rgb [H, W, 3] float32 in [0, 1], and depth [H, W] float64: camera z at the
@@ -80,31 +81,38 @@ def cast(
     Raises:
       InputError: if ``samples`` is below 1, or the optics are not valid.
     """
-    size = width, height
-    rgb = _image(viewmat, K, size, samples, background, optics)
+    size, scene = (width, height), scene or solids()
+    rgb = _image(viewmat, K, size, samples, background, optics, scene)
     u, v = (a.ravel() + 0.5 for a in np.meshgrid(np.arange(width), np.arange(height)))
-    depth, _, _ = _hits(viewmat, K, size, (u, v), optics)
+    depth, _, _ = _hits(scene, viewmat, K, size, (u, v), optics)
     return rgb, np.where(np.isfinite(depth), depth, 0).reshape(height, width)
 
 
-def surface_points(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def surface_points(
+    count: int, seed: int = 0, scene: Sequence[Solid] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return noisy surface points that the cameras see, as from structure from motion.
+
+    Args:
+      count: M.
+      seed: of the random numbers.
+      scene: as in `cast`.
 
     Returns:
       points [M, 3] float64 with noise of σ = 0.004 in each coordinate, and their
       shaded colours [M, 3] uint8.
     """
-    rng = np.random.default_rng(seed)
+    rng, scene = np.random.default_rng(seed), scene or solids()
     viewmats, K = demo_cameras(24, 1, 1)
     points, colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     while len(points) < count:
         share = -(-count // len(viewmats))
         for viewmat in viewmats:
             pixels = rng.uniform(size=(2, share))
-            t, which, places = _hits(viewmat, K, (1, 1), pixels)
+            t, which, places = _hits(scene, viewmat, K, (1, 1), pixels)
             hit = np.isfinite(t)
             points = np.concatenate([points, places[:, hit].T])
-            shaded = images.to_8_bit(_shade(places[:, hit], which[hit]).T)
+            shaded = images.to_8_bit(_shade(scene, places[:, hit], which[hit]).T)
             colors = np.concatenate([colors, shaded])
     chosen = rng.permutation(len(points))[:count]
     points = points[chosen] + rng.normal(0, 0.004, (count, 3))
@@ -161,42 +169,24 @@ def write_demo_dataset(
     entries = []
     for name, photo, viewmat in zip(names, photos, viewmats):
         samples, background = settings.samples, settings.background
-        rgb = _image(viewmat, K, size, samples, background, PINHOLE)
+        rgb = _image(viewmat, K, size, samples, background, PINHOLE, solids())
         write_file(photo, images.encode_png(images.to_8_bit(rgb)))
         camera = make_camera(viewmat=viewmat, K=K, width=size[0], height=size[1])
         entries.append(CameraEntry(name, camera))
     cloud = surface_points(settings.points, settings.seed)
-    write_file(points, _points_ply(*cloud))
+    write_file(points, points_ply(*cloud))
     text = transforms_json(entries, ply_file_path=points.name)
     write_file(cameras, text.encode())
 
 
-@cache
-def solids() -> tuple[Solid, ...]:
-    """Return the still life, the floor first."""
-
-    def turned(degrees: float) -> np.ndarray:
-        cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-        return np.asarray([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-
-    upright = turned(35) @ np.asarray([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    tilted = np.asarray([[0.8, 0, 0.6], [0, 1.0, 0], [-0.6, 0, 0.8]])
-
-    half, major, minor = 0.46, 0.46, 0.17
-    ring, ring_place = torus(major, minor), (0.72, -0.62, major + minor)
-    cube, cube_place = box((half, half, half)), (0.1, 0.9, half)
-    rows = (
-        (disc(GROUND_RADIUS), (0, 0, 0), np.eye(3), albedo.ground(GROUND_RADIUS)),
-        (sphere(0.56), (-0.85, -0.35, 0.56), tilted, albedo.bands),
-        (cube, cube_place, turned(24), albedo.crate(half)),
-        (ring, ring_place, upright, albedo.helix(major)),
-        (sphere(0.24), (-0.12, -1.22, 0.24), turned(70), albedo.rings),
-    )
-    return tuple(Solid(s, np.asarray(p, float), axes, c) for s, p, axes, c in rows)
-
-
 def _image(
-    viewmat, K, size: tuple[int, int], samples: int, background, optics: Optics
+    viewmat,
+    K,
+    size: tuple[int, int],
+    samples: int,
+    background,
+    optics: Optics,
+    scene: Sequence[Solid],
 ) -> np.ndarray:
     """Return an image [H, W, 3] float32, the mean over samples² rays a pixel."""
     if samples < 1:
@@ -210,17 +200,23 @@ def _image(
         v = (np.arange(top * samples, bottom * samples) + 0.5) / samples
         grid = [a.ravel() for a in np.meshgrid(u, v)]
         # float32 takes half the time and is exact to 1e-6 of the scene.
-        t, which, places = _hits(viewmat, K, size, grid, optics, np.float32)
+        t, which, places = _hits(scene, viewmat, K, size, grid, optics, np.float32)
         rgb = np.tile(np.asarray(background, np.float32)[:, None], len(t))
         hit = np.flatnonzero(np.isfinite(t))
-        rgb[:, hit] = _shade(places.take(hit, axis=1), which[hit])
+        rgb[:, hit] = _shade(scene, places.take(hit, axis=1), which[hit])
         rgb = rgb.reshape(3, bottom - top, samples, width, samples).mean(axis=(2, 4))
         image[top:bottom] = np.moveaxis(rgb, 0, -1)
     return image
 
 
 def _hits(
-    viewmat, K, size: tuple[int, int], pixels, optics=PINHOLE, dtype: type = np.float64
+    scene: Sequence[Solid],
+    viewmat,
+    K,
+    size: tuple[int, int],
+    pixels,
+    optics: Optics = PINHOLE,
+    dtype: type = np.float64,
 ):
     """Return depth [R], solid [R] and place [3, R] of what pixels (u, v) show.
 
@@ -233,18 +229,18 @@ def _hits(
         rotation = pose[:3, :3]
         origin = (-rotation.T @ pose[:3, 3]).astype(dtype)
         directions = (rotation.T @ local[:, rays]).astype(dtype)
-        t[rays], which[rays] = found = _first_hits(origin, directions)
+        t[rays], which[rays] = found = _first_hits(scene, origin, directions)
         finite = np.where(np.isfinite(found[0]), found[0], 0)
         places[:, rays] = origin[:, None] + finite * directions
     return t, which, places
 
 
-def _first_hits(origin: np.ndarray, directions: np.ndarray):
+def _first_hits(scene: Sequence[Solid], origin: np.ndarray, directions: np.ndarray):
     """Return (t [R], index [R]) of the first solid on each ray; t is inf if none."""
     first = np.full(directions.shape[1], np.inf, directions.dtype)
     which = np.zeros(directions.shape[1], int)
     square = dot(directions, directions)
-    for index, solid in enumerate(solids()):
+    for index, solid in enumerate(scene):
         centre, axes = (a.astype(origin.dtype) for a in (solid.centre, solid.axes))
         offset, reach = origin - centre, solid.shape.reach
         beyond = offset @ offset - reach * reach
@@ -256,17 +252,17 @@ def _first_hits(origin: np.ndarray, directions: np.ndarray):
     return first, which
 
 
-def _shade(points: np.ndarray, which: np.ndarray) -> np.ndarray:
+def _shade(scene: Sequence[Solid], points: np.ndarray, which: np.ndarray) -> np.ndarray:
     """Return colours [3, R] in [0, 1] of points on the solids ``which`` [R]."""
     base, normals = np.empty_like(points), np.empty_like(points)
-    for index, solid in enumerate(solids()):
+    for index, solid in enumerate(scene):
         mine = np.flatnonzero(which == index)
         local = solid.local(points.take(mine, axis=1))
         base[:, mine] = solid.albedo(local)
         normals[:, mine] = solid.axes.astype(local.dtype) @ solid.shape.normal(local)
     facing = np.maximum(_SUN.astype(normals.dtype) @ normals, 0)
     sun, sky = facing, 0.66 + 0.34 * normals[2]
-    for index, solid in enumerate(solids()[1:], start=1):
+    for index, solid in enumerate(scene[1:], start=1):
         other = which != index
         asked = (facing > 0) & (other if solid.shape.convex else True)
         sun = sun * _sun_visibility(solid, points, normals, asked)
@@ -328,7 +324,7 @@ def _sky_visibility(solid: Solid, points, normals, other: np.ndarray) -> np.ndar
     return sky
 
 
-def _points_ply(points: np.ndarray, colors: np.ndarray) -> bytes:
+def points_ply(points: np.ndarray, colors: np.ndarray) -> bytes:
     """Return a PLY point cloud as nerfstudio writes it: xyz, red, green, blue."""
     kinds = [(name, "<f4") for name in "xyz"]
     kinds += [(name, "u1") for name in ("red", "green", "blue")]

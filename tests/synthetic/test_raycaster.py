@@ -11,9 +11,11 @@ from gsjax.cameras.distortion import Distortion, project_points
 from gsjax.cameras.shutter import exposed_at, moment_at
 from gsjax.data.photos import load_photo
 from gsjax.synthetic import raycaster
+from gsjax.synthetic.moving import moving_solids
 from gsjax.synthetic.optics import Optics, exposures, local_rays
 from gsjax.synthetic.raycaster import DemoDatasetSettings
 from gsjax.synthetic.shapes import box, disc, sphere, torus
+from gsjax.synthetic.still_life import GROUND_RADIUS
 
 SIZE = 96, 72
 
@@ -60,7 +62,7 @@ def test_background_beyond_the_disc():
     eye = np.linalg.inv(viewmat)[:3, 3]
     along = plane - eye
     ground = eye + along * (-eye[2] / along[..., 2])[..., None]
-    beyond = np.hypot(ground[..., 0], ground[..., 1]) > raycaster.GROUND_RADIUS
+    beyond = np.hypot(ground[..., 0], ground[..., 1]) > GROUND_RADIUS
     assert not (depth[~beyond] == 0).any()
     empty = (depth == 0) & (cv2.erode((depth == 0).astype(np.uint8), np.ones((3, 3))))
     assert empty.mean() > 0.2
@@ -238,3 +240,30 @@ def test_a_camera_turns_by_its_twist(turn):
         seen = exposed_at(camera, tuple(point), moment_at(camera, jnp.float32(time)))
         wanted = Rotation.from_rotvec(time * twist[:3]).apply(point)
         np.testing.assert_allclose(seen, wanted, atol=1e-6)
+
+
+def test_the_moving_still_life_begins_as_the_still_one():
+    """But for the ball, which is elsewhere; and the lid turns about its edge."""
+    floor, globe, crate, ring, ball = raycaster.solids()
+    begun = moving_solids(0.0)
+    viewmats, K = raycaster.demo_cameras(8, *SIZE)
+    scene = floor, globe, crate, ring, ball._replace(centre=begun[-1].centre)
+    for viewmat in viewmats[::3]:
+        rgb, depth = raycaster.cast(viewmat, K, *SIZE, 2, scene=scene)
+        found, other = raycaster.cast(viewmat, K, *SIZE, 2, scene=begun)
+        np.testing.assert_allclose(other, depth, atol=1e-6)
+        # The parts of the crate shade one another a little.
+        assert np.abs(found - rgb).mean() < 0.01
+    half = float(crate.centre[2])
+    for time in (0.0, 0.4, 1.0):
+        lid = moving_solids(time)[3]
+        closed = begun[3]
+        hinge = closed.centre + closed.axes @ np.asarray([0.2, half, -0.06])
+        below = lid.centre + lid.axes @ np.asarray([0.2, half, -0.06])
+        np.testing.assert_allclose(below, hinge, atol=1e-12)
+    up = moving_solids(1.0)[3].axes[:, 2]
+    np.testing.assert_allclose(up[2], np.cos(np.radians(75)), atol=1e-12)
+    path = np.stack([moving_solids(t)[-1].centre for t in np.linspace(0, 1, 9)])
+    assert (np.diff(path[:, 0]) > 0).all()
+    turned = begun[4].axes.T @ moving_solids(1.0)[4].axes
+    np.testing.assert_allclose((np.trace(turned) - 1) / 2, np.cos(np.radians(150)))
