@@ -1,6 +1,7 @@
 """Datasets from images, cameras and points in memory."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from gsjax.cameras.distortion import distortion_of
 from gsjax.cameras.lenses import LENSES, ORTHOGRAPHIC
 from gsjax.data.dataset import finish_dataset
 from gsjax.data.types import Dataset, Photo, View, unexpected
+from gsjax.runtime.settings import as_float
 
 
 def make_dataset(
@@ -21,6 +23,7 @@ def make_dataset(
     *,
     names: Sequence[str] | None = None,
     valid: Sequence[ArrayLike] | np.ndarray | None = None,
+    times: Sequence[float] | np.ndarray | None = None,
 ) -> tuple[Dataset, list[Photo]]:
     """Return a dataset and its photos from arrays, the first two arguments of `fit`.
 
@@ -38,6 +41,7 @@ def make_dataset(
       names: V unique names of the views, by which both results are sorted; the default
         keeps the order.
       valid: V masks [H, W] bool, False where a pixel is excluded.
+      times: V times of exposure, for scenes that move (`TrainConfig.motion`).
 
     Returns:
       The dataset, and one photo per view.
@@ -49,16 +53,20 @@ def make_dataset(
     singles = _single_cameras(cameras)
     names = [f"{i:06d}" for i in range(len(images))] if names is None else list(names)
     masks = [None] * len(images) if valid is None else list(valid)
-    for what, given in {"cameras": singles, "names": names, "valid": masks}.items():
+    clock = [None] * len(images) if times is None else list(times)
+    each = {"cameras": singles, "names": names, "valid": masks, "times": clock}
+    for what, given in each.items():
         if len(given) != len(images):
             expected = f"{len(images)}, one per image"
             raise unexpected(what, expected, len(given), "pass as many")
     views, photos = [], {}
-    for name, image, camera, mask in zip(names, images, singles, masks):
+    for name, image, camera, mask, time in zip(names, images, singles, masks, clock):
         photo = photos[name] = _photo(name, np.asarray(image), camera, mask)
         pose = np.asarray(camera.viewmat, np.float64)
         size = camera.width, camera.height
-        views.append(View(name, Path(name), pose, photo.K, *size, photo.lens))
+        view = View(name, Path(name), pose, photo.K, *size, photo.lens)
+        moment = None if time is None else as_float(f"time of {name!r}", time)
+        views.append(replace(view, time=moment))
     xyz, rgb = _points(points, colors)
     dataset = finish_dataset(Dataset(Path("arrays"), "arrays", tuple(views), xyz, rgb))
     return dataset, [photos[view.name] for view in dataset.views]

@@ -11,6 +11,7 @@ import numpy as np
 from gsjax.data.extent import cameras_coincide, least_extent, near_plane
 from gsjax.data.readers import READERS
 from gsjax.data.rebase import rebase
+from gsjax.data.times import with_unit_times
 from gsjax.data.types import Dataset, Reader, ReadOptions, unexpected
 from gsjax.errors import InputError
 
@@ -43,7 +44,12 @@ def load_dataset(
       ``transforms_test.json`` (if absent, ``transforms_val.json``) of NeRF's synthetic
       scenes; another camera list is read if ``path`` is the .json file;
     - a COLMAP model in ``colmap/sparse/0``, as nerfstudio stores it;
-    - ``poses_bounds.npy`` of LLFF.
+    - ``poses_bounds.npy`` of LLFF; with a folder for each row in place of a photograph,
+      they are fixed cameras, and the folders hold their frames;
+    - ``dataset.json`` and ``metadata.json`` of Nerfies and HyperNeRF.
+
+    Times of views are those of the files, of ``times.json``, or of the frame numbers of
+    synchronised cameras; see `gsjax.data.times`.
 
     `load_photos` reads the photographs themselves. A dataset far from the origin is
     translated towards it, see `gsjax.data.rebase`.
@@ -91,17 +97,21 @@ def _reader_of(path: Path, readers: Sequence[Reader]) -> Reader:
         raise InputError(f"{path}: expected the folder of a dataset, a .json or a .npy")
     names = sorted(entry.name for entry in path.iterdir())[:12]
     raise InputError(
-        f"{path}: expected sparse/0 of COLMAP, transforms.json, transforms_train.json "
-        f"or poses_bounds.npy, got {', '.join(names) or 'an empty folder'}; for "
-        "photographs without cameras run `gsjax sfm` first"
+        f"{path}: expected sparse/0 of COLMAP, transforms.json, transforms_train.json, "
+        "poses_bounds.npy or dataset.json, got "
+        f"{', '.join(names) or 'an empty folder'}; for photographs without cameras run "
+        "`gsjax sfm` first"
     )
 
 
 def finish_dataset(dataset: Dataset) -> Dataset:
     """Return a dataset with sorted views, near planes and coordinates near the origin.
 
+    Times are from 0 to 1, see `gsjax.data.times`.
+
     Raises:
-      InputError: if there is no view, two have one name, or a position is unusable.
+      InputError: if there is no view, two have one name, a position is unusable, or
+        only some views have a time.
     """
     views = sorted(dataset.views, key=lambda view: view.name)
     if not views:
@@ -114,7 +124,7 @@ def finish_dataset(dataset: Dataset) -> Dataset:
     _check_positions(dataset, [view.name for view in views], centres)
     near = near_plane(centres, least_extent(dataset))
     views = tuple(replace(view, near=near) for view in views)
-    dataset = rebase(replace(dataset, views=views))
+    dataset = rebase(with_unit_times(replace(dataset, views=views)))
     return _with_one_position(dataset) if cameras_coincide(centres) else dataset
 
 

@@ -3,8 +3,12 @@
 A row has 17 numbers: a 3 × 5 matrix (camera → world rotation with axes down, right,
 back; the camera's position; image height, width and focal length in px), then the
 nearest and farthest depth, which are not used.
+
+A row may also be that of a fixed camera, whose frames are in a folder of its own, as in
+the Neural 3D Video dataset. The first of several cameras is then held out.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +41,9 @@ def load_llff(path: Path, options: ReadOptions | None = None) -> Dataset:
     options = options or ReadOptions()
     path = path / _FILE if path.is_dir() else path
     table = read_poses(path)
+    cameras = _camera_folders(path.parent, len(table), options)
+    if cameras:
+        return _of_fixed_cameras(path, table, cameras)
     root = image_folder(path.parent, options)
     there = root.iterdir() if root.is_dir() else ()
     files = sorted(p for p in there if is_photograph(p))
@@ -52,6 +59,43 @@ def load_llff(path: Path, options: ReadOptions | None = None) -> Dataset:
         _view(f"{path}: row {index}", row, file)
         for index, (row, file) in enumerate(zip(table, files))
     ]
+    return Dataset(path, "llff", tuple(views))
+
+
+def _camera_folders(path: Path, rows: int, options: ReadOptions) -> list[list[Path]]:
+    """Return the frames of each camera, if there is a folder of frames for each row.
+
+    The folders are in the dataset, or in its folder of photographs.
+    """
+    suffix = f"_{options.factor}" if (options.factor or 1) > 1 else ""
+    for root in (path, path / f"{options.images or 'images'}{suffix}"):
+        folders = (
+            sorted(p for p in root.iterdir() if p.is_dir()) if root.is_dir() else []
+        )
+        inner = [p / f"images{suffix}" for p in folders]
+        places = [b if b.is_dir() else a for a, b in zip(folders, inner)]
+        frames = [sorted(filter(is_photograph, p.iterdir())) for p in places]
+        frames = [found for found in frames if found]
+        if (
+            rows > 1
+            and len(frames) == rows
+            and not any(map(is_photograph, root.iterdir()))
+        ):
+            return frames
+    return []
+
+
+def _of_fixed_cameras(
+    path: Path, table: np.ndarray, cameras: list[list[Path]]
+) -> Dataset:
+    """Return the dataset of the frames of fixed cameras, in the order of the rows."""
+    views = []
+    for index, (row, frames) in enumerate(zip(table, cameras)):
+        first = _view(f"{path}: row {index}", row, frames[0])
+        split = "test" if index == 0 and len(cameras) > 2 else "train"
+        for file in frames:
+            name = file.relative_to(path.parent).as_posix()
+            views.append(replace(first, name=name, image=file, split=split))
     return Dataset(path, "llff", tuple(views))
 
 

@@ -155,7 +155,7 @@ def _view(
 ) -> View:
     lens = lens_of_frame(frame)
     K = intrinsics_of_frame(frame, size, lens)
-    return View(name, file, viewmat, K, *size, lens)
+    return View(name, file, viewmat, K, *size, lens, time=frame.number("time"))
 
 
 def _size_of_file(

@@ -69,7 +69,8 @@ class View:
       mask: file of a grey image of the same size, 0 where a pixel is excluded; or None.
       split: "train" or "test" if the dataset says so, else None.
       near: near plane: depth below which nothing is drawn, in world units.
-      time: time of the exposure in any unit, for scene models that move.
+      time: time of the exposure, for scenes that move; None if it is unknown. In
+        datasets of `load_dataset`, 0 to 1.
       twist: [6] motion during the exposure of a rolling shutter, see
         `gsjax.cameras.shutter`; None if it is unknown or there is none.
     """
@@ -84,7 +85,7 @@ class View:
     mask: Path | None = None
     split: str | None = None
     near: float = NEAR
-    time: float = 0.0
+    time: float | None = None
     twist: np.ndarray | None = None
 
     @property
@@ -107,6 +108,7 @@ class Dataset:
       points: [M, 3] float64; M may be 0.
       colors: [M, 3] uint8.
       origin: [3] float64, added to coordinates on export.
+      duration: seconds from time 0 to time 1 of the views; None if it is unknown.
     """
 
     source: Path
@@ -115,6 +117,7 @@ class Dataset:
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     colors: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    duration: float | None = None
 
 
 class ReadOptions(NamedTuple):

@@ -19,10 +19,17 @@ _JUDGED_AT = 640  # px: keeps the noise of single pixels out of the sharpness
 
 
 class Frame(NamedTuple):
-    """A frame: its index in the video, from 0, and [H, W, 3] BGR uint8."""
+    """A frame of a video.
+
+    Attributes:
+      number: its index, from 0.
+      pixels: [H, W, 3] BGR uint8.
+      seconds: its time in the video.
+    """
 
     number: int
     pixels: np.ndarray
+    seconds: float
 
 
 def sharpness(pixels: np.ndarray) -> float:
@@ -57,14 +64,15 @@ def sharpest_frames(path: Path, windows: int, max_size: int = 0) -> Iterator[Fra
 
 def _sharpest(path: Path, windows: int, total: int, max_size: int) -> Iterator[Frame]:
     best, best_score, window, index = None, -1.0, 0, -1
-    for index, pixels in enumerate(_frames(path)):
+    for index, (pixels, seconds) in enumerate(_frames(path)):
         here = min(index * windows // total, windows - 1)
         if here != window and best is not None:
             yield best
             best, best_score, window = None, -1.0, here
         score = sharpness(pixels)
         if score > best_score:
-            best, best_score = Frame(index, shrink(pixels, max_size)), score
+            best_score = score
+            best = Frame(index, shrink(pixels, max_size), seconds)
     if best is not None:
         yield best
     if index + 1 < _COMPLETE * total:
@@ -72,15 +80,16 @@ def _sharpest(path: Path, windows: int, total: int, max_size: int) -> Iterator[F
         warn(f"{path}: {what}; copy it again if it is truncated")
 
 
-def _frames(path: Path) -> Iterator[np.ndarray]:
-    """Yield all frames, rotated as the file says."""
+def _frames(path: Path) -> Iterator[tuple[np.ndarray, float]]:
+    """Yield all frames, rotated as the file says, and their times in seconds."""
+    cv2 = opencv()
     with _opened(path) as capture:
         while True:
             with captured_stderr():
                 good, pixels = capture.read()
             if not good:
                 return
-            yield pixels
+            yield pixels, capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
 
 
 def _count(path: Path) -> int:
