@@ -36,10 +36,14 @@ class SfmCommand(Command):
     frames: Annotated[int | None, integer(2)] = None
     """Number of frames to take from a video, evenly spaced, the sharpest of each
     interval; default: 100."""
+    moving: bool = False
+    """The scene of the video moves: keep the times of the frames, for gsjax train
+    --motion. COLMAP leaves out what moves by its geometric verification; it helps to
+    cover it with --masks, which are then used for matching only."""
     masks: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder of masks, black where a photograph is ignored: IMG.png or IMG.jpg.png for
     IMG.jpg, of the size of the upright photograph. Transparent pixels are ignored,
-    too."""
+    too. Of a video, with --moving: frame_000012.png, of the size in the dataset."""
     seed: Annotated[int, integer(0)] = 0
     """Seed of the random numbers."""
     overwrite: bool = False
@@ -49,6 +53,9 @@ class SfmCommand(Command):
         if 0 < self.max_size < 64:
             fault = f"expected 0 or at least 64, got {self.max_size}"
             raise UsageError(f"--max-size: {fault}")
+        if self.moving and self.source.is_dir():
+            fault = f"--moving goes with a video; {self.source} is a folder"
+            raise UsageError(f"{fault}, whose photographs have no times")
         if self.frames is not None and self.source.is_dir():
             raise UsageError(f"--frames goes with a video; {self.source} is a folder")
         from gsjax.errors import SfmError
@@ -63,6 +70,7 @@ class SfmCommand(Command):
             masks=self.masks,
             seed=self.seed,
             undistort=self.undistort,
+            moving=self.moving,
         )
         report = run_sfm(
             self.source, self.out, settings, overwrite=self.overwrite, progress=note
@@ -77,6 +85,8 @@ class SfmCommand(Command):
             f"{report.mean_reprojection_error:.2f} px, track length "
             f"{report.mean_track_length:.1f} images"
         )
+        if report.times is not None:
+            say(report.times)
         note(", ".join(f"{stage} {s:.1f} s" for stage, s in report.seconds.items()))
         if report.problem is not None:
             raise SfmError(report.problem)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsjax.data.times import TIMES_FILE, FrameTimes, write_times
 from gsjax.errors import InputError
 from gsjax.io.images import encode_png, opencv
 from gsjax.runtime.files import make_folder, temporary_in, write_file, writing
@@ -21,7 +22,7 @@ from gsjax.sfm.engine import colmap
 from gsjax.sfm.photos import PreparedPhoto, WorkFolder, read_upright
 
 # The last marks a dataset as written by this module.
-ENTRIES = ("images", "masks", "sparse", "sfm.json")
+ENTRIES = ("images", "masks", "sparse", TIMES_FILE, "sfm.json")
 JPEG_QUALITY = 95
 _ROWS_PER_STEP = 256
 
@@ -40,6 +41,7 @@ def write_dataset(
     work: WorkFolder,
     dataset: Path,
     undistort: bool = False,
+    moving: bool = False,
 ) -> None:
     """Write ``images/``, ``masks/`` and ``sparse/0/`` of the registered images.
 
@@ -48,6 +50,7 @@ def write_dataset(
         the images of the dataset.
       dataset: the folder, which exists.
       undistort: resample the photographs to ideal pinholes.
+      moving: write the times of the frames, and no masks, which hide what moves.
     """
     by_file = {photo.record.file: photo for photo in photos}
     for folder in ("images", "sparse/0"):
@@ -59,6 +62,8 @@ def write_dataset(
         undistortion = _undistortion_map(camera) if undistort else None
         for image in of_camera:
             photo = by_file[image.name]
+            if moving:
+                photo = photo._replace(mask=False)
             _write_pixels(photo, undistortion, work, dataset)
             if undistortion is not None:
                 _undistort_features(image, camera, undistortion.pinhole)
@@ -70,6 +75,11 @@ def write_dataset(
         camera.width, camera.height = pinhole.width, pinhole.height
         camera.params = pinhole.params
     model.write_binary(dataset / "sparse" / "0")
+    if moving:
+        kept = {image.name for image in images}
+        seconds = {p.name: p.seconds for p in photos if p.name in kept}
+        known = {name: s for name, s in seconds.items() if s is not None}
+        write_times(dataset / TIMES_FILE, FrameTimes(known))
 
 
 def _undistortion_map(camera: Any) -> _UndistortionMap:

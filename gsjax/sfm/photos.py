@@ -41,11 +41,13 @@ class PreparedPhoto(NamedTuple):
       name: name in the dataset; the working file is named by number.
       record: the image as COLMAP sees it.
       mask: whether it has a mask, drawn or from transparency.
+      seconds: its time, of the frame of a video; None for a photograph.
     """
 
     name: str
     record: ImageRecord
     mask: bool = False
+    seconds: float | None = None
 
 
 class WorkFolder(NamedTuple):
@@ -223,11 +225,36 @@ def prepare_photos(
             f"{len(bad)} of {len(paths)} photos cannot be read; repair or remove them: "
             + "; ".join([*bad[:5], *["…"] * (len(bad) > 5)])
         )
+    _complete_masks(made, work)
+    return made
+
+
+def add_masks(
+    frames: Sequence[PreparedPhoto], masks: Path, work: WorkFolder
+) -> list[PreparedPhoto]:
+    """Write the masks of frames of a video, by the names of these in the dataset.
+
+    Raises:
+      InputError: if there is no mask for any frame, or one does not fit.
+    """
+    drawn, made = find_masks(masks, [Path(frame.name) for frame in frames]), []
+    for frame in frames:
+        path, record = drawn.get(Path(frame.name)), frame.record
+        if path is not None:
+            size = record.height, record.width
+            mask = _read_mask(path, frame.name, size, size)
+            write_file(work.mask(record.file), encode_png(mask))
+        made.append(frame._replace(mask=path is not None))
+    _complete_masks(made, work)
+    return made
+
+
+def _complete_masks(made: Sequence[PreparedPhoto], work: WorkFolder) -> None:
+    """Write a mask for all photographs if there is one for any."""
     whole = [photo.record for photo in made if not photo.mask]
     for record in whole if len(whole) < len(made) else ():
         mask = np.full((record.height, record.width), 255, np.uint8)
         write_file(work.mask(record.file), encode_png(mask))
-    return made
 
 
 def find_masks(folder: Path, photos: Sequence[Path]) -> dict[Path, Path]:
@@ -241,7 +268,7 @@ def find_masks(folder: Path, photos: Sequence[Path]) -> dict[Path, Path]:
     found, listing = {}, cache(files_by_lowered_suffix)
     for photo in photos:
         mask = find_mask(folder, photo.name, listing)
-        if mask is not None and not mask.samefile(photo):
+        if mask is not None and not (photo.exists() and mask.samefile(photo)):
             found[photo] = mask
     if not found:
         raise InputError(

@@ -30,7 +30,13 @@ from gsjax.sfm.output import (
     staging_folder,
     write_dataset,
 )
-from gsjax.sfm.photos import PreparedPhoto, WorkFolder, find_photos, prepare_photos
+from gsjax.sfm.photos import (
+    PreparedPhoto,
+    WorkFolder,
+    add_masks,
+    find_photos,
+    prepare_photos,
+)
 
 EXHAUSTIVE_UP_TO = 60  # photos
 
@@ -54,6 +60,9 @@ class SfmSettings:
       seed: seed of COLMAP's random numbers.
       undistort: whether to resample the photos to ideal pinholes; otherwise they keep
         their pixels and lenses.
+      moving: whether the scene of a video moves: frames keep their times, and masks,
+        which may then be given for frames by their names in the dataset, are used for
+        the features only.
     """
 
     matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
@@ -64,6 +73,7 @@ class SfmSettings:
     masks: Path | None = None
     seed: int = 0
     undistort: bool = False
+    moving: bool = False
 
 
 @dataclass(frozen=True)
@@ -80,6 +90,8 @@ class SfmReport:
       cameras: number of different intrinsics.
       other_models: number of images in each smaller model, which is not written.
       seconds: duration of each phase.
+      times: with ``moving``, the times of the frames, and how what moves was left out
+        of the matching; else None.
       settings: the settings, with "auto" resolved in ``matcher``.
     """
 
@@ -94,6 +106,7 @@ class SfmReport:
     other_models: list[int]
     settings: dict[str, Any]
     seconds: dict[str, float] = field(default_factory=dict)
+    times: str | None = None
 
     @property
     def problem(self) -> str | None:
@@ -174,6 +187,7 @@ def run_sfm(
             output=str(output),
             settings=resolved,
             seconds=job.seconds,
+            times=_told_times(photos) if settings.moving else None,
             **_statistics(models, photos, job.work),
         )
         dataset = stage / "dataset"
@@ -181,11 +195,31 @@ def run_sfm(
         with job.timed("dataset"):
             verb = "undistorting" if settings.undistort else "writing"
             progress(f"{verb} {len(report.registered)} images")
-            write_dataset(models[0], photos, job.work, dataset, settings.undistort)
+            write_dataset(
+                models[0],
+                photos,
+                job.work,
+                dataset,
+                undistort=settings.undistort,
+                moving=settings.moving,
+            )
         facts = {**asdict(report), "pycolmap": colmap().__version__}
         write_json(dataset / "sfm.json", facts, indent=2)
         install_dataset(dataset, output, stage)
     return report
+
+
+def _told_times(photos: list[PreparedPhoto]) -> str:
+    """Return the times of frames, and what was left out of the matching, as a line."""
+    seconds = [photo.seconds or 0.0 for photo in photos]
+    masked = sum(photo.mask for photo in photos)
+    by = "geometric verification alone"
+    if masked:
+        by = f"the masks of {masked} of {len(photos)} frames and geometric verification"
+    return (
+        f"times of {len(photos)} frames, {min(seconds):.2f} to {max(seconds):.2f} s; "
+        f"what moves was left out by {by}"
+    )
 
 
 def _check(source: Path, settings: SfmSettings) -> None:
@@ -202,7 +236,12 @@ def _check(source: Path, settings: SfmSettings) -> None:
         )
     if settings.frames < 2:
         raise InputError(f"frames: expected at least 2, got {settings.frames}")
-    if settings.masks is not None and not source.is_dir():
+    if settings.moving and source.is_dir():
+        raise InputError(
+            f"{source}: moving needs a video, got a folder of photos, whose times are "
+            "unknown; pass the video"
+        )
+    if settings.masks is not None and not (source.is_dir() or settings.moving):
         raise InputError(
             f"{source}: masks need a folder of photos, got a video; omit the masks"
         )
@@ -226,9 +265,12 @@ def _collect(source: Path, settings: SfmSettings, job: _Job) -> list[PreparedPho
         frames = sharpest_frames(source, settings.frames, size)  # rejects other files
         job.progress(f"choosing the sharpest {settings.frames} frames")
         found = []
-        for number, pixels in frames:
+        for number, pixels, seconds in frames:
             name = f"frame_{number:06d}.jpg"
-            found.append(job.work.add(number, name, pixels, None, "video"))
+            photo = job.work.add(number, name, pixels, None, "video")
+            found.append(photo._replace(seconds=seconds))
+        if settings.masks is not None:
+            found = add_masks(found, settings.masks, job.work)
         if len(found) < 2:
             raise InputError(
                 f"{source}: only {len(found)} frames can be read, expected at least 2; "

@@ -27,6 +27,7 @@ from corner_room import (
 from gsjax import InputError
 from gsjax.cli.main import main
 from gsjax.data.dataset import load_dataset
+from gsjax.data.times import require_times
 from gsjax.data.video import sharpest_frames, sharpness
 from gsjax.sfm.mapping import deregister_implausible
 from gsjax.sfm.reconstruction import SfmSettings, run_sfm
@@ -286,12 +287,31 @@ def test_the_sharpest_frames_are_chosen(video, monkeypatch):
     assert sharpness(sharp) > 3 * sharpness(cv2.GaussianBlur(sharp, (0, 0), 2))
 
 
-def test_video_to_dataset(video, tmp_path):
-    out = tmp_path / "out"
-    assert main(["sfm", str(video), "-o", str(out), "--frames", "5"]) == 0
+def test_a_video_of_something_that_moves(video, tmp_path, capsys):
+    """Frames keep their times, and a mask hides nothing from training."""
+    out, masks = tmp_path / "out", tmp_path / "masks"
+    number = [frame.number for frame in sharpest_frames(video, 5)][2]
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, : WIDTH // 4] = 0
+    masks.mkdir()
+    cv2.imwrite(str(masks / f"frame_{number:06d}.png"), mask)
+    words = ["--frames", "5", "--moving", "--masks", str(masks)]
+    assert main(["sfm", str(video), "-o", str(out), *words]) == 0
+    told = capsys.readouterr().out
+    assert "the masks of 1 of 5 frames and geometric verification" in told
     report = json.loads((out / "sfm.json").read_text())
-    assert len(report["registered"]) == len(load_dataset(out).views) == 5
+    dataset = require_times(load_dataset(out))
+    assert len(report["registered"]) == len(dataset.views) == 5
     assert report["settings"]["matcher"] == "sequential"
+    assert not (out / "masks").exists()
+    numbers = np.asarray([int(view.name[-10:-4]) for view in dataset.views])
+    times = np.asarray([view.time for view in dataset.views])
+    np.testing.assert_allclose(times, (numbers - numbers[0]) / np.ptp(numbers))
+    rate = cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FPS)
+    assert dataset.duration is not None
+    np.testing.assert_allclose(dataset.duration * rate, np.ptp(numbers), rtol=1e-6)
+    assert main(["sfm", str(masks), "-o", str(tmp_path / "no"), "--moving"]) == 2
+    assert "photographs have no times" in capsys.readouterr().err
 
 
 def test_truncated_video(video, tmp_path, monkeypatch):
