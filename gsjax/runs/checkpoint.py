@@ -56,7 +56,7 @@ def save_checkpoint(folder: Path, state: TrainState, meta: dict[str, Any]) -> Pa
     Args:
       folder, state: the folder is created if missing.
       meta: JSON values to store: ``pair_capacity``, ``seconds`` of training, and
-        optionally the number of ``devices``.
+        optionally ``visible_capacity`` and the number of ``devices``.
 
     Raises:
       InputError: if writing fails; earlier checkpoints are kept.
@@ -120,10 +120,7 @@ def load_checkpoint(path: Path, steps: int | None = None) -> Checkpoint:
         that no run produces.
     """
     where = f"{path}: not a readable checkpoint"
-    arrays = {
-        name.removesuffix(".npy"): read_npy(f"{path}: {name}", data)
-        for name, data in _entries(path)
-    }
+    arrays = archived_arrays(path, "a checkpoint")
     if _META not in arrays:
         raise InputError(f"{where}: {_META} is missing; {_REMEDY}")
     try:
@@ -136,6 +133,7 @@ def load_checkpoint(path: Path, steps: int | None = None) -> Checkpoint:
         "step": lambda value: type(value) is int and value >= 0,
         "capacity": lambda value: type(value) is int and value in lengths,
         "pair_capacity": lambda value: type(value) is int and 0 <= value < 2**30,
+        "visible_capacity": lambda value: value is None or _is_count(value),
         "seconds": lambda value: type(value) in (int, float) and 0 <= value < math.inf,
         "arrays": lambda value: value == sorted(arrays),
         "devices": lambda value: value is None or (type(value) is int and value >= 1),
@@ -150,6 +148,10 @@ def load_checkpoint(path: Path, steps: int | None = None) -> Checkpoint:
     if fault is not None:
         raise InputError(f"{path}: damaged checkpoint: {fault}; {_REMEDY}")
     return Checkpoint(path, meta["step"], arrays, meta)
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 1 <= value < 2**31
 
 
 def _step_fault(
@@ -197,9 +199,21 @@ def _value_fault(arrays: dict[str, np.ndarray]) -> str | None:
     return None
 
 
-def _entries(path: Path) -> Iterator[tuple[str, bytes]]:
+def archived_arrays(path: Path, wanted: str) -> dict[str, np.ndarray]:
+    """Return the arrays of an uncompressed .npz by name; ``wanted`` is what it holds.
+
+    Raises:
+      InputError: if the file is missing, damaged or truncated.
+    """
+    return {
+        name.removesuffix(".npy"): read_npy(f"{path}: {name}", data)
+        for name, data in _entries(path, wanted)
+    }
+
+
+def _entries(path: Path, wanted: str) -> Iterator[tuple[str, bytes]]:
     """Yield name and bytes of each uncompressed entry with a matching checksum."""
-    with opened(path, "a checkpoint") as file:
+    with opened(path, wanted) as file:
         try:
             archive = zipfile.ZipFile(file)
             entries = archive.infolist()
@@ -215,7 +229,7 @@ def _entries(path: Path) -> Iterator[tuple[str, bytes]]:
         fault = next((fault for fault, found in faults.items() if found), None)
         if fault is not None:
             raise InputError(
-                f"{path}: not a readable checkpoint: {len(entries)} arrays, {fault}, "
+                f"{path}: not {wanted}: {len(entries)} arrays, {fault}, "
                 f"of {declared} bytes in a file of {size}; {_REMEDY}"
             )
         for entry in entries:

@@ -12,9 +12,17 @@ from gsjax.densify.mcmc import McmcSettings
 from gsjax.errors import InputError
 from gsjax.raster.types import RasterConfig
 from gsjax.train.config import Level, TrainConfig
+from gsjax.train.motion.settings import FieldSettings, TrajectorySettings
 from gsjax.train.optimiser import Rates
 
 _MAX_INTEGER = 1 << 63
+# Settings that are dataclasses themselves.
+_PARTS = {
+    "adaptive": AdaptiveSettings,
+    "mcmc": McmcSettings,
+    "field": FieldSettings,
+    "trajectories": TrajectorySettings,
+}
 _MALFORMED = (ValueError, TypeError, LookupError, AttributeError, RecursionError)
 
 
@@ -42,7 +50,7 @@ def _config(data: Any) -> TrainConfig:
             rates = [*rates, *Rates()[len(rates) :]]
         check_types(Rates, dict(zip(Rates._fields, rates, strict=True)))
         data["rates"] = Rates(tuple(rates[0]), *rates[1:])
-    for name, kind in (("adaptive", AdaptiveSettings), ("mcmc", McmcSettings)):
+    for name, kind in _PARTS.items():
         if name in data:
             check_types(kind, data[name])
             data[name] = kind(**data[name])

@@ -178,6 +178,7 @@ def _last_checkpoint(
     return ResumePoint(
         state=restore(found, template),
         pair_capacity=int(found.meta["pair_capacity"]),
+        visible_capacity=found.meta.get("visible_capacity"),
         step=found.step,
         seconds=float(found.meta["seconds"]),
         devices=found.meta.get("devices"),
@@ -230,9 +231,14 @@ def _fit_and_save(
     with session.hooks() as hooks:
         if watch is not None:
             hooks.state = watch(dataset, photos, config)
-        capacity = start.pair_capacity
         result = fit(
-            dataset, photos, config, state=state, pair_capacity=capacity, hooks=hooks
+            dataset,
+            photos,
+            config,
+            state=state,
+            pair_capacity=start.pair_capacity,
+            visible_capacity=start.visible_capacity,
+            hooks=hooks,
         )
         gaussians = int(np.sum(result.gaussians.active))
         if result.dropped:

@@ -1,4 +1,4 @@
-"""Capacities of a run: numbers of slots and pairs, and when they grow.
+"""Capacities of a run: slots, visible Gaussians and pairs, and when they grow.
 
 A larger pair capacity recompiles most of a step, more slots recompile all of it. Spare
 capacity is chosen to minimise recompilation plus the cost of idle slots.
@@ -31,6 +31,9 @@ _PAIR_MARGIN, _GROWING_MARGINS = 1.5, (2.5, 4.0)
 _PER_GROWTH = 1.2  # pairs grow faster than Gaussians, and only some views are probed
 _WIDENING = 2.0  # initial Gaussians are narrower than trained ones
 _MAX_PROBED_VIEWS = 6
+# Spare room for visible Gaussians, and the share of the slots up to which it is worth
+# a limit.
+_VISIBLE_MARGIN, _WORTH = 1.5, 0.5
 # Minimum number of pairs per tile that the compositor needs.
 _PAIRS_OF_TILE = 7
 
@@ -51,13 +54,13 @@ def _price() -> _Price:
     return _ON_CPU if on_cpu() else _ON_ACCELERATOR
 
 
-def pairs_for(
+def capacities_for(
     state: TrainState, frames: Frames, config: TrainConfig, schedule: EditSchedule
-) -> int:
-    """Return a pair capacity with a margin for these photographs.
+) -> tuple[int, int | None]:
+    """Return pair and visible capacities with a margin for these photographs.
 
-    Before the first step it is estimated on the host, since counting would compile a
-    program.
+    Before the first step pairs are estimated on the host, since counting would compile
+    a program, and there is room for all Gaussians.
 
     Raises:
       CapacityError: as `with_margin` and `count_demand`.
@@ -67,10 +70,11 @@ def pairs_for(
     raster = config.raster.replace(visible_capacity=gaussians.capacity)
     spheres = as_spheres(gaussians)
 
-    def count(camera: Camera) -> int:
+    def count(camera: Camera) -> tuple[int, int]:
         if begins:
-            return int(expected_pairs(spheres, camera, raster))
-        return int(count_demand(gaussians, camera, raster).capacity)
+            return int(expected_pairs(spheres, camera, raster)), gaussians.capacity
+        found = count_demand(gaussians, camera, raster)
+        return int(found.capacity), int(found.visible)
 
     tiles = [-(-side // raster.tile_size) for side in frames.pixels.shape[1:3]]
     least = _PAIRS_OF_TILE * int(np.prod(tiles)) if begins else 1
@@ -80,7 +84,9 @@ def pairs_for(
         count(jax.tree.map(lambda a, i=index: a[i], cameras))
         for index in np.unique(probed.astype(int))
     ]
-    return with_margin(max(least, *wanted), state, config, schedule)
+    pairs, visible = (max(numbers) for numbers in zip(*wanted))
+    pairs = with_margin(max(least, pairs), state, config, schedule)
+    return pairs, visible_room(visible, gaussians.capacity)
 
 
 Spheres = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -147,6 +153,15 @@ def with_margin(
         likely = _PER_GROWTH * growth * (1 if step else _WIDENING)
         margin = max(margin, min(likely, growing))
     return min(capacity_bucket(int(margin * wanted)), 2**30 - 1)
+
+
+def visible_room(most: int, slots: int) -> int | None:
+    """Return a visible capacity for views that show at most ``most`` of the slots.
+
+    None is room for all slots, where less would hardly save time.
+    """
+    room = capacity_bucket(int(_VISIBLE_MARGIN * most))
+    return room if room <= _WORTH * slots else None
 
 
 def _count(state: TrainState) -> int:

@@ -1,7 +1,8 @@
 """Settings of a training run, and its presets."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from itertools import pairwise
 
 from gsjax.cameras.shutter import SHUTTERS
@@ -12,6 +13,7 @@ from gsjax.densify.types import Strategy
 from gsjax.errors import InputError
 from gsjax.raster.types import PRIMITIVES, RasterConfig
 from gsjax.runtime.settings import as_float, convert_fields, require_ranges
+from gsjax.train.motion.settings import MOTIONS, FieldSettings, TrajectorySettings
 from gsjax.train.optimiser import Rates
 
 STRATEGIES = ("adaptive", "mcmc")
@@ -21,6 +23,7 @@ _CHOICES = {
     "background": ("auto", "black", "white", "random"),
     "initial": ("auto", "points", "dense", "random"),
     "primitive": (None, *PRIMITIVES),
+    "motion": MOTIONS,
 }
 
 
@@ -118,6 +121,9 @@ class TrainConfig:
         ``raster``. Surfels start in the planes of neighbouring points.
       mip: train with the filters of Mip-Splatting against aliasing: the 3D filter of
         `gsjax.train.mip`, and `mip_raster` in place of the dilation. For ellipsoids.
+      motion: "none" for a scene that stands still; "field" or "trajectories" for one
+        that moves, see `gsjax.train.motion`, with the settings of that name. The views
+        need times.
       normal_weight, distortion_weight, entropy_weight: weights of
         `gsjax.train.geometry_loss`: of `normal_consistency`, of `distortion_term`, and
         of `opacity_entropy`; 0 leaves a term out.
@@ -145,8 +151,8 @@ class TrainConfig:
     batch: int = 1
     seed: int = 0
     strategy: str = "adaptive"
-    adaptive: AdaptiveSettings = field(default_factory=AdaptiveSettings)
-    mcmc: McmcSettings = field(default_factory=McmcSettings)
+    adaptive: AdaptiveSettings = dataclass_field(default_factory=AdaptiveSettings)
+    mcmc: McmcSettings = dataclass_field(default_factory=McmcSettings)
     max_size: int | None = 1600
     levels: tuple[Level, ...] = (Level(0.0, 1),)
     sh_degree: int = 3
@@ -157,7 +163,7 @@ class TrainConfig:
     initial_count: int = 100_000
     dense_count: int = 100_000
     max_initial: int = 1_000_000
-    rates: Rates = field(default_factory=Rates)
+    rates: Rates = dataclass_field(default_factory=Rates)
     undistort: bool = False
     shutter: str = "global"
     refine_poses: bool = False
@@ -166,6 +172,11 @@ class TrainConfig:
     exposure: bool = False
     primitive: str | None = None
     mip: bool = False
+    motion: str = "none"
+    field: FieldSettings = dataclass_field(default_factory=FieldSettings)
+    trajectories: TrajectorySettings = dataclass_field(
+        default_factory=TrajectorySettings
+    )
     normal_weight: float = 0.0
     normal_from: float = 0.25
     distortion_weight: float = 0.0
@@ -213,6 +224,7 @@ class TrainConfig:
             "sh_degree": "[0, 4]",
             "refine_shutter": (rolling, "False for a global shutter"),
             "mip": (not surfels, "False for surfels"),
+            "motion": (self.motion == "none" or not self.mip, "none with mip"),
             "ssim_weight": "[0, 1]",
             "rates' means": (means, "two positive numbers, or equal ones"),
             "rates' cooling": (0 < rates.cooling <= 1, "cooling in (0, 1]"),

@@ -19,6 +19,7 @@ from gsjax.raster.types import RasterConfig
 from gsjax.runtime.devices import replicate
 from gsjax.train.frames import with_shutter_of
 from gsjax.train.metrics import psnr, ssim
+from gsjax.train.motion.scene import Scene, gaussians_at
 
 LPIPS_NOTE = "unavailable: its weights are not part of gsjax"
 
@@ -65,7 +66,7 @@ _scores = jax.jit(lambda *arrays: (psnr(*arrays), ssim(*arrays)))
 
 
 def evaluate(
-    gaussians: Gaussians,
+    scene: Scene,
     views: Sequence[View],
     photos: Sequence[Photo],
     *,
@@ -79,7 +80,7 @@ def evaluate(
     compiled for all.
 
     Args:
-      gaussians: the scene.
+      scene: Gaussians, or a scene that moves, which is shown at the time of each view.
       views: V views.
       photos: V photographs, in the order of the views.
       config: render settings.
@@ -96,11 +97,11 @@ def evaluate(
     """
     config = config or RasterConfig()
     # Independent of the number of active Gaussians, so that a run compiles once.
-    visible = config.visible_capacity or gaussians.capacity
+    visible = config.visible_capacity or scene.capacity
     changes = {"outputs": ("rgb", "depth"), "absgrad": False}
     config = config.replace(**changes, visible_capacity=visible)
     behind = np.asarray(background, np.float32)
-    gaussians = replicate(gaussians)
+    still = replicate(scene) if isinstance(scene, Gaussians) else None
     for view, photo in zip(views, photos, strict=True):
         photo.require(view.name)
     sizes = {photo.pixels.shape[:2] for photo in photos}
@@ -121,6 +122,7 @@ def evaluate(
         camera = jax.tree.map(lambda a, i=index: a[i], cameras)
         size = jnp.asarray([cols, rows]) if len(sizes) > 1 else None
         camera = camera.replace(visible_size=size)
+        gaussians = still or replicate(gaussians_at(scene, view.time))
         result = render_exact(gaussians, camera, config, jnp.asarray(behind))
         assert result.rgb is not None
         image = np.clip(np.asarray(result.rgb, np.float32)[:rows, :cols], 0, 1)

@@ -31,7 +31,7 @@ class Frames:
       camera: batch of V cameras.
       size: [V, 2] int32, width and height of each photograph, which occupies the upper
         left corner; None if all photographs have the size of the frame.
-      time: [V] `gsjax.data.types.View.time`.
+      time: [V] `gsjax.data.types.View.time`; 0 where it is unknown.
     """
 
     pixels: Array
@@ -115,7 +115,7 @@ def make_frames(
         "pixels": pixels,
         "valid": None if valid.all() else valid,
         "size": None if (size == (width, height)).all() else size,
-        "time": np.asarray([view.time for view in views], np.float32),
+        "time": np.asarray([view.time or 0.0 for view in views], np.float32),
     }
     return to_device(Frames(camera=camera, **fields))
 
@@ -174,6 +174,23 @@ def views_of_step(seed: int, step: int, batch: int, views: int) -> np.ndarray:
 
     first = int(step) * batch  # step may be an array
     return np.asarray([one(first + i) for i in range(batch)], np.int32)
+
+
+def views_until(
+    seed: int, step: int, batch: int, times: np.ndarray, last: float
+) -> np.ndarray:
+    """Return random views [B] int32 of a step from those up to a time.
+
+    Like `views_of_step`, it depends on the arguments only.
+
+    Args:
+      seed, step, batch: as `views_of_step`.
+      times: [V] of all views.
+      last: latest time; the views of the first time are always drawn from.
+    """
+    allowed = np.flatnonzero(times <= max(last, times.min()))
+    rng = np.random.default_rng((seed, int(step), len(times)))
+    return rng.choice(allowed, batch).astype(np.int32)
 
 
 def draw(frames: Frames, view: Array) -> Batch:

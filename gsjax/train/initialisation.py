@@ -119,12 +119,17 @@ def _jitted_state(setup: Setup, gaussians: Gaussians, views: int) -> TrainState:
     return jax.jit(lambda scene: setup_state(setup, scene, views))(gaussians)
 
 
+def blank_gaussians(capacity: int, sh_degree: int) -> Gaussians:
+    """Return inactive slots, as a template."""
+    numbers = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1}
+    fields = {name: np.zeros((0, count)) for name, count in numbers.items()}
+    sh = np.zeros((0, num_bases(sh_degree), 3))
+    return make_gaussians(**fields, sh=sh, capacity=capacity)
+
+
 def empty_state(
     config: TrainConfig, extent: float, views: int, capacity: int
 ) -> TrainState:
     """Return a state of the given capacity, as a template for reading a checkpoint."""
-    numbers = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacities": 1}
-    fields = {name: np.zeros((0, count)) for name, count in numbers.items()}
-    sh = np.zeros((0, num_bases(config.sh_degree), 3))
-    gaussians = make_gaussians(**fields, sh=sh, capacity=capacity)
+    gaussians = blank_gaussians(capacity, config.sh_degree)
     return _jitted_state(make_setup(config, extent), gaussians, views)

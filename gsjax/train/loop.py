@@ -11,23 +11,25 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsjax.data.extent import extent_of
+from gsjax.data.times import require_times
 from gsjax.data.types import Dataset, Photo
 from gsjax.densify.types import Strategy
 from gsjax.errors import CapacityError
 from gsjax.gaussians import Gaussians
 from gsjax.raster.types import RasterConfig
 from gsjax.train.capacity_policy import (
-    pairs_for,
+    capacities_for,
+    visible_room,
     with_margin,
     with_slots,
     with_slots_ahead,
 )
 from gsjax.train.config import TrainConfig
-from gsjax.train.frames import Frames, make_frames, views_of_step
+from gsjax.train.frames import Frames, make_frames, views_of_step, views_until
 from gsjax.train.health import Health, check_photos
 from gsjax.train.initialisation import add_dense_points, initial_state
 from gsjax.train.losses import LossTerm
-from gsjax.train.models import Model, scene_of
+from gsjax.train.models import IDENTITY, Model, scene_of
 from gsjax.train.state import Metrics, Setup, TrainState, make_setup
 from gsjax.train.step import refresh_table
 from gsjax.train.step_compiler import CompiledStep, StepCompiler
@@ -44,6 +46,7 @@ class Progress(NamedTuple):
       compilations: number of sizes that a step was compiled for.
       divisor: divisor of the image size.
       capacity: number of slots.
+      visible_capacity: room for visible Gaussians; None for all slots.
     """
 
     metrics: Metrics
@@ -52,6 +55,7 @@ class Progress(NamedTuple):
     compilations: int
     divisor: int
     capacity: int
+    visible_capacity: int | None = None
 
     def record(self) -> dict[str, float | int | bool]:
         """Return plain numbers, for a line of `metrics.jsonl`."""
@@ -60,7 +64,7 @@ class Progress(NamedTuple):
             seconds=round(self.seconds, 3),
             compile_seconds=round(self.compile_seconds, 3),
         )._asdict()
-        del rest["metrics"]
+        del rest["metrics"], rest["visible_capacity"]
         return {**out, **rest}
 
 
@@ -98,7 +102,8 @@ class FitResult:
       progress: of the last step; None if no step was made.
       dropped: number of Gaussians removed afterwards by `TrainConfig.prune_invisible`.
       scene: the Gaussians to render, if a scene model makes them from the canonical
-        ones of the state.
+        ones of the state; of a scene that moves, those at time 0.
+      model: the scene model.
     """
 
     state: TrainState
@@ -106,11 +111,16 @@ class FitResult:
     progress: Progress | None = None
     dropped: int = 0
     scene: Gaussians | None = None
+    model: Model = IDENTITY
 
     @property
     def gaussians(self) -> Gaussians:
         """The scene to render; with a model that depends on the view, canonical."""
         return self.state.gaussians if self.scene is None else self.scene
+
+    def at(self, time: float) -> Gaussians:
+        """Return the scene at a time, as of the views; for a model that moves."""
+        return scene_of(self.model, self.state.params, time)
 
 
 def fit(
@@ -120,6 +130,7 @@ def fit(
     *,
     state: TrainState | None = None,
     pair_capacity: int | None = None,
+    visible_capacity: int | None = None,
     hooks: Hooks | None = None,
     strategy: Strategy | None = None,
     loss_terms: Sequence[LossTerm] = (),
@@ -137,7 +148,7 @@ def fit(
       config: settings.
       state: state to resume from, of the same settings, strategy and model; default
         `initial_state`.
-      pair_capacity: of the run that ``state`` is from.
+      pair_capacity, visible_capacity: of the run that ``state`` is from.
       hooks: callbacks.
       strategy: density control; default that of ``config``.
       loss_terms: terms added to the photometric loss and the strategy's penalty.
@@ -148,13 +159,16 @@ def fit(
 
     Raises:
       InputError: if photographs and views do not match, all pixels are masked, or there
-        are no initial Gaussians.
+        are no initial Gaussians; or if the scene is to move and the views have no
+        times.
       CapacityError: if a view needs more pairs than can be addressed, or a step more
         memory than is available. Before, the state is passed to ``hooks.checkpoint``.
       DivergedError: if 50 of the last 100 steps, or half of a short run, had non-finite
         numbers or a PSNR below 0 dB; or if no Gaussian was in view for 50 steps.
     """
     check_photos(dataset, photos)
+    if config.motion != "none":
+        dataset = require_times(dataset)
     parts = {"strategy": strategy, "loss_terms": loss_terms, "model": model}
     setup = make_setup(config, extent_of(dataset), **parts)
     run = _Run(dataset, photos, setup, hooks or Hooks())
@@ -166,7 +180,8 @@ def fit(
     else:
         state = _copied(state)  # steps donate their state, not that of the caller
     try:
-        return run.loop(run.compiler.place(state), pair_capacity)
+        capacities = pair_capacity, visible_capacity
+        return run.loop(run.compiler.place(state), *capacities)
     finally:
         run.compiler.close()
 
@@ -190,7 +205,9 @@ class _Run:
         self.compiler = StepCompiler(self.setup, self.hooks.phase)
         self.refreshes = refresh_table(self.setup)
 
-    def loop(self, state: TrainState, pair_capacity: int | None) -> FitResult:
+    def loop(
+        self, state: TrainState, pair_capacity: int | None, visible: int | None
+    ) -> FitResult:
         """Run all remaining steps."""
         config, schedule = self.config, self.setup.schedule
         step, pairs = int(state.step), pair_capacity
@@ -200,14 +217,7 @@ class _Run:
             finer = config.divisor(step) != divisor
             if frames is None or finer:
                 divisor = config.divisor(step)
-                frames = make_frames(
-                    self.dataset.views,
-                    self.photos,
-                    divisor,
-                    shutter=config.shutter,
-                    distorting=config.refine_intrinsics,
-                )
-                frames = self.compiler.place(frames)
+                frames = self.frames(divisor)
             try:
                 if finer:
                     state = with_slots_ahead(state, config, schedule)
@@ -216,16 +226,17 @@ class _Run:
                     state = self.compiler.refresh(state, frames)
                 if pairs is None or finer:
                     shown = state.replace(gaussians=self.scene(state))
-                    pairs = pairs_for(shown, frames, config, schedule)
-                raster = config.raster.replace(pair_capacity=pairs)
+                    pairs, visible = capacities_for(shown, frames, config, schedule)
+                raster = config.raster.replace(
+                    pair_capacity=pairs, visible_capacity=visible
+                )
                 program = self.program(state, frames, raster)
                 self.compile_seconds += time.perf_counter() - begun
-                view = views_of_step(config.seed, step, config.batch, frames.count)
+                view = self.views(step)
                 state, metrics = program(state, frames, view)
                 if metrics.overflowed:
                     state = with_slots_ahead(state, config, schedule)
-                    wanted = int(metrics.pair_capacity)
-                    pairs = with_margin(wanted, state, config, schedule)
+                    pairs, visible = self.room(state, metrics, pairs)
                     continue
             except CapacityError:
                 if progress is not None and not self.health.bad:
@@ -239,6 +250,7 @@ class _Run:
                 compilations=len(self.compiler.by_sizes),
                 divisor=divisor,
                 capacity=state.gaussians.capacity,
+                visible_capacity=visible,
             )
             self.health.check(metrics)
             self.hooks.step(progress)
@@ -246,8 +258,8 @@ class _Run:
             slots = state.gaussians.capacity
             state = with_slots(state, int(metrics.wanted), config, schedule)
             if state.gaussians.capacity > slots:  # recompiles: with more pairs too
-                wanted = int(metrics.pair_capacity)
-                pairs = max(pairs, with_margin(wanted, state, config, schedule))
+                pairs, visible = self.room(state, metrics, pairs)
+                progress = progress._replace(visible_capacity=visible)
             self.report(state, pairs, progress)
             if self.hooks.stop():
                 break
@@ -255,7 +267,42 @@ class _Run:
         if step >= config.steps and frames is not None and config.prune_invisible:
             state, dropped = prune_invisible(state, frames, self.setup)
         scene = self.scene(state)
-        return FitResult(state, pairs or 0, progress, dropped, scene)
+        model = self.setup.model
+        return FitResult(state, pairs or 0, progress, dropped, scene, model)
+
+    def views(self, step: int) -> np.ndarray:
+        """Return the views [B] of a step."""
+        config, until = self.config, self.setup.model.until
+        last = 1.0 if until is None else until(step / config.steps)
+        views = self.dataset.views
+        if last >= 1:
+            return views_of_step(config.seed, step, config.batch, len(views))
+        times = np.asarray([view.time or 0.0 for view in views])
+        return views_until(config.seed, step, config.batch, times, last)
+
+    def frames(self, divisor: int) -> Frames:
+        """Return the photographs, downscaled by a divisor, on the devices."""
+        frames = make_frames(
+            self.dataset.views,
+            self.photos,
+            divisor,
+            shutter=self.config.shutter,
+            distorting=self.config.refine_intrinsics,
+        )
+        return self.compiler.place(frames)
+
+    def room(
+        self, state: TrainState, metrics: Metrics, pairs: int
+    ) -> tuple[int, int | None]:
+        """Return pair and visible capacities for what a step needed; pairs only grow.
+
+        Raises:
+          CapacityError: as `with_margin`.
+        """
+        config, schedule = self.config, self.setup.schedule
+        wanted, seen = int(metrics.pair_capacity), int(metrics.visible)
+        pairs = max(pairs, with_margin(wanted, state, config, schedule))
+        return pairs, visible_room(seen, state.gaussians.capacity)
 
     def scene(self, state: TrainState) -> Gaussians:
         """Return the Gaussians that files and viewers show."""

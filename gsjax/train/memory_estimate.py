@@ -2,10 +2,13 @@
 
 import math
 from collections.abc import Sequence
+from functools import cache
+from typing import Any
 
 import jax
 import numpy as np
 
+from gsjax.cameras.camera import USUAL_EXTENT
 from gsjax.data.photos import size_within, stored_size
 from gsjax.data.types import Dataset, View
 from gsjax.errors import InputError
@@ -17,7 +20,8 @@ from gsjax.runtime.console import note
 from gsjax.runtime.memory import Estimate, available, require, size_text
 from gsjax.train.capacity_policy import slots_for
 from gsjax.train.config import TrainConfig
-from gsjax.train.state import TrainState
+from gsjax.train.initialisation import blank_gaussians
+from gsjax.train.state import TrainState, model_of
 
 Size = tuple[int, int]  # width and height, px
 
@@ -32,7 +36,21 @@ _PAIRS_RANDOM = 3.3e-4
 def state_bytes(slots: int, config: TrainConfig) -> int:
     """Return the bytes of parameters, both moments, statistics and mask."""
     numbers = 11 + 3 * num_bases(config.sh_degree)
-    return slots * (4 * (3 * numbers + 3) + 1)
+    each, shared = _model_numbers(config)
+    return slots * (4 * (3 * numbers + each + 3) + 1) + 4 * shared
+
+
+@cache
+def _model_numbers(config: TrainConfig) -> tuple[int, int]:
+    """Return what a scene model adds, with moments: numbers per slot, and others."""
+    model = model_of(config, USUAL_EXTENT)
+    two = jax.eval_shape(lambda: model.init(blank_gaussians(2, config.sh_degree)))
+
+    def numbers(tree: Any) -> int:
+        return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
+
+    each = (3 * numbers(two.slots) + numbers(two.buffers)) // 2
+    return each, 3 * numbers(two.shared)
 
 
 def step_estimate(

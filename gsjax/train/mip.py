@@ -22,7 +22,7 @@ from gsjax.train.models import Model, ModelParams, Refresh, SceneParams
 
 Array = jax.Array
 
-_VARIANCE = 0.2  # of the filter, in squares of the interval between samples
+VARIANCE = 0.2  # of the filter, in squares of the interval between samples
 _MARGIN = 0.15  # of the image, beyond each side
 NEAREST = 0.2  # smallest depth of a Gaussian that a camera samples
 
@@ -60,7 +60,7 @@ def filter_radii(
     least, _ = lax.scan(visit, unseen, lax.stop_gradient(cameras))
     seen = active & (least < jnp.inf)
     largest = jnp.max(jnp.where(seen, least, 0), initial=0)
-    return math.sqrt(_VARIANCE) * jnp.where(seen, least, largest)
+    return math.sqrt(VARIANCE) * jnp.where(seen, least, largest)
 
 
 def _sampling_interval(
@@ -148,7 +148,10 @@ def mip_model(extent: float = USUAL_EXTENT) -> Model:
     def scene(params: SceneParams) -> Gaussians:
         return smoothed(params.gaussians, params.model.buffers["radii"])
 
-    def update(params: SceneParams, cameras: Camera) -> dict[str, Array]:
+    def update(
+        params: SceneParams, cameras: Camera, fraction: Array
+    ) -> dict[str, Array]:
+        del fraction
         gaussians = params.gaussians
         means, active = gaussians.params.means, gaussians.active
         return {"radii": filter_radii(means, active, cameras, nearest)}

@@ -9,6 +9,8 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+from optax import GradientTransformation
 
 from gsjax.cameras.camera import Camera
 from gsjax.errors import InputError
@@ -67,14 +69,15 @@ class Refresh(NamedTuple):
     """Values of a model that are recomputed from the scene now and then.
 
     Attributes:
-      update: ``(SceneParams, batch of V cameras) → ModelParams.buffers``. The cameras
-        are those of all training views, as refined so far.
+      update: ``(SceneParams, batch of V cameras, fraction []) → ModelParams.buffers``.
+        The cameras are those of all training views, as refined so far; the fraction is
+        that of the run that is completed.
       every: interval in steps. It is also called before the first step, after each
         edit of the slots and when the resolution changes; otherwise not in the last
         ``every`` steps.
     """
 
-    update: Callable[[SceneParams, Camera], Any]
+    update: Callable[[SceneParams, Camera, Array], Any]
     every: int = 100
 
 
@@ -86,19 +89,28 @@ class Model(NamedTuple):
       apply: ``(SceneParams, ViewInfo) → Gaussians`` to render, N slots in the same
         order; differentiable.
       rates: learning rate of each parameter, by its name at the top level of
-        `ModelParams.slots` or `.shared` (dicts, NamedTuples): a constant, or a function
-        of the completed fraction of the run.
+        `ModelParams.slots` or `.shared` (dicts, NamedTuples): a constant, a function
+        of the completed fraction of the run, or a transformation of Adam's updates,
+        such as `gsjax.train.optimiser.scale_by_rate`.
       scene: ``SceneParams → Gaussians`` of all views, for models whose ``apply`` does
         not depend on the view, or None. Views of a step are then rendered together, and
         files and viewers show these Gaussians instead of the canonical ones.
       refresh: how ``ModelParams.buffers`` are recomputed, or None.
+      at: ``(SceneParams, time []) → Gaussians`` for models whose ``apply`` depends on
+        the time of the view alone, or None.
+      penalty: ``(SceneParams, ViewInfo) → []`` added to the loss of a view, or None.
+      until: completed fraction of the run → share of the time, 0 to 1, from whose views
+        `gsjax.fit` draws, or None for all. Called on the host.
     """
 
     init: Callable[[Gaussians], ModelParams]
     apply: Callable[[SceneParams, ViewInfo], Gaussians]
-    rates: Mapping[str, Rate] = MappingProxyType({})
+    rates: Mapping[str, Rate | GradientTransformation] = MappingProxyType({})
     scene: Callable[[SceneParams], Gaussians] | None = None
     refresh: Refresh | None = None
+    at: Callable[[SceneParams, Array], Gaussians] | None = None
+    penalty: Callable[[SceneParams, ViewInfo], Array] | None = None
+    until: Callable[[float], float] | None = None
 
 
 # Renders the Gaussians as they are.
@@ -109,11 +121,13 @@ IDENTITY = Model(
 )
 
 
-def scene_of(model: Model, params: SceneParams) -> Gaussians:
-    """Return the Gaussians that files and viewers show; N slots.
+def scene_of(model: Model, params: SceneParams, time: float = 0.0) -> Gaussians:
+    """Return the Gaussians that files and viewers show at a time; N slots.
 
-    They are the canonical ones if the model depends on the view.
+    They are the canonical ones if the model depends on more than the time.
     """
+    if model.at is not None:
+        return model.at(params, jnp.asarray(time))
     return params.gaussians if model.scene is None else model.scene(params)
 
 

@@ -67,18 +67,34 @@ def cooling_factor(rates: Rates, fraction: Array) -> Array:
     return rates.cooling ** jnp.maximum(late, 0)
 
 
-def scale_by_rate(rate: Rate) -> optax.GradientTransformationExtraArgs:
-    """Return a transformation that multiplies updates by the negative learning rate."""
-    return _scale(lambda fraction, _: rate(fraction) if callable(rate) else rate)
+def scale_by_rate(
+    rate: Rate, shrinkage: float = 0.0
+) -> optax.GradientTransformationExtraArgs:
+    """Return a transformation that multiplies updates by the negative learning rate.
+
+    Args:
+      rate: the learning rate.
+      shrinkage: pull towards 0, added to the update before. Adam's updates are about
+        the mean of a gradient over its spread, so numbers stay at 0 unless that exceeds
+        the shrinkage: L1 regularisation that is decoupled from the gradient, as weight
+        decay is in Loshchilov and Hutter, "Decoupled Weight Decay Regularization",
+        2019.
+    """
+    return _scale(
+        lambda fraction, _: rate(fraction) if callable(rate) else rate, shrinkage
+    )
 
 
 def _scale(
-    rate_of: Callable[[Array, Array], Array | float],
+    rate_of: Callable[[Array, Array], Array | float], shrinkage: float = 0.0
 ) -> optax.GradientTransformationExtraArgs:
     """Return `scale_by_rate` for a rate by fraction and update."""
 
     def update(updates, state, params=None, **extra):
-        del params
+        if shrinkage:
+            updates = jax.tree.map(
+                lambda u, p: u + shrinkage * jnp.sign(p), updates, params
+            )
         rates = jax.tree.map(lambda u: rate_of(extra["fraction"], u), updates)
         scaled = jax.tree.map(lambda u, r: -(u * r).astype(u.dtype), updates, rates)
         return scaled, state

@@ -38,6 +38,8 @@ from gsjax.train.models import (
     init_model,
     scene_of,
 )
+from gsjax.train.motion.registry import motion_model
+from gsjax.train.motion.scene import MovingScene, Scene
 from gsjax.train.optimiser import (
     Rate,
     Rates,
@@ -141,13 +143,15 @@ def make_setup(
     """Return the parts of a training step; arguments as `make_train_step`.
 
     Raises:
-      InputError: if there is a ``model`` beside that of `TrainConfig.mip`.
+      InputError: if there is a ``model`` beside that of `TrainConfig.mip` or
+        ``motion``.
     """
     strategy = strategy or config.make_strategy(extent)
-    if config.mip and model is not None:
+    if model is not None and (config.mip or config.motion != "none"):
+        name = "mip" if config.mip else "motion"
         raise InputError(
-            "model: expected None with TrainConfig.mip, which is a model itself; call "
-            "gsjax.train.mip.smoothed in the model, or leave out mip"
+            f"model: expected None with TrainConfig.{name}, which is a model itself; "
+            f"leave out {name}, or call its functions in the model"
         )
     model = model or model_of(config, extent)
     rates: dict[str, Rate] = {
@@ -158,9 +162,11 @@ def make_setup(
         "twists": _cooled(config.shutter_rate),
         "exposures": config.exposure_rate,
     }
-    rates |= {f"model.{name}": rate for name, rate in model.rates.items()}
     table = gaussian_rates(config.rates, extent)
     table |= {name: scale_by_rate(rate) for name, rate in rates.items()}
+    for name, rate in model.rates.items():
+        plain = not isinstance(rate, optax.GradientTransformation)
+        table[f"model.{name}"] = scale_by_rate(rate) if plain else rate
     return Setup(
         config=config,
         extent=extent,
@@ -174,12 +180,21 @@ def make_setup(
 
 def model_of(config: TrainConfig, extent: float) -> Model:
     """Return the scene model of settings, for a scene extent in world units."""
-    return mip_model(extent) if config.mip else IDENTITY
+    return motion_model(config, extent) or (
+        mip_model(extent) if config.mip else IDENTITY
+    )
 
 
 def shown_gaussians(state: TrainState, config: TrainConfig) -> Gaussians:
     """Return the Gaussians of a run of `TrainConfig` as files and viewers show them."""
     return scene_of(model_of(config, USUAL_EXTENT), state.params)
+
+
+def shown_scene(state: TrainState, config: TrainConfig) -> Scene:
+    """Return the scene of a run: Gaussians, or with a motion those of all times."""
+    if config.motion == "none":
+        return shown_gaussians(state, config)
+    return MovingScene(config.motion, state.params)
 
 
 def init_state(
@@ -326,8 +341,11 @@ class Metrics(NamedTuple):
       wanted: number of Gaussians if the capacity had sufficed; 0 without an edit.
       pairs: (tile, Gaussian) pairs of all views of this step.
       pair_capacity: largest pair capacity that a view requires.
-      overflowed: True if the pairs exceeded the capacity. Nothing was changed and the
-        step does not count: increase `RasterConfig.pair_capacity` and repeat it.
+      visible: largest number of Gaussians that a view shows; more of those of a scene
+        that moves exist at other times.
+      overflowed: True if pairs or visible Gaussians exceeded their capacity. Nothing
+        was changed and the step does not count: increase `RasterConfig.pair_capacity`
+        or ``visible_capacity`` and repeat it.
       finite: False if the loss or a gradient was not finite, in which case only
         ``step`` changed, or if a parameter would have become non-finite, in which case
         it was kept.
@@ -340,6 +358,7 @@ class Metrics(NamedTuple):
     wanted: Array
     pairs: Array
     pair_capacity: Array
+    visible: Array
     overflowed: Array
     finite: Array
 
@@ -354,7 +373,7 @@ class Gradients(NamedTuple):
       by_probe: [B, N, 2] gradient by the projected means, 1/px; see `Observation`.
       radii: [B, N] px.
       size: [B, 2] int32, width and height of the photographs.
-      pairs, pair_capacity, overflowed: [] as in `Metrics`.
+      pairs, pair_capacity, visible, overflowed: [] as in `Metrics`.
     """
 
     loss: Array
@@ -366,6 +385,7 @@ class Gradients(NamedTuple):
     size: Array
     pairs: Array
     pair_capacity: Array
+    visible: Array
     overflowed: Array
 
 
@@ -385,5 +405,6 @@ def gradients_like(state: TrainState, batch: int) -> Gradients:
         size=shape((batch, 2), jnp.int32),
         pairs=shape((), jnp.int32),
         pair_capacity=shape((), jnp.int32),
+        visible=shape((), jnp.int32),
         overflowed=shape((), jnp.bool_),
     )

@@ -84,7 +84,7 @@ def make_train_step(
       extent: scene extent in world units.
       strategy, loss_terms, model: as `gsjax.fit` takes them.
       raster: render settings with a sufficient `pair_capacity`; default
-        ``config.raster``. Its ``visible_capacity`` is ignored.
+        ``config.raster``.
       cameras: batch of the cameras of all V views, for models with `Model.refresh`.
 
     Returns:
@@ -141,11 +141,9 @@ def refresh_table(setup: Setup) -> np.ndarray:
 def step_raster(setup: Setup, raster: RasterConfig | None = None) -> RasterConfig:
     """Return the render settings of a step: with the outputs that its loss uses."""
     needed = {"rgb", *(name for term in setup.loss_terms for name in term.outputs)}
-    # Room for all slots: `Metrics` does not report how many are visible.
     return (raster or setup.config.raster).replace(
         outputs=tuple(name for name in OUTPUTS if name in needed),
         absgrad=setup.strategy.absgrad,
-        visible_capacity=None,
     )
 
 
@@ -155,6 +153,9 @@ def _differentiate(setup: Setup, raster: RasterConfig | None):
     terms = [photometric_term(config.ssim_weight, device_count(raster))]
     if penalty is not None:
         terms.append(LossTerm("penalty", lambda *inputs: penalty(inputs[2].gaussians)))
+    regulariser = setup.model.penalty
+    if regulariser is not None:
+        terms.append(_of_views("model", regulariser))
     terms += setup.loss_terms
 
     def objective(trained, probe, state: TrainState, batch: Batch):
@@ -194,6 +195,7 @@ def _differentiate(setup: Setup, raster: RasterConfig | None):
             size=size,
             pairs=view.demand.pairs,
             pair_capacity=view.demand.capacity,
+            visible=view.demand.visible,
             overflowed=view.overflowed,
         )
         # Cameras may be float64 while the parameters are float32.
@@ -201,6 +203,25 @@ def _differentiate(setup: Setup, raster: RasterConfig | None):
         return jax.tree.map(lambda a, b: a.astype(b.dtype), found, like)
 
     return differentiate
+
+
+def _of_views(
+    name: str, function: Callable[[SceneParams, ViewInfo], Array]
+) -> LossTerm:
+    """Return the mean over the views of a step as a loss term."""
+
+    def mean(render: Render, batch: Batch, params: SceneParams) -> Array:
+        del render
+        each = jax.vmap(lambda view: function(params, view))
+        return jnp.mean(each(_views(batch)))
+
+    return LossTerm(name, mean)
+
+
+def _views(batch: Batch) -> ViewInfo:
+    """Return the views [B] of a batch."""
+    time = jnp.zeros(batch.view.shape) if batch.time is None else batch.time
+    return ViewInfo(batch.view, time)
 
 
 def _render(
@@ -241,12 +262,11 @@ def _render_model(
     if setup.model.scene is not None:
         return draw(setup.model.scene(params), *arguments)
     count = batch.view.shape[0]
-    time = jnp.zeros(count) if batch.time is None else batch.time
 
     def one(inputs) -> Render:
         return draw(setup.model.apply(params, inputs[0]), *inputs[1])
 
-    views = ViewInfo(batch.view, time), arguments
+    views = _views(batch), arguments
     if count == 1:
         found = one(jax.tree.map(lambda a: a[0], views))
         found = jax.tree.map(lambda a: a[None], found)
@@ -291,6 +311,7 @@ def _advance(setup: Setup):
             wanted=jnp.int32(0),
             pairs=found.pairs,
             pair_capacity=found.pair_capacity,
+            visible=found.visible,
             overflowed=found.overflowed,
             finite=finite & good,
         )
@@ -325,7 +346,8 @@ def _refresh(setup: Setup):
     def recompute(state: TrainState, cameras: Camera) -> TrainState:
         index = jnp.arange(cameras.viewmat.shape[0])
         cameras = refine_camera(cameras, state.refinement, index, setup.extent)
-        found = refresh.update(state.params, cameras)
+        fraction = state.step / setup.config.steps
+        found = refresh.update(state.params, cameras, fraction)
         like = state.model.buffers
         buffers = jax.tree.map(lambda a, b: a.astype(b.dtype), found, like)
         return state.replace(model=state.model._replace(buffers=buffers))

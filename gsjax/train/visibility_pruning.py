@@ -42,13 +42,14 @@ def prune_invisible(
         outputs=("alpha",), num_size_buckets=1, absgrad=False, visible_capacity=None
     )
     visible = jnp.zeros(state.gaussians.capacity, bool)
+    apply = jax.jit(setup.model.apply)
     for view in range(frames.count):
         index = jnp.full(1, view, jnp.int32)
         arrays = frames.camera, frames.size, frames.time
         camera, size, time = jax.tree.map(lambda a, i=index: a[i], arrays)
         camera = refine_camera(camera, state.refinement, index, setup.extent)
         time = jnp.zeros(1) if time is None else time
-        gaussians = setup.model.apply(state.params, ViewInfo(index[0], time[0]))
+        gaussians = apply(state.params, ViewInfo(index[0], time[0]))
         visible |= _in_view(gaussians, camera, size, raster)
     active = state.gaussians.active
     dropped = int(jnp.sum(active & ~visible))

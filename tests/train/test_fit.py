@@ -35,6 +35,7 @@ from gsjax.train.capacity_policy import (
     expected_pairs,
     grow_state,
     slots_for,
+    visible_room,
     with_margin,
 )
 from gsjax.train.config import Level, TrainConfig
@@ -192,7 +193,7 @@ def test_a_failed_state_is_not_saved_before_a_capacity_error(monkeypatch):
     def fail(health, _):
         health.bad = 1
 
-    monkeypatch.setattr(fit_module, "pairs_for", too_many)
+    monkeypatch.setattr(fit_module, "capacities_for", too_many)
     monkeypatch.setattr(fit_module.Health, "check", fail)
     with pytest.raises(CapacityError, match="too many"):
         run(config, log, state=begun.state, pair_capacity=begun.pair_capacity)
@@ -319,3 +320,10 @@ def test_pair_capacities_have_a_margin_and_a_limit():
     assert with_margin(2**30 - 9, settled, CONFIG, schedule) == 2**30 - 1
     with pytest.raises(CapacityError, match="2,147,483,647 or more"):
         with_margin(2**31 - 1, settled, CONFIG, schedule)
+
+
+def test_room_for_visible_gaussians_follows_what_is_seen():
+    """It is limited where a view shows few of the slots, and grows as pairs do."""
+    assert visible_room(1000, 2000) is None
+    assert visible_room(100, 100_000) == 1024
+    assert visible_room(10_000, 100_000) == 16384
