@@ -9,7 +9,7 @@ from gsjax.data.transforms import load_near_transforms, load_transforms
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
 from gsjax.runs.folder import load_settings, load_split, run_files, with_refined_cameras
-from gsjax.runs.scene_source import is_run, open_scene_source
+from gsjax.runs.scene_source import is_run, note_moment, open_scene_source
 from gsjax.runs.trajectories import view_entries
 from gsjax.synthetic.stress_scenes import STRESS_SCENES, StressScene
 
@@ -51,6 +51,7 @@ def open_bench_scene(
     if built_in:
         scene = STRESS_SCENES[name]()
     else:
+        note_moment(path)
         source = open_scene_source(path, origin=origin)
         gaussians = source.load()
         camera = camera or facing_camera(gaussians, *(size or _SIZE))

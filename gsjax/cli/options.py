@@ -128,6 +128,18 @@ def parse_budget(text: str) -> float:
     return parts[0] / parts[1]
 
 
+def _times(text: str) -> tuple[float, float]:
+    """Return the times of a text like ``0.4`` or ``0:1``; a single one twice."""
+    parts = text.split(":")
+    good = len(parts) in (1, 2) and all(re.fullmatch(_NUMBER, p) for p in parts)
+    times = [float(part) for part in parts] if good else [-1.0]
+    if not all(0 <= time <= 1 for time in times):
+        expected = "a time from 0 to 1, or two like 0:1"
+        raise ValueError(f"expected {expected}, got {text!r}")
+    return times[0], times[-1]
+
+
+Times = Annotated[tuple[float, float] | None, option("T|T0:T1", _times)]
 Size = Annotated[tuple[int, int], option("WxH", _size, "{0[0]}x{0[1]}".format)]
 OptionalSize = Annotated[tuple[int, int] | None, option("WxH", _size)]
 Kinds = Annotated[tuple[str, ...], option("KINDS", _kinds, ",".join)]

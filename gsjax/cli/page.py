@@ -50,6 +50,7 @@ def write_scene_page(
     drawn, remedy = f"{page.drawn:,}{of_all} Gaussians", "gsjax view --max-gaussians"
     if page.triangles:
         drawn, remedy = f"{page.triangles:,} triangles", "gsjax mesh --triangles"
-    say(f"{path}  {drawn}{cameras}, {size}")
+    moments = f", {page.moments} moments" if page.moments else ""
+    say(f"{path}  {drawn}{moments}{cameras}, {size}")
     if page.size > _LARGE_PAGE:
         note(f"a page this large opens slowly; reduce it with {remedy}")

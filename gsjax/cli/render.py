@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from gsjax.cli.common import HeavyCommand, UsageError, start_jax
-from gsjax.cli.options import Budget, Color, Kinds, OptionalSize, integer, real
+from gsjax.cli.options import Budget, Color, Kinds, OptionalSize, Times, integer, real
 from gsjax.runtime.console import note, say
 
 _MOVIES = (".mp4", ".webm", ".webp", ".gif")
@@ -35,6 +35,13 @@ class RenderCommand(HeavyCommand):
     """Number of frames of orbit, spiral and interpolate; default: 120."""
     fps: Annotated[float | None, real(0.1, 1000)] = None
     """Frames per second of a movie; default: 24."""
+    time: Times = None
+    """Time of a scene that moves, from 0 to 1; or of the first and last frame, such as
+    0:1. Default: that of each view, and 0:1 along a path."""
+    freeze_time: bool = False
+    """Stop the time at the first of --time: only the camera moves."""
+    freeze_camera: bool = False
+    """Stop the camera at its first place: only the time runs."""
     npy: bool = False
     """Also write each image as a float32 .npy, linear and unclipped."""
     preset: Literal["compat", "accurate", "fast"] | None = None
@@ -81,6 +88,7 @@ class RenderCommand(HeavyCommand):
         source = open_scene_source(
             self.scene, origin=origin, raster=raster, background=self.background
         )._replace(budget=self.budget)
+        entries = self._timed(entries, moving=source.moving is not None)
         if self.order is not None:
             ordered = source.config.replace(order=self.order, occlusion=False)
             source = source._replace(config=ordered)
@@ -99,6 +107,30 @@ class RenderCommand(HeavyCommand):
                 overwrite=self.overwrite,
             )  # fmt: skip
         return 0
+
+    def _timed(self, entries: list, *, moving: bool) -> list:
+        """Return the cameras with their times; reject options for still scenes."""
+        from gsjax.runs.trajectories import with_times
+
+        asked = {
+            "--time": self.time is not None,
+            "--freeze-time": self.freeze_time,
+            "--freeze-camera": self.freeze_camera,
+        }
+        option = next((name for name, given in asked.items() if given), None)
+        if option is not None and not moving:
+            fault = f"{option} goes with a scene that moves (gsjax train --motion)"
+            raise UsageError(f"{self.scene}: {fault}")
+        if not moving:
+            return entries
+        if self.freeze_time and self.freeze_camera:
+            raise UsageError("--freeze-time and --freeze-camera exclude each other")
+        return with_times(
+            entries,
+            self.time,
+            freeze_time=self.freeze_time,
+            freeze_camera=self.freeze_camera,
+        )
 
     def _entries(self, path: str):
         """Return the cameras with their names, and the origin of their coordinates."""
@@ -140,7 +172,7 @@ class RenderCommand(HeavyCommand):
             raise UsageError(f"--path {path}: there are no {path} views; pass another")
         if self.size is not None:
             entries = [
-                entry._replace(camera=resize_camera(entry.camera, *self.size))
+                entry.replace(camera=resize_camera(entry.camera, *self.size))
                 for entry in entries
             ]
         return entries, dataset.origin

@@ -67,6 +67,10 @@ class TrainCommand(HeavyCommand):
     """Train with the filters of Mip-Splatting, for renders at other sizes and
     distances: a 3D filter by the resolution of the photographs, and a smaller filter of
     the image that keeps the brightness."""
+    motion: Literal["none", "field", "trajectories"] = "none"
+    """Train a scene that moves, from views with times: a field in space and time that
+    moves all Gaussians, for motions that resemble those nearby; or a trajectory and a
+    lifetime for each Gaussian, which is faster and suits several cameras."""
     absgrad: bool = False
     """Split by absolute gradients in the adaptive strategy: sharper, with more
     Gaussians."""
@@ -137,6 +141,8 @@ class TrainCommand(HeavyCommand):
         if self.mip and (self.antialias or self.primitive != "ellipsoid"):
             other = "--antialias" if self.antialias else "--primitive"
             raise UsageError(f"--mip and {other} exclude each other")
+        if self.mip and self.motion != "none":
+            raise UsageError("--mip and --motion exclude each other")
         if self.viewer_port is not None and not self.viewer:
             raise UsageError("--viewer-port goes with --viewer")
         start_jax()
@@ -312,6 +318,7 @@ class TrainCommand(HeavyCommand):
             undistort=self.undistort,
             exposure=self.exposure,
             mip=self.mip,
+            motion=self.motion,
             **self._geometry(),
             prune_invisible=not self.keep_unseen,
         )

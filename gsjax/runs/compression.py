@@ -26,7 +26,12 @@ from gsjax.runs import folder as run_folder
 from gsjax.runs.export import scene_mode
 from gsjax.runs.mesh import sphere_cameras
 from gsjax.runs.refined_cameras import refine_photos
-from gsjax.runs.scene_source import is_run, open_scene_source, splat_file
+from gsjax.runs.scene_source import (
+    is_run,
+    note_moment,
+    open_scene_source,
+    splat_file,
+)
 from gsjax.runs.trajectories import view_entries
 from gsjax.runtime.console import note
 from gsjax.runtime.files import make_folder, reject_existing
@@ -133,7 +138,13 @@ def compression_inputs(source: Path, cameras: Path | None = None) -> Compression
       InputError: as `load_split`, if the run has no scene yet, or if the file cannot be
         read.
     """
-    return _of_run(source) if is_run(source) else _of_file(source, cameras)
+    if not is_run(source):
+        return _of_file(source, cameras)
+    if run_folder.load_settings(source).config.motion == "none":
+        return _of_run(source)
+    # Photographs of other times do not show the moment that is compressed.
+    note_moment(source)
+    return _of_file(splat_file(source), cameras)
 
 
 def _of_run(path: Path) -> CompressionInputs:
@@ -166,9 +177,18 @@ def _of_run(path: Path) -> CompressionInputs:
 
 
 def run_finetuning(path: Path, steps: int) -> Finetuning:
-    """Return the training views of a run, as refined, with their photographs."""
+    """Return the training views of a run, as refined, with their photographs.
+
+    Raises:
+      InputError: if the scene of the run moves.
+    """
     settings = run_folder.load_settings(path)
     files, config = run_folder.run_files(path), settings.config
+    if config.motion != "none":
+        raise InputError(
+            f"{path}: the scene moves, and its photographs show other times than the "
+            "moment that is compressed; leave out --finetune"
+        )
     given = run_folder.load_split(settings)
     split = run_folder.with_refined_cameras(given, files)
     before, dataset = given.views("train"), subset(split.dataset, split.train)

@@ -28,7 +28,7 @@ class DemoFiles(NamedTuple):
 
     dataset: Path
     run: Path
-    turntable: Path
+    movie: Path
 
 
 class DemoSettings(NamedTuple):
@@ -80,7 +80,7 @@ def run_demo(
     images.opencv()
     files = demo_files(folder)
     photos = files.dataset / "transforms.json"
-    outputs = [photos, run_files(files.run).config, files.turntable]
+    outputs = [photos, run_files(files.run).config, files.movie]
     reject_existing(outputs, overwrite, "another folder with -o")
     size = f"{settings.width} × {settings.height} px"
     note(f"rendering {settings.photos} photographs of {size}")
@@ -95,5 +95,5 @@ def run_demo(
         source = open_scene_source(files.run, origin=dataset.origin)
         entries = path_entries(dataset, camera_paths.orbit, frames=_TURN_FRAMES)
         fps = _TURN_FRAMES / _TURN_SECONDS
-        render_movie(source, entries, files.turntable, fps=fps, overwrite=overwrite)
+        render_movie(source, entries, files.movie, fps=fps, overwrite=overwrite)
     return files, result

@@ -10,17 +10,18 @@ from gsjax.data.image_files import short_names
 from gsjax.data.photos import load_photos
 from gsjax.data.types import Dataset, Photo
 from gsjax.errors import InputError
-from gsjax.gaussians import Gaussians
 from gsjax.io import images
 from gsjax.plots.contact_sheets import SheetRow, comparison
 from gsjax.runs import folder as run_folder
 from gsjax.runs.folder import RunFiles
+from gsjax.runs.moving import load_moving
 from gsjax.runs.refined_cameras import refine_photos
 from gsjax.runtime.files import finite_or_none, make_folder, write_file, write_json
 from gsjax.train.config import TrainConfig
 from gsjax.train.evaluation import Summary, ViewResult, evaluate, summarise
 from gsjax.train.health import has_valid_pixels
 from gsjax.train.loop import subset
+from gsjax.train.motion.scene import Scene, gaussians_at
 
 PREVIEWED = 4  # views in a preview
 
@@ -42,8 +43,11 @@ def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
         other = "train" if which == "test" else "test"
         fault = f"the run has no {which} views; pass --views {other}"
         raise InputError(f"{folder}: {fault}")
-    splat = run_folder.require_splat(folder)
-    gaussians = run_folder.load_scene(splat, split.dataset.origin)
+    splat, origin = run_folder.require_splat(folder), split.dataset.origin
+    if settings.config.motion == "none":
+        scene = run_folder.load_scene(splat, origin)
+    else:
+        scene = load_moving(files.motion, settings.config, origin)
     dataset = subset(split.dataset, chosen)
     before = subset(given.dataset, chosen).views
     config = settings.config
@@ -52,16 +56,16 @@ def evaluate_run(folder: Path, *, which: str = "test") -> Summary:
     if not any(map(has_valid_pixels, photos)):
         fault = f"all {len(photos)} {which} views are fully masked"
         raise InputError(f"{folder}: {fault}; hold out others (--test-images)")
-    return write_evaluation(files, config, gaussians, dataset, photos, which)
+    return write_evaluation(files, config, scene, dataset, photos, which)
 
 
 def evaluate_views(
-    gaussians: Gaussians, dataset: Dataset, photos: list[Photo], config: TrainConfig
+    scene: Scene, dataset: Dataset, photos: list[Photo], config: TrainConfig
 ) -> Iterator[ViewResult]:
     """Evaluate all views of ``dataset`` with the render settings of a run."""
     background = run_folder.background_color(config)
     return evaluate(
-        gaussians,
+        scene,
         dataset.views,
         photos,
         config=config.raster,
@@ -73,7 +77,7 @@ def evaluate_views(
 def write_evaluation(
     files: RunFiles,
     config: TrainConfig,
-    gaussians: Gaussians,
+    scene: Scene,
     dataset: Dataset,
     photos: list[Photo],
     which: str,
@@ -82,7 +86,7 @@ def write_evaluation(
     make_folder(files.renders)
     start, results = time.perf_counter(), []
     names = short_names([view.name for view in dataset.views])
-    for name, result in zip(names, evaluate_views(gaussians, dataset, photos, config)):
+    for name, result in zip(names, evaluate_views(scene, dataset, photos, config)):
         path = files.renders / f"{name}.png"
         make_folder(path.parent)
         write_file(path, images.encode_png(images.to_8_bit(result.render)))
@@ -104,7 +108,7 @@ def write_evaluation(
         "psnr": finite_or_none(summary.psnr),
         "ssim": finite_or_none(summary.ssim),
         "seconds": round(time.perf_counter() - start, 3),
-        "gaussians": int(np.sum(gaussians.active)),
+        "gaussians": int(np.sum(gaussians_at(scene, 0.0).active)),
         "each": each,
     }
     write_json(files.eval, content)

@@ -4,6 +4,7 @@ RUN/config.json       settings, dataset and split
 RUN/metrics.jsonl     one line per step: loss, PSNR, counts, seconds, compilations
 RUN/checkpoints/      the two latest
 RUN/splat.ply         the scene, in the coordinates of the dataset
+RUN/motion.npz        with a motion: the scene at all times; splat.ply is that at time 0
 RUN/cameras.json      refined cameras, if any
 RUN/eval.json         PSNR and SSIM of the held-out views
 RUN/held_out.jsonl    the same by step, with --eval-every
@@ -26,6 +27,7 @@ import numpy as np
 
 from gsjax.data.dataset import is_dataset, load_dataset
 from gsjax.data.splits import split_views
+from gsjax.data.times import require_times
 from gsjax.data.types import Dataset, View
 from gsjax.errors import InputError
 from gsjax.gaussians import Gaussians
@@ -75,6 +77,7 @@ class RunFiles(NamedTuple):
     metrics: Path
     checkpoints: Path
     splat: Path
+    motion: Path
     cameras: Path
     eval: Path
     held_out: Path
@@ -104,7 +107,8 @@ class SplitDataset(NamedTuple):
 def run_files(folder: Path, which: str = "test") -> RunFiles:
     """Return the paths inside ``folder``; ``which`` views were evaluated."""
     suffix = "" if which == "test" else f"_{which}"
-    names = ("config.json", "metrics.jsonl", "checkpoints", "splat.ply", "cameras.json")
+    names = ("config.json", "metrics.jsonl", "checkpoints", "splat.ply")
+    names += ("motion.npz", "cameras.json")
     names += (f"eval{suffix}.json", "held_out.jsonl", f"renders{suffix}")
     names += (f"preview{suffix}.png", "curves.png")
     return RunFiles(*(folder / name for name in names))
@@ -127,6 +131,8 @@ def load_split(settings: RunSettings) -> SplitDataset:
     dataset = load_dataset(
         settings.dataset, images=images, skip_missing=skip, factor=factor
     )
+    if settings.config.motion != "none":
+        dataset = require_times(dataset)
     if not settings.trained:
         split = split_views(dataset.views, settings.every, settings.test_images)
         return SplitDataset(dataset, *split)

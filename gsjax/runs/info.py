@@ -52,6 +52,7 @@ def describe_run(folder: Path) -> dict[str, Any]:
         "background": config.background,
         "shutter": config.shutter,
         "mip": config.mip,
+        "motion": config.motion,
         "undistort": config.undistort,
         "evaluation": _evaluation(files.eval),
     }
@@ -84,6 +85,8 @@ def run_text(path: str, facts: dict[str, Any]) -> str:
         rows["shutter"] = facts["shutter"].replace("_", " ")
     if facts["mip"]:
         rows["filters"] = "Mip-Splatting"
+    if facts["motion"] != "none":
+        rows["motion"] = facts["motion"]
     quality = facts["evaluation"]
     if quality is not None:
         views = f"{quality['views']} {_VIEWS[quality['which']]} views"

@@ -28,7 +28,12 @@ from gsjax.mesh.surface import (
 )
 from gsjax.raster.types import RasterConfig
 from gsjax.runs import folder as run_folder
-from gsjax.runs.scene_source import SceneSource, is_run, open_scene_source
+from gsjax.runs.scene_source import (
+    SceneSource,
+    is_run,
+    note_moment,
+    open_scene_source,
+)
 from gsjax.runs.trajectories import view_entries
 from gsjax.runs.views import prepare_render, render_cameras
 from gsjax.runtime.console import note, progress
@@ -234,6 +239,7 @@ def _opened(path: Path, *, with_views: bool):
     """Return cameras, the origin of the coordinates of training, and the scene."""
     if not is_run(path):
         return [], np.zeros(3), open_scene_source(path)
+    note_moment(path)
     run = run_folder.load_settings(path)
     files = run_folder.run_files(path)
     split = run_folder.with_refined_cameras(run_folder.load_split(run), files)

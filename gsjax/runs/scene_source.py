@@ -11,7 +11,10 @@ from gsjax.gaussians import Gaussians
 from gsjax.io.formats import render_mode, scene_path
 from gsjax.raster.types import RasterConfig
 from gsjax.runs import folder as run_folder
+from gsjax.runs.moving import load_moving
+from gsjax.runtime.console import note
 from gsjax.train.config import mip_raster
+from gsjax.train.motion.scene import MovingScene
 
 # Render settings by their names on the command line.
 RASTER_PRESETS = {
@@ -29,12 +32,15 @@ class SceneSource(NamedTuple):
       config: render settings.
       background: RGB background.
       budget: maximum error of rgb to choose settings for, or None to use ``config``.
+      moving: reads the scene at all times, if it moves. What ``load`` reads is then
+        that at time 0.
     """
 
     load: Callable[[], Gaussians]
     config: RasterConfig
     background: tuple[float, ...]
     budget: float | None = None
+    moving: Callable[[], MovingScene] | None = None
 
 
 def free_view_config(trained: RasterConfig) -> RasterConfig:
@@ -43,6 +49,15 @@ def free_view_config(trained: RasterConfig) -> RasterConfig:
     A free view may be filled by Gaussians right before the camera, where it pays.
     """
     return trained.replace(occlusion=not trained.sorts_pixels)
+
+
+def note_moment(path: Path) -> None:
+    """Say that of a run that moves, one moment is used."""
+    if is_run(path) and run_folder.load_settings(path).config.motion != "none":
+        note(
+            f"{path}: the scene moves; its moment at time 0 is used (for another: "
+            "gsjax export --time)"
+        )
 
 
 def is_run(path: Path) -> bool:
@@ -103,17 +118,21 @@ def open_scene_source(
     Raises:
       InputError: as `splat_file`.
     """
-    config, behind = RasterConfig.compat(), (0.0, 0.0, 0.0)
+    config, behind, moving = RasterConfig.compat(), (0.0, 0.0, 0.0), None
+    origin = np.zeros(3) if origin is None else origin
     if is_run(path):
         trained = run_folder.load_settings(path).config
         config, behind = trained.raster, run_folder.background_color(trained)
         config = free_view_config(config)
+        if trained.motion != "none":
+            file = run_folder.run_files(path).motion
+            moving = partial(load_moving, file, trained, origin)
     else:
         config = file_raster(path)
     if raster is not None:  # a scene is learnt for one way of drawing
         names = "dilation", "antialias", "primitive"
         config = raster.replace(**{name: getattr(config, name) for name in names})
     splat = splat_file(path)
-    origin = np.zeros(3) if origin is None else origin
     reader = partial(run_folder.load_scene, splat, origin)
-    return SceneSource(reader, config, behind if background is None else background)
+    behind = behind if background is None else background
+    return SceneSource(reader, config, behind, moving=moving)

@@ -20,6 +20,7 @@ from gsjax.runs.evaluation import (
 )
 from gsjax.runs.folder import RunFiles, SplitDataset, save_scene
 from gsjax.runs.history import JsonlLog
+from gsjax.runs.moving import save_moving
 from gsjax.runs.refined_cameras import refine_dataset, refine_photos, save_cameras
 from gsjax.runs.report import Reporter
 from gsjax.runtime.console import decibels, deferred_interrupt, note
@@ -28,7 +29,8 @@ from gsjax.train.config import TrainConfig
 from gsjax.train.evaluation import Summary, summarise
 from gsjax.train.health import has_valid_pixels
 from gsjax.train.loop import FitResult, Hooks, Progress, subset
-from gsjax.train.state import TrainState, shown_gaussians
+from gsjax.train.motion.scene import MovingScene
+from gsjax.train.state import TrainState, shown_gaussians, shown_scene
 
 
 class ResumePoint(NamedTuple):
@@ -36,7 +38,7 @@ class ResumePoint(NamedTuple):
 
     Attributes:
       state: state to start from; None to initialise from points.
-      pair_capacity: pair capacity at that step.
+      pair_capacity, visible_capacity: capacities at that step.
       step: steps done.
       seconds: seconds of training so far.
       devices: number of devices that wrote the checkpoint, if known.
@@ -44,6 +46,7 @@ class ResumePoint(NamedTuple):
 
     state: TrainState | None = None
     pair_capacity: int | None = None
+    visible_capacity: int | None = None
     step: int = 0
     seconds: float = 0.0
     devices: int | None = None
@@ -83,6 +86,8 @@ class Session:
         self.metrics.write()
         self.measured.write()
         meta = {"pair_capacity": pair_capacity, "seconds": self.seconds(progress)}
+        visible = progress.visible_capacity if progress else None
+        meta["visible_capacity"] = visible
         meta["devices"] = device_count(self.config.raster)
         path = save_checkpoint(self.files.checkpoints, state, meta)
         for folder in (path.parent, self.files.config.parent):
@@ -119,13 +124,17 @@ class Session:
         files, dataset = self.files, self.split.dataset
         scene = shown_gaussians(state, self.config)
         save_scene(files.splat, scene, dataset, self.config)
+        moving = shown_scene(state, self.config)
+        if isinstance(moving, MovingScene):
+            save_moving(files.motion, moving, dataset.origin)
         if (cameras := self.cameras(state)) is not dataset:
             save_cameras(files.cameras, cameras)
 
     def evaluate(self, result: FitResult, photos: list[Photo]) -> Summary | None:
         """Evaluate the held-out views; without any, write only the preview."""
         config, split, files = self.config, self.split, self.files
-        cameras, scene = self.cameras(result.state), result.gaussians
+        cameras = self.cameras(result.state)
+        scene = shown_scene(result.state, config)
         dataset, held_out = self.held_out(cameras)
         if not any(map(has_valid_pixels, held_out)):
             if held_out:
@@ -166,7 +175,7 @@ class Session:
         def measure(state: TrainState, progress: Progress) -> None:
             dataset, photos = self.held_out(self.cameras(state))
             if any(map(has_valid_pixels, photos)):
-                scene = shown_gaussians(state, self.config)
+                scene = shown_scene(state, self.config)
                 results = evaluate_views(scene, dataset, photos, self.config)
                 summary = summarise(list(results))
                 self.log_held_out(state, summary, self.seconds(progress))

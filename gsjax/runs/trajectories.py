@@ -30,7 +30,7 @@ from gsjax.io import images
 from gsjax.io.movies import check_movie, write_movie
 from gsjax.plots.contact_sheets import depth_colors
 from gsjax.runs.scene_source import SceneSource
-from gsjax.runs.views import prepare_render, render_cameras
+from gsjax.runs.views import render_entries
 from gsjax.runtime.console import note, progress
 from gsjax.train.frames import twists_of
 
@@ -86,13 +86,13 @@ def view_entries(
     if undistort:
         scaled = [replace(view, lens=None) for view in scaled]
     entries = [
-        _entry(n, view.viewmat, view, view.near, view.lens)
+        _entry(n, view.viewmat, view, view.near, view.lens).replace(time=view.time)
         for n, view in zip(flat, scaled)
     ]
     if not SHUTTERS[shutter].rolling:
         return entries
     return [
-        entry._replace(camera=with_shutter(entry.camera, shutter, twist=twist))
+        entry.replace(camera=with_shutter(entry.camera, shutter, twist=twist))
         for entry, twist in zip(entries, twists_of(scaled))
     ]
 
@@ -144,6 +144,33 @@ def _ideal_intrinsics(views: Sequence[View]) -> camera_paths.Intrinsics:
     return found._replace(K=K)
 
 
+def with_times(
+    entries: Sequence[CameraEntry],
+    span: tuple[float, float] | None = None,
+    *,
+    freeze_time: bool = False,
+    freeze_camera: bool = False,
+) -> list[CameraEntry]:
+    """Return cameras with the times at which they show a scene that moves.
+
+    Args:
+      entries: F cameras, in the order of the frames.
+      span: times of the first and the last frame. By default cameras keep their times,
+        and if any has none, time runs from 0 to 1.
+      freeze_time: show all frames at the time of the first.
+      freeze_camera: show all frames from the place of the first.
+    """
+    times = [entry.time for entry in entries]
+    if span is not None or any(time is None for time in times):
+        times = np.linspace(*(span or (0.0, 1.0)), len(entries)).tolist()
+    if freeze_time:
+        times = times[:1] * len(entries)
+    timed = [entry.replace(time=time) for entry, time in zip(entries, times)]
+    if freeze_camera:
+        timed = [entry.replace(camera=entries[0].camera) for entry in timed]
+    return timed
+
+
 def render_movie(
     source: SceneSource,
     entries: Sequence[CameraEntry],
@@ -180,10 +207,8 @@ def render_movie(
 def _frames(
     source: SceneSource, entries: Sequence[CameraEntry], kind: str
 ) -> Iterator[np.ndarray]:
-    cameras = [entry.camera for entry in entries]
-    gaussians, config = prepare_render(source, cameras, (kind,))
+    renders, gaussians = render_entries(source, entries, (kind,))
     limits = depth_limits(gaussians, entries) if kind == "depth" else None
-    renders = render_cameras(gaussians, cameras, config, source.background)
     for _, view in zip(progress(entries, "frames"), renders):
         image = np.asarray(getattr(view, kind), np.float32)
         if kind == "depth":
@@ -237,7 +262,7 @@ def through_lens(entry: CameraEntry, lens: str) -> CameraEntry:
         lens=lens,
         coefficients=coefficients,
     )
-    return entry._replace(camera=changed)
+    return entry.replace(camera=changed)
 
 
 def _at_photo_size(view: View, max_size: int | None) -> View:
@@ -265,7 +290,7 @@ def depth_limits(
     means = np.asarray(gaussians.params.means)[np.asarray(gaussians.active)]
     means = means[:: 1 + len(means) // _SAMPLED].astype(np.float64)
     seen = []
-    for _, camera in entries:
+    for camera in (entry.camera for entry in entries):
         viewmat = np.asarray(camera.viewmat)
         local = means @ viewmat[:3, :3].T + viewmat[:3, 3]
         lens, K = distortion_of(camera), np.asarray(camera.K, np.float64)

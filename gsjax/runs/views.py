@@ -1,7 +1,7 @@
 """Renders of a scene as image files, one or several per camera."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -65,10 +65,8 @@ def render_images(
     images.opencv()
     targets = [_targets(folder, entry.name, kinds, npy) for entry in entries]
     _check_paths(targets, overwrite)
-    cameras = [entry.camera for entry in entries]
-    gaussians, config = prepare_render(source, cameras, kinds)
+    renders, _ = render_entries(source, entries, kinds)
     make_folder(folder)
-    renders = render_cameras(gaussians, cameras, config, source.background)
     paths = [target.png for of_view in targets for target in of_view]
     list_each = len(paths) <= _MAX_LISTED or "depth" in kinds
     for of_view, view in zip(progress(targets, "views"), renders):
@@ -107,20 +105,56 @@ def prepare_render(
     return planned.gaussians, planned.config
 
 
+def render_entries(
+    source: SceneSource, entries: Sequence[CameraEntry], kinds: Sequence[str]
+) -> tuple[Iterator[Render], Gaussians]:
+    """Return the renders of cameras, and the Gaussians of the first.
+
+    A scene that moves is shown at the time of each camera, by default 0.
+
+    Raises:
+      InputError: as `prepare_render`; if there is a budget for a scene that moves.
+    """
+    cameras, background = [entry.camera for entry in entries], source.background
+    if source.moving is None:
+        gaussians, config = prepare_render(source, cameras, kinds)
+        return render_cameras(gaussians, cameras, config, background), gaussians
+    if source.budget is not None:
+        raise InputError(
+            "budget: expected None for a scene that moves, since settings are chosen "
+            "for one moment; export the moment first (gsjax export --time)"
+        )
+    scene, config = source.moving(), source.config.replace(outputs=tuple(kinds))
+    first = scene.at(entries[0].time or 0.0)
+
+    def at(index: int) -> Gaussians:
+        return scene.at(entries[index].time or 0.0)
+
+    return render_cameras(first, cameras, config, background, at), first
+
+
 def render_cameras(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     config: RasterConfig,
     background: Sequence[float],
+    at: Callable[[int], Gaussians] | None = None,
 ) -> Iterator[Render]:
     """Yield `render_exact` of each camera.
 
     The pair capacity starts from the first view and only grows, so that few programs
     are compiled.
+
+    Args:
+      gaussians, cameras, config, background: the scene and how it is drawn.
+      at: returns the Gaussians of a camera by its index, as many slots; by default they
+        are the same for all.
     """
     color = jnp.asarray(background, jnp.result_type(float))
     gaussians = replicate(gaussians)
     for index, camera in enumerate(cameras):
+        if at is not None:
+            gaussians = replicate(at(index))
         if index == 0 and config.pair_capacity is None:
             needed = exact_config(gaussians, camera, config).pair_capacity or 1
             capacity = capacity_bucket(int(_MARGIN * needed))
