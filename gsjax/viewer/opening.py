@@ -69,6 +69,8 @@ def load_content(
     renderer = ExactRenderer(source.config, source.background)
     content = make_content(gaussians, renderer, cameras.frusta_of(views), up)
     content.status = status
+    if source.moving is not None:
+        content.moving = source.moving()
     if mesh is not None:
         offset = 0 if origin is None else origin
         content.mesh = mesh._replace(vertices=mesh.vertices - offset)

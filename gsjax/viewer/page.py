@@ -22,6 +22,7 @@ from gsjax.viewer.splats import (
     pack,
     within,
 )
+from gsjax.viewer.timeline import controls, moment_name, page_moments
 from gsjax.viewer.viser_server import (
     add_mesh,
     open_server,
@@ -29,6 +30,7 @@ from gsjax.viewer.viser_server import (
     stop_server,
 )
 
+MOMENTS = 25  # at which a page shows a scene that moves
 _CAPTION = """<div style="position:fixed;left:12px;bottom:10px;z-index:9;color:#ddd;
 font:13px sans-serif;background:rgba(0,0,0,.7);padding:3px 7px;border-radius:4px;
 pointer-events:none">{}</div>"""
@@ -81,12 +83,14 @@ class Page(NamedTuple):
       drawn, found: Gaussians drawn, and of the scene.
       size: bytes.
       triangles: of the mesh, which is drawn in place of the Gaussians; 0 without one.
+      moments: at which a scene that moves is shown; 0 if it stands still.
     """
 
     drawn: int
     found: int
     size: int
     triangles: int = 0
+    moments: int = 0
 
 
 def write_page(
@@ -116,9 +120,14 @@ def write_page(
         raise InputError(f"{path}: {what}; lower --min-opacity")
     count = _number_of_parts(parts, 0 if mesh is not None else drawn)
     masks = importance_parts(gaussians, shown, count, content.ordered)
+    moments = 0
     server = open_server("127.0.0.1", 0)
     try:
-        text, scripts = _recorded(server, content, masks)
+        if content.moving is not None and mesh is None:
+            moments = MOMENTS
+            text, scripts = _recorded_moments(server, content, moments)
+        else:
+            text, scripts = _recorded(server, content, masks)
     finally:
         stop_server(server)
     what = (
@@ -133,8 +142,12 @@ def write_page(
     head, tail = text.rsplit("</body>", 1)
     head = head.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>")
     before, after = _WORKERS, "".join(scripts)
+    if moments:
+        after = controls(moments) + after
     if scripts:
         first = f"{int(masks[0].sum()):,} are shown, the others load."
+        if moments:
+            first = f"The first of {moments} moments is shown, the others load."
         before, after = before + page_parts.HEAD, page_parts.START + after
         caption += page_parts.STATUS.format(first)
     head = head.replace("<head>", f"<head>{before}", 1)
@@ -143,7 +156,45 @@ def write_page(
     files.write_file(path, data)
     if mesh is not None:
         return Page(0, found, len(data), len(mesh.faces))
-    return Page(drawn, found, len(data))
+    return Page(drawn, found, len(data), moments=moments)
+
+
+def _recorded_moments(
+    server: Any, content: ViewerContent, count: int
+) -> tuple[str, list[str]]:
+    """Return the page with the first moment of a scene, and a script with the others.
+
+    Raises:
+      MissingExtraError: if the installed viser cannot load a page in parts.
+    """
+    assert content.moving is not None
+    if not page_parts.parts_are_possible():
+        what = "the installed viser cannot show a scene that moves in a page"
+        raise MissingExtraError(f"{what}; pip install -U viser, or gsjax view --time")
+    cut = Cut(max(content.min_opacity, MIN_DRAWN_OPACITY))
+    still, found = page_moments(content.moving, count, cut)
+    scene = server.scene
+    set_viewpoint(server, content.viewpoint)
+    set_background(scene, content.renderer.background)
+
+    def add(index: int) -> None:
+        packed, name = found[index], moment_name(index)
+        if len(packed.centers):
+            visible = index == 0
+            scene.add_gaussian_splats(name, **packed._asdict(), visible=visible)
+
+    def add_others() -> None:
+        for index in range(1, count):
+            add(index)
+        if content.frusta:
+            size = frustum_size(content.frusta, content.viewpoint.distance)
+            add_cameras(scene, content.frusta, size)
+
+    if len(still.centers):
+        scene.add_gaussian_splats("/splats", **still._asdict())
+    add(0)
+    text = scene.as_html(dark_mode=True)
+    return text, page_parts.record(server, [(add_others, "")])
 
 
 def _number_of_parts(parts: int | None, drawn: int) -> int:

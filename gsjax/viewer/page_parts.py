@@ -53,8 +53,12 @@ HEAD = """<script>
   };
   window.gsjaxParts = {
     start,
+    added: 0,
     add: (messages, data, text) => {
-      last = last.then(() => apply(messages, data)).then(() => tell(text));
+      last = last.then(() => apply(messages, data)).then(() => {
+        window.gsjaxParts.added += 1;
+        tell(text);
+      });
       last.catch((error) => tell(` The rest cannot be shown: ${error}.`));
     },
   };

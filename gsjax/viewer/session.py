@@ -15,8 +15,10 @@ from gsjax.cameras.camera import NEAR
 from gsjax.gaussians import Gaussians, select
 from gsjax.mesh.surface import Mesh
 from gsjax.runtime.console import note, one_line
+from gsjax.train.motion.scene import MovingScene
 from gsjax.viewer import cameras, splats
 from gsjax.viewer.exact import KINDS, ExactRenderer, camera_of, picture
+from gsjax.viewer.timeline import Timeline
 from gsjax.viewer.viser_server import add_mesh, set_background
 
 _HEIGHTS = ("270", "360", "540", "720", "1080")
@@ -39,6 +41,7 @@ class ViewerContent:
       ordered: the scene lists its Gaussians by importance, the most important first;
         otherwise `gsjax.viewer.splats.by_importance` estimates it.
       mesh: a mesh of the scene, shown in place of the splats at first; or None.
+      moving: the scene at all times, if it moves; ``gaussians`` are those at time 0.
     """
 
     gaussians: Gaussians
@@ -50,6 +53,7 @@ class ViewerContent:
     min_opacity: float = 0.0
     ordered: bool = False
     mesh: Mesh | None = None
+    moving: MovingScene | None = None
 
 
 class Latest:
@@ -77,6 +81,8 @@ class Session:
         self.splats: Any = None
         self.mesh: Any = None
         self.choice: Any = None  # of splats or mesh
+        self.timeline: Timeline | None = None
+        self.moment = 0.0
         # The scene and its mask in one tuple: another thread reads both.
         self.scene_shown: tuple[Gaussians, np.ndarray] | None = None
         self.closed = False
@@ -104,6 +110,8 @@ class Session:
         if self.content.mesh is not None:
             self.choice = gui.add_dropdown("Scene", _SCENES, initial_value=_SCENES[0])
             self.choice.on_update(lambda _: self._choose())
+        if self.content.moving is not None:
+            self.timeline = Timeline(gui, self._show_time)
         self.opacity = gui.add_slider(
             "Opacity from", min=0.0, max=max(0.99, begin), step=0.01,
             initial_value=begin, hint="hide Gaussians of lower opacity",
@@ -129,6 +137,17 @@ class Session:
             choice.on_update(lambda _: self._again())
         self.camera_folder = gui.add_folder("Cameras")
         self.go_to: Any = None
+
+    def _show_time(self, moment: float) -> None:
+        """Show the scene at another time."""
+        self.moment = moment
+        self.refresh()
+        self._again()
+
+    def _gaussians(self) -> Gaussians:
+        """Return the scene at the time of this browser."""
+        moving = self.content.moving
+        return self.content.gaussians if moving is None else moving.at(self.moment)
 
     def _shows(self, what: str) -> bool:
         """Return whether "splats" or "mesh" are visible."""
@@ -207,7 +226,7 @@ class Session:
     def _draw(self) -> None:
         if self.closed:
             return
-        content, gaussians = self.content, self.content.gaussians
+        content, gaussians = self.content, self._gaussians()
         longest = splats.longest_axes(gaussians)[np.asarray(gaussians.active)]
         longest = longest[np.isfinite(longest)]
         limit = float("inf")
@@ -321,5 +340,7 @@ class Session:
     def close(self) -> None:
         """Stop drawing."""
         self.closed = True
+        if self.timeline is not None:
+            self.timeline.close()
         if self.rest is not None:
             self.rest.cancel()
