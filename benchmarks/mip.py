@@ -38,11 +38,10 @@ from gsjax.data.splits import split_views
 from gsjax.data.types import Dataset, Photo, View
 from gsjax.io.ply import write_ply
 from gsjax.runs.demo import demo_config
-from gsjax.runs.folder import ply_mode
 from gsjax.synthetic import raycaster
 from gsjax.synthetic.optics import Optics
-from gsjax.train.capacity_policy import pairs_for
-from gsjax.train.config import TrainConfig, preset, scaled
+from gsjax.train.capacity_policy import capacities_for
+from gsjax.train.config import TrainConfig, preset, render_mode_of, scaled
 from gsjax.train.evaluation import evaluate, summarise
 from gsjax.train.frames import draw, make_frames
 from gsjax.train.loop import FitResult, subset
@@ -124,7 +123,7 @@ def compared(
                 keep / f"{where}-{name}.ply",
                 results[name].gaussians,
                 overwrite=True,
-                mode=ply_mode(mine.raster),
+                mode=render_mode_of(mine.raster),
             )
     rows[-1] |= step_times(dataset, photos, config, results)
     rows[0] |= {name: 1.0 for name in rows[-1] if name.startswith("step")}
@@ -154,7 +153,7 @@ def step_times(
         stages = make_stages(setup)
         if stages.refresh is not None:
             state = jax.jit(stages.refresh)(state, frames.camera)
-        pairs = pairs_for(state, frames, mine, setup.schedule)
+        pairs, _ = capacities_for(state, frames, mine, setup.schedule)
         stages = make_stages(setup, mine.raster.replace(pair_capacity=pairs))
         differentiate = jax.jit(
             lambda state, frames: stages.differentiate(state, draw(frames, view))

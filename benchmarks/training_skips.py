@@ -30,7 +30,7 @@ from gsjax.data.extent import extent_of
 from gsjax.data.photos import load_photos
 from gsjax.raster.exact import count_demand
 from gsjax.runs.evaluation import evaluate_views
-from gsjax.train.capacity_policy import pairs_for
+from gsjax.train.capacity_policy import capacities_for
 from gsjax.train.config import Level, TrainConfig, preset
 from gsjax.train.frames import draw, make_frames
 from gsjax.train.loop import FitResult, fit, subset
@@ -121,7 +121,7 @@ def of_masks(name: str, trained: Trained, result: FitResult, share: float) -> di
     disc = apart <= np.quantile(apart, share)
     batch = draw(frames, jnp.zeros(1, jnp.int32))
     batch = batch._replace(valid=jnp.asarray(disc)[None])
-    pairs = pairs_for(state, frames, config, config.schedule)
+    pairs, _ = capacities_for(state, frames, config, config.schedule)
     raster = config.raster.replace(pair_capacity=pairs)
     steps = {
         skip: jax.jit(
@@ -153,7 +153,7 @@ def of_masks(name: str, trained: Trained, result: FitResult, share: float) -> di
 def of_occlusion(name: str, trained: Trained, result: FitResult) -> list[dict]:
     """Time the gradient of a step and its compiling without occlusion culling."""
     config, frames, state = trained.config, trained.frames, result.state
-    pairs = pairs_for(state, frames, config, config.schedule)
+    pairs, _ = capacities_for(state, frames, config, config.schedule)
     raster = config.raster.replace(pair_capacity=pairs)
     batch = draw(frames, jnp.zeros(config.batch, jnp.int32))
     looks, seconds, pairs = {}, {True: [], False: []}, {}

@@ -22,7 +22,7 @@ from gsjax.densify.types import apply_edit
 from gsjax.raster.tile_render import device_count
 from gsjax.runs.checkpoint import load_latest, restore
 from gsjax.runs.folder import load_settings, load_split, run_files
-from gsjax.train.capacity_policy import pairs_for
+from gsjax.train.capacity_policy import capacities_for
 from gsjax.train.frames import draw, make_frames, targets, views_of_step
 from gsjax.train.initialisation import empty_state
 from gsjax.train.loop import subset
@@ -40,7 +40,7 @@ def parts(folder: Path) -> tuple[dict, dict]:
     slots = int(checkpoint.meta["capacity"])
     state = restore(checkpoint, empty_state(config, extent, views, slots))
     frames = make_frames(scene.views, load_photos(scene.views, config.max_size))
-    pairs = pairs_for(state, frames, config, config.schedule)
+    pairs, _ = capacities_for(state, frames, config, config.schedule)
     raster = config.raster.replace(pair_capacity=pairs)
     setup = make_setup(config, extent)
     strategy = setup.strategy
