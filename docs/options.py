@@ -14,7 +14,7 @@ _MARK = re.compile(r"<!-- options: (\w+) -->")
 _METAVARS = {"int": "N", "float": "X", "str": "TEXT", "Path": "PATH", "bool": ""}
 # Types of gsjax.cli.options.
 _METAVARS |= {"Size": "WxH", "OptionalSize": "WxH", "Kinds": "KINDS"}
-_METAVARS |= {"Color": "R,G,B", "Budget": "ERROR"}
+_METAVARS |= {"Color": "R,G,B", "Budget": "ERROR", "Times": "T|T0:T1"}
 
 
 def _sources() -> list[str]:
