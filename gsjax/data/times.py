@@ -17,6 +17,7 @@ from gsjax.runtime.files import read_json, shown, write_json
 _NUMBER = re.compile(r"([0-9]+)\D*$")
 TIMES_FILE = "times.json"
 _MOST_SECONDS = 1e12
+_MODEL_FOLDERS = ("0", "sparse", "colmap")  # of a COLMAP model in its dataset
 _REMEDY = (
     "give each frame of the transforms.json a 'time', or put the frames of each camera "
     "into a folder of its own, numbered alike (camera_1/0001.png …)"
@@ -33,9 +34,10 @@ def with_unit_times(dataset: Dataset) -> Dataset:
       InputError: if some views have a time and others have none, or `read_times` does.
     """
     folder = dataset.source if dataset.source.is_dir() else dataset.source.parent
-    found = [p / TIMES_FILE for p in (folder, *folder.parents[:2])]
-    path = next((p for p in found if p.is_file()), None)
-    if path is not None:
+    while folder.name in _MODEL_FOLDERS:
+        folder = folder.parent
+    path = folder / TIMES_FILE
+    if path.is_file():
         dataset = _stamped(dataset, path, read_times(path))
     times = [view.time for view in dataset.views]
     known = [time for time in times if time is not None]

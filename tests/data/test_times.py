@@ -211,6 +211,11 @@ def test_seconds_of_a_video(tmp_path):
     write_times(path, FrameTimes(dict(zip(names[:2], seconds))))
     with pytest.raises(InputError, match=f"no time for the photograph {names[2]}"):
         load_dataset(tmp_path)
+    path.rename(tmp_path.parent / path.name)  # that of another dataset
+    try:
+        assert load_dataset(tmp_path).duration is None
+    finally:
+        (tmp_path.parent / path.name).rename(path)
     path.write_text('{"seconds": {"a.png": "soon"}}')
     with pytest.raises(InputError, match="a time in seconds"):
         load_dataset(tmp_path)
