@@ -162,7 +162,8 @@ def test_capacities_grow_without_changing_bits():
     state = init_state(rough_start(1, 64), config, EXTENT, VIEWS)
     before = bits(state)
     limited = config.replace(raster=config.raster.replace(visible_capacity=2))
-    small, log = run(limited, Log(stop_at=6), state=state, pair_capacity=7)
+    least = {"pair_capacity": 7, "visible_capacity": 2}
+    small, log = run(limited, Log(stop_at=6), state=state, **least)
     large, other = run(
         config, Log(stop_at=6), state=grow_state(state, 1024), pair_capacity=4096
     )
