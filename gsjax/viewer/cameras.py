@@ -75,10 +75,17 @@ class Viewpoint(NamedTuple):
 
 
 def frusta_of(views: Sequence[View], photos: Sequence[Photo] = ()) -> list[Frustum]:
-    """Return at most 200 cameras to draw, evenly chosen; ``photos`` may be none."""
-    few = np.linspace(0, len(views) - 1, min(len(views), _MAX_FRUSTA))
+    """Return at most 200 cameras to draw, evenly chosen; ``photos`` may be none.
+
+    Of views from one camera that stands still, only the first is drawn.
+    """
+    places = {}
+    for index, view in enumerate(views):
+        places.setdefault((view.viewmat.tobytes(), view.K.tobytes()), index)
+    firsts = list(places.values())
+    few = np.linspace(0, len(firsts) - 1, min(len(firsts), _MAX_FRUSTA))
     out = []
-    for index in np.unique(few.astype(int)):
+    for index in np.take(firsts, np.unique(few.astype(int))):
         view = views[index]
         fov = 2 * np.arctan(view.height / (2 * view.K[1, 1]))
         if view.lens is not None and view.lens.lens.depth is range_depth:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsjax.errors import InputError, MissingExtraError
-from gsjax.gaussians import num_active
+from gsjax.gaussians import Gaussians, num_active
 from gsjax.runtime import files
 from gsjax.viewer import page_parts
 from gsjax.viewer.cameras import add_cameras, frustum_size, set_viewpoint
@@ -17,12 +17,13 @@ from gsjax.viewer.splats import (
     MANY,
     MIN_DRAWN_OPACITY,
     Cut,
+    Splats,
     importance_parts,
     most_important,
     pack,
     within,
 )
-from gsjax.viewer.timeline import controls, moment_name, page_moments
+from gsjax.viewer.timeline import controls, page_moments
 from gsjax.viewer.viser_server import (
     add_mesh,
     open_server,
@@ -112,8 +113,7 @@ def write_page(
       InputError: if no Gaussian would be drawn, or the file cannot be written.
     """
     gaussians, mesh = content.gaussians, content.mesh
-    shown = within(gaussians, Cut(max(content.min_opacity, MIN_DRAWN_OPACITY)))
-    shown = most_important(gaussians, shown, content.max_gaussians, content.ordered)
+    shown = _shown(content, gaussians)
     drawn, found = int(shown.sum()), int(num_active(gaussians))
     if found and not drawn and mesh is None:
         what = f"none of {found:,} Gaussians is opaque enough to be drawn"
@@ -171,30 +171,33 @@ def _recorded_moments(
     if not page_parts.parts_are_possible():
         what = "the installed viser cannot show a scene that moves in a page"
         raise MissingExtraError(f"{what}; pip install -U viser, or gsjax view --time")
-    cut = Cut(max(content.min_opacity, MIN_DRAWN_OPACITY))
-    still, found = page_moments(content.moving, count, cut)
+    still, found = page_moments(content.moving, count, partial(_shown, content))
     scene = server.scene
     set_viewpoint(server, content.viewpoint)
     set_background(scene, content.renderer.background)
 
-    def add(index: int) -> None:
-        packed, name = found[index], moment_name(index)
+    def add(packed: Splats) -> None:
         if len(packed.centers):
-            visible = index == 0
-            scene.add_gaussian_splats(name, **packed._asdict(), visible=visible)
+            scene.add_gaussian_splats(page_parts.KEPT, **packed._asdict())
 
-    def add_others() -> None:
-        for index in range(1, count):
-            add(index)
+    def add_moments() -> None:
+        for packed in found:
+            add(packed)
         if content.frusta:
             size = frustum_size(content.frusta, content.viewpoint.distance)
             add_cameras(scene, content.frusta, size)
 
     if len(still.centers):
         scene.add_gaussian_splats("/splats", **still._asdict())
-    add(0)
+    add(found[0])
     text = scene.as_html(dark_mode=True)
-    return text, page_parts.record(server, [(add_others, "")])
+    return text, page_parts.record(server, [(add_moments, "")])
+
+
+def _shown(content: ViewerContent, gaussians: Gaussians) -> np.ndarray:
+    """Return [N] bool: the Gaussians that a page draws."""
+    shown = within(gaussians, Cut(max(content.min_opacity, MIN_DRAWN_OPACITY)))
+    return most_important(gaussians, shown, content.max_gaussians, content.ordered)
 
 
 def _number_of_parts(parts: int | None, drawn: int) -> int:

@@ -19,6 +19,9 @@ from gsjax.viewer.viser_server import require_viser
 _ARRAYS = {"<u4": "Uint32Array", "<f4": "Float32Array", "|u1": "Uint8Array"}
 _ALIGNMENT = 8  # bytes
 
+# Later splats of this name are kept for scripts of the page, not shown.
+KEPT = "/moment"
+
 # To be placed before viser's program, which waits for DOMContentLoaded. The recording
 # hides what precedes it, and `firstMessageBatch` is false as soon as it is played.
 HEAD = """<script>
@@ -45,7 +48,11 @@ HEAD = """<script>
     const added = JSON.parse(messages, (_, value) => value?.array === undefined ? value
       : new globalThis[value.array](bytes, value.offset, value.length));
     while (window.__viserMutable?.firstMessageBatch !== false) await pause();
-    window.__viserMutable.messageQueue.push(...added);
+    const { kept } = window.gsjaxParts, queue = window.__viserMutable.messageQueue;
+    for (const one of added) {
+      if (one.name !== "{kept}") queue.push(one);
+      else if (one.props?.buffer) kept.push(one);
+    }
     window.__viserMutable.requestRender();
   };
   const tell = (text) => {
@@ -53,17 +60,14 @@ HEAD = """<script>
   };
   window.gsjaxParts = {
     start,
-    added: 0,
+    kept: [],
     add: (messages, data, text) => {
-      last = last.then(() => apply(messages, data)).then(() => {
-        window.gsjaxParts.added += 1;
-        tell(text);
-      });
+      last = last.then(() => apply(messages, data)).then(() => tell(text));
       last.catch((error) => tell(` The rest cannot be shown: ${error}.`));
     },
   };
 })();
-</script>"""
+</script>""".replace("{kept}", KEPT)
 START = "<script>gsjaxParts.start()</script>"
 STATUS = '<span id="gsjax-loading" style="display:block">{}</span>'
 

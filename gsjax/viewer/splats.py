@@ -151,6 +151,22 @@ def pack(gaussians: Gaussians, shown: np.ndarray) -> Splats:
     )
 
 
+def padded(packed: Splats, size: int) -> Splats:
+    """Return ``size`` splats, the last of which are invisible."""
+    more = size - len(packed.centers)
+
+    def longer(array: np.ndarray) -> np.ndarray:
+        return np.pad(array, [(0, more)] + [(0, 0)] * (array.ndim - 1))
+
+    return Splats(
+        centers=longer(packed.centers),
+        covariances=longer(packed.covariances),
+        rgbs=longer(packed.rgbs),
+        opacities=longer(packed.opacities),
+        scale=packed.scale,
+    )
+
+
 def _unit(longest: np.ndarray) -> float:
     """Return the world units in which half precision holds these log scales [M]."""
     if not len(longest):

@@ -56,28 +56,32 @@ def moving_mask(scene: MovingScene) -> np.ndarray:
 
 
 def page_moments(
-    scene: MovingScene, count: int, cut: splats.Cut
+    scene: MovingScene, count: int, choose: Callable[[Gaussians], np.ndarray]
 ) -> tuple[splats.Splats, list[splats.Splats]]:
     """Return what stands still, and what moves at each of ``count`` moments.
 
-    The moments divide the time from 0 to 1 evenly.
+    Args:
+      scene: with N slots.
+      count: of moments, which divide the time from 0 to 1 evenly.
+      choose: returns [N] bool, the Gaussians to be shown at a moment.
+
+    Returns:
+      The splats that stand still, and those of each moment; moments have equally many,
+      the last of which are invisible where fewer are shown.
     """
     moving = moving_mask(scene)
     first = scene.at(0.0)
-    still = splats.pack(first, splats.within(first, cut) & ~moving)
+    still = splats.pack(first, choose(first) & ~moving)
     found = []
     for moment in np.linspace(0, 1, count).tolist():
-        now: Gaussians = scene.at(moment)
-        found.append(splats.pack(now, splats.within(now, cut) & moving))
-    return still, found
+        now = scene.at(moment)
+        found.append(splats.pack(now, choose(now) & moving))
+    size = max(len(packed.centers) for packed in found)
+    return still, [splats.padded(packed, size) for packed in found]
 
 
-def moment_name(index: int) -> str:
-    """Return the name of the splats of a moment in a page."""
-    return f"/moment-{index}"
-
-
-# Shows one of the moments of a page.
+# Shows one of the moments of a page. As many splats take the place of those before, so
+# a page draws and sorts those of one moment only.
 CONTROLS = """<div id="gsjax-time" style="position:fixed;left:12px;bottom:58px;
 z-index:9;color:#ddd;font:13px sans-serif;background:rgba(0,0,0,.7);padding:5px 9px;
 border-radius:4px">
@@ -87,21 +91,20 @@ style="width:260px;vertical-align:middle" aria-label="Time">
 <output id="gsjax-now">0.00</output></div>
 <script>
 (() => {
-  const count = {count}, seconds = {seconds};
+  const count = {count}, seconds = {seconds}, kept = window.gsjaxParts.kept;
   const slider = document.getElementById("gsjax-slider");
   const button = document.getElementById("gsjax-play");
   let shown = 0, playing = false, before = 0;
-  const send = (index, visible) => window.__viserMutable.messageQueue.push({
-    type: "SetSceneNodeVisibilityMessage", name: `/moment-${index}`, visible});
   const show = () => {
     const time = Number(slider.value), index = Math.round(time * (count - 1));
     document.getElementById("gsjax-now").textContent = time.toFixed(2);
     // Before its splats have arrived, a moment cannot be shown.
-    if (index === shown || !window.gsjaxParts.added) return;
-    send(index, true);
-    send(shown, false);
-    shown = index;
+    if (index === shown || index >= kept.length) return;
+    const { name, owner, props: { buffer, scale } } = kept[index];
+    window.__viserMutable.messageQueue.push({
+      type: "SceneNodeUpdateMessage", name, owner, updates: { buffer, scale }});
     window.__viserMutable.requestRender();
+    shown = index;
   };
   const run = (now) => {
     if (!playing) return;
@@ -118,11 +121,10 @@ style="width:260px;vertical-align:middle" aria-label="Time">
     if (playing) requestAnimationFrame(run);
   });
   const arrived = setInterval(() => {
-    if (!window.gsjaxParts.added) return;
+    if (kept.length < count) return;
     clearInterval(arrived);
     show();
   }, 100);
-  window.gsjaxTime = { show, slider, get shown() { return shown; } };
 })();
 </script>"""
 

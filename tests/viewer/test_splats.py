@@ -1,5 +1,7 @@
 """Conversions for the browser: splats, cameras, viewpoints, exact images."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -165,3 +167,19 @@ def test_exact_images_are_rendered_on_one_device():
     pixels, _ = picture(view, "depth")
     # A level of depth more or less is another colour.
     np.testing.assert_allclose(pixels.astype(float), colors, atol=8)
+
+
+def test_a_camera_that_stands_still_is_drawn_once():
+    views = training.dataset().views
+    twice = [dataclasses.replace(view, name=f"again-{view.name}") for view in views]
+    frusta = cameras.frusta_of([*views, *twice])
+    assert [frustum.name for frustum in frusta] == [view.name for view in views]
+
+
+def test_padding_is_invisible():
+    found = scene()
+    packed = splats.pack(found, within(found, Cut(0.1)))
+    more = splats.padded(packed, len(packed.centers) + 3)
+    assert more.opacities[-3:].max() == 0
+    for before, after in zip(packed[:-1], more[:-1], strict=True):
+        np.testing.assert_array_equal(after[:-3], before)

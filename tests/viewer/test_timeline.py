@@ -1,11 +1,12 @@
 """The time of a scene that moves, in the panel of a browser and in a page."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from viewing import Browser, wait_for
+from viewing import CHROMIUM, Browser, screenshots, wait_for
 
 import gsjax
 from gsjax.math.sh import rgb_to_dc
@@ -18,7 +19,7 @@ from gsjax.viewer.exact import ExactRenderer
 from gsjax.viewer.opening import make_content
 from gsjax.viewer.page import MOMENTS, write_page
 from gsjax.viewer.server import ViewerServer
-from gsjax.viewer.splats import Cut
+from gsjax.viewer.splats import Cut, within
 from gsjax.viewer.timeline import Timeline, page_moments
 
 pytest.importorskip("viser", reason="needs gsjax[viewer]")
@@ -57,7 +58,7 @@ def content_of(scene: MovingScene):
 
 
 def test_what_stands_still_is_stored_once():
-    still, moments = page_moments(moving_scene(), 3, Cut(0.01))
+    still, moments = page_moments(moving_scene(), 3, partial(within, cut=Cut(0.01)))
     assert (len(still.centers), [len(m.centers) for m in moments]) == (
         STILL,
         3 * [MOVING],
@@ -140,5 +141,45 @@ def test_a_page_holds_all_moments_and_a_slider(tmp_path):
     text = out.read_text()
     assert page.moments == MOMENTS
     assert page.size == out.stat().st_size
-    assert text.count("/moment-") >= MOMENTS - 1
+    assert text.count('GaussianSplatsMessage\\"') == MOMENTS
     assert 'id="gsjax-slider"' in text
+
+
+def blue_column(picture: np.ndarray) -> float:
+    """Return the mean column of blue pixels; NaN if there are few."""
+    red, _, blue = np.moveaxis(picture[:-60].astype(int), -1, 0)
+    columns = np.nonzero(blue > red + 60)[1]
+    return float(columns.mean()) if len(columns) > 50 else float("nan")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+def test_the_slider_of_a_page_moves_the_scene(tmp_path):
+    out = tmp_path / "page.html"
+    write_page(content_of(moving_scene()), out, title="balls")
+    pictures = screenshots(out.as_uri(), tmp_path / "profile")
+
+    def column(script: str = "0", other: float = np.nan) -> float:
+        """Wait until the picture is at rest, and other than before."""
+        seen = [blue_column(pictures.send(script))]
+
+        def rests() -> bool:
+            seen.append(blue_column(next(pictures)))
+            return len(set(seen[-4:])) == 1 and len(seen) > 4 and seen[-1] != other
+
+        wait_for(rests, 60)
+        return seen[-1]
+
+    set_time = """{
+        const slider = document.getElementById("gsjax-slider");
+        slider.value = %s;
+        slider.dispatchEvent(new Event("input"));
+    }"""
+    try:
+        next(pictures)
+        first = column()
+        last = column(set_time % 1, other=first)
+        middle = column(set_time % 0.5, other=last)
+    finally:
+        pictures.close()
+    assert abs(last - first) > 30
+    np.testing.assert_allclose(middle, (first + last) / 2, atol=0.1 * abs(last - first))
