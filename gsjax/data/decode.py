@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsjax.data import image_header
+from gsjax.data import heif, image_header
 from gsjax.errors import InputError
 from gsjax.io.common import warn
 from gsjax.io.images import captured_stderr, opencv
@@ -50,7 +50,9 @@ def decode(
     if image_header.has_two_samples(data):  # OpenCV drops one, or reads zeros
         what = "a TIFF of two samples a pixel, grey and transparency"
         raise InputError(f"{path}: {what}, cannot be read; convert it to PNG")
-    cv2 = opencv()
+    kind, cv2 = heif.kind_of(data[:64]), opencv()
+    if kind == "heic":
+        return _as_asked(heif.decode_heic(path, data), flags)
     if flags & cv2.IMREAD_IGNORE_ORIENTATION:  # IMREAD_UNCHANGED includes it
         data = image_header.tiff_as_stored(data)  # OpenCV ignores the flag in a TIFF
     try:
@@ -62,6 +64,8 @@ def decode(
         raise InputError(
             f"{path}: cannot be decoded: {what}; convert it to PNG or JPEG"
         )
+    if kind == "avif":  # OpenCV stores it as it lies on the sensor
+        return heif.turns_of(data).apply(pixels)
     most = 65535 if pixels.dtype == np.uint16 else 255
     # OpenCV 5.0 multiplies straight colours of 8 bits by alpha and keeps premultiplied
     # ones, without telling which.
@@ -75,6 +79,22 @@ def decode(
         alpha = np.where(pixels == round(grey * most), 0, most).astype(pixels.dtype)
         pixels = np.stack([pixels, alpha], -1)
     return pixels
+
+
+def _as_asked(pixels: np.ndarray, flags: int) -> np.ndarray:
+    """Return pixels of a colour image or a grey one as OpenCV would for these flags."""
+    cv2 = opencv()
+    if flags == cv2.IMREAD_UNCHANGED:
+        return pixels
+    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+    if flags & cv2.IMREAD_COLOR:
+        if channels < 3:
+            grey = pixels if channels == 1 else pixels[..., 0]
+            return cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+        return np.ascontiguousarray(pixels[..., :3])
+    if channels < 3:
+        return pixels if channels == 1 else np.ascontiguousarray(pixels[..., 0])
+    return cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_BGR2GRAY)
 
 
 @contextmanager

@@ -6,11 +6,15 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path, PurePosixPath
 
+from gsjax.data import heif
 from gsjax.data.types import ReadOptions, unexpected
 from gsjax.errors import InputError
 from gsjax.io.common import warn
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"),
+    *heif.SUFFIXES,
+)
 _SHOWN = 5
 _MAX_NAME, _MAX_PART = 1024, 251  # bytes; masks have ".png" appended
 _ENDING = re.compile(f"({'|'.join(map(re.escape, SUFFIXES))})+$", re.IGNORECASE)

@@ -9,6 +9,7 @@ import mmap
 import struct
 from pathlib import Path
 
+from gsjax.data import heif
 from gsjax.errors import InputError
 from gsjax.runtime.files import opened
 
@@ -21,10 +22,10 @@ MAX_PIXELS = 1 << 28
 _MAX_DEFLATE, _MAX_LZW = 1032, 1400
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _REMEDY = "copy or export it again"
-# Tags of TIFF: width, height, bits per sample, compression, orientation, samples per
-# pixel, extra samples.
+# Tags of TIFF: width, height, bits per sample, compression, kind of colours,
+# orientation, samples per pixel, extra samples.
 _ORIENTATION = 274
-_TIFF_TAGS = (256, 257, 258, 259, _ORIENTATION, 277, 338)
+_TIFF_TAGS = (256, 257, 258, 259, 262, _ORIENTATION, 277, 338)
 # Markers of JPEG without a length, and those with the size of the image.
 _JPEG_BARE = {0x01, *range(0xD0, 0xD9)}
 _JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
@@ -46,22 +47,27 @@ def image_size(path: Path) -> tuple[int, int]:
 def check_image(path: Path, data: Buffer) -> tuple[int, int]:
     """Return the width and height in px that the bytes of an image file declare.
 
-    EXIF orientation is ignored.
+    EXIF orientation is ignored; the turn of a HEIC or AVIF is applied.
 
     Raises:
-      InputError: if the file is empty, of an unknown format, truncated, or larger
-        than `MAX_PIXELS`.
+      InputError: if the file is empty, of an unknown format, truncated, in CMYK, or
+        larger than `MAX_PIXELS`.
     """
     if not len(data):
         raise InputError(f"{path}: the file is empty; {_REMEDY}")
-    reader = _reader(data[:12])
+    reader = _reader(data[:64])
     if reader is None:
         got = f"a file that starts with {data[:8]!r}; convert it to PNG or JPEG"
-        raise InputError(f"{path}: expected a PNG, JPEG, WebP, TIFF or BMP, got {got}")
+        kinds = "PNG, JPEG, WebP, TIFF, BMP, HEIC or AVIF"
+        raise InputError(f"{path}: expected a {kinds}, got {got}")
     try:
         width, height = reader(data)
-    except (struct.error, IndexError, _Truncated) as error:
-        detail = f" ({error})" if isinstance(error, _Truncated) else ""
+    except _ForPrint as error:
+        what = "expected grey or RGB, got CMYK, the inks of a printer"
+        raise InputError(f"{path}: {what}; convert it to sRGB") from error
+    except (struct.error, IndexError, _Truncated, heif.BoxError) as error:
+        told = isinstance(error, _Truncated | heif.BoxError)
+        detail = f" ({error})" if told else ""
         what = f"the image is truncated or damaged{detail}, got {len(data)} bytes"
         raise InputError(f"{path}: {what}; {_REMEDY}") from error
     if width < 1 or height < 1:
@@ -76,6 +82,10 @@ class _Truncated(Exception):
     """Names the missing part of a file."""
 
 
+class _ForPrint(Exception):
+    """Says that an image has the colours of inks."""
+
+
 def _reader(head: bytes):
     if head.startswith(b"\x89PNG\r\n\x1a\n"):
         return _png
@@ -85,6 +95,8 @@ def _reader(head: bytes):
         return _webp
     if head.startswith((b"II*\0", b"MM\0*")):
         return _tiff
+    if heif.kind_of(head):
+        return _heif
     return _bmp if head.startswith(b"BM") else None
 
 
@@ -121,7 +133,9 @@ def _jpeg(data: Buffer) -> tuple[int, int]:
         if code == 0xDA and size is not None:
             break
         if code in _JPEG_FRAMES:
-            height, width = struct.unpack_from(">HH", data, at + 5)
+            height, width, channels = struct.unpack_from(">HHB", data, at + 5)
+            if channels == 4:
+                raise _ForPrint
             size, arithmetic = (width, height), code > 0xC8
         at += 2 + struct.unpack_from(">H", data, at + 2)[0]
     # Huffman codes take at least a bit for each block of 8 × 8.
@@ -214,6 +228,8 @@ def _tiff(data: Buffer) -> tuple[int, int]:
     found = _tiff_tags(data)
     if not {256, 257} <= set(found):
         raise _Truncated("no image size")
+    if found.get(262) == 5:
+        raise _ForPrint
     width, height = found[256], found[257]
     # One sample: others may be subsampled, as in YCbCr.
     bits = width * height * found.get(258, 1)
@@ -222,6 +238,10 @@ def _tiff(data: Buffer) -> tuple[int, int]:
     if width * height <= MAX_PIXELS and shrunk and bits > 8 * shrunk * len(data):
         raise _Truncated(f"{width} × {height} px cannot fit in it")
     return width, height
+
+
+def _heif(data: Buffer) -> tuple[int, int]:
+    return heif.turns_of(data).upright
 
 
 def _bmp(data: Buffer) -> tuple[int, int]:

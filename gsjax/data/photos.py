@@ -146,7 +146,6 @@ def _to_rgb(path: Path, stored: np.ndarray) -> tuple[np.ndarray, np.ndarray | No
         pixels = np.repeat(stored[..., :1], 3, axis=2)
     else:
         pixels = np.ascontiguousarray(stored[..., 2::-1])
-    # OpenCV also decodes CMYK to four channels, the last of them opaque.
     clear = channels in (2, 4) and (stored[..., -1] < 255).any()
     return pixels, stored[..., -1].copy() if clear else None
 

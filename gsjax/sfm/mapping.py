@@ -7,8 +7,11 @@ import re
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+from gsjax.data import heif
+from gsjax.runtime.files import read_bytes
 from gsjax.runtime.machine import usable_cores
 from gsjax.sfm.engine import Progress, colmap, count_rows, run_cancellable
 
@@ -20,6 +23,7 @@ CAMERA_MODELS = (
     *("THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION"),
 )
 _FEW_FEATURES = 100
+_SMALL = 512  # px, longer side of a JPEG from which COLMAP reads the EXIF of a HEIC
 _MAX_GUIDED_PAIRS, _MAX_GUIDED_PAIRS_PER_IMAGE = 60, 5
 # COLMAP starts with 30. 15 are still not chance: one in 4000 random matches lies within
 # the 12 px that count as an inlier.
@@ -49,8 +53,11 @@ def exif_camera(path: Path) -> tuple[str, float | None]:
 
     The focal length is side × (mm / sensor mm); the sensor size comes from EXIF or from
     COLMAP's table of cameras. A missing name is ""; a focal length that is missing or
-    outside COLMAP's limits is None.
+    outside COLMAP's limits is None. For HEIC and AVIF, which COLMAP does not read, the
+    focal length is scaled from that of a small JPEG with the same EXIF.
     """
+    if path.suffix.lower() in heif.SUFFIXES:
+        return _exif_camera_heif(path)
     bitmap = colmap().Bitmap.read(str(path), False)
     if bitmap is None:
         return "", None
@@ -60,6 +67,18 @@ def exif_camera(path: Path) -> tuple[str, float | None]:
     side, limits = max(bitmap.width, bitmap.height), colmap().IncrementalMapperOptions()
     least, most = limits.min_focal_length_ratio, limits.max_focal_length_ratio
     return name, focal if least * side < focal < most * side else None
+
+
+def _exif_camera_heif(path: Path) -> tuple[str, float | None]:
+    data = read_bytes(path, "a photograph")
+    width, height = heif.turns_of(data).upright
+    scale = max(width, height) / _SMALL
+    size = max(1, round(width / scale)), max(1, round(height / scale))
+    with TemporaryDirectory() as folder:
+        small = Path(folder) / "small.jpg"
+        small.write_bytes(heif.small_jpeg(heif.exif_of(data), size))
+        name, focal = exif_camera(small)
+    return name, None if focal is None else focal * scale
 
 
 def extract_features(

@@ -114,12 +114,15 @@ def _write_pixels(
 
     pixels = _read_working_file(work.photos / photo.record.file)
     pixels = resampled(pixels, cv2.INTER_CUBIC)
-    write_file(dataset / "images" / photo.name, _encode(pixels, photo.name))
+    image = dataset / "images" / photo.name
+    make_folder(image.parent)
+    write_file(image, _encode(pixels, photo.name))
     if photo.mask:
-        make_folder(dataset / "masks")
+        drawn = dataset / "masks" / f"{photo.name}.png"
+        make_folder(drawn.parent)
         mask = _read_working_file(work.mask(photo.record.file), grey=True)
         mask = resampled(mask, cv2.INTER_NEAREST)
-        write_file(dataset / "masks" / f"{photo.name}.png", encode_png(mask))
+        write_file(drawn, encode_png(mask))
 
 
 def _read_working_file(path: Path, grey: bool = False) -> np.ndarray:

@@ -4,6 +4,7 @@ OpenCV decodes them and applies the EXIF orientation; they are written as PNG wi
 EXIF, so every reader sees the same pixels. Transparent parts go into the mask.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsjax.data import heif
 from gsjax.data.decode import decode, warn_of_damage
 from gsjax.data.image_files import (
     SUFFIXES,
@@ -25,10 +27,13 @@ from gsjax.runtime.files import opened, write_file
 from gsjax.sfm.mapping import ImageRecord, exif_camera
 
 _KEPT = (".jpg", ".jpeg", ".png")  # formats that the dataset keeps
+_RAW = (
+    *(".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"),
+    *(".orf", ".rw2", ".pef", ".srw", ".nrw"),
+)
 _UNSUPPORTED = (
-    *(".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf"),
-    *(".orf", ".rw2", ".pef", ".srw", ".nrw", ".gif", ".jxl", ".jp2", ".psd"),
-    *(".jfif", ".jpe", ".mpo", ".ppm"),
+    *_RAW,
+    *(".gif", ".jxl", ".jp2", ".psd", ".jfif", ".jpe", ".mpo", ".ppm"),
 )
 _JPEG = b"\xff\xd8"  # first bytes of a JPEG, which has no alpha
 _CUBIC_REACH = 2  # px, of the interpolation that undistorts
@@ -84,35 +89,42 @@ class WorkFolder(NamedTuple):
         return PreparedPhoto(name, ImageRecord(file, width, height, focal, key))
 
 
-def find_photos(folder: Path) -> list[Path]:
-    """Return the photographs directly in a folder, in natural order (2 before 10).
+def find_photos(folder: Path, skipped: Sequence[Path] = ()) -> list[Path]:
+    """Return the photographs in a folder and those below, in natural order (2, 10).
+
+    Hidden folders, masks, and datasets that `gsjax.sfm` has written are left out.
+
+    Args:
+      folder: to search.
+      skipped: further folders to leave out.
 
     Raises:
       InputError: if there are fewer than two, if a format is not supported, or if two
         would have the same name in the dataset.
     """
-    files = [p for p in folder.iterdir() if p.is_file() and p.name[0] != "."]
-    files.sort(key=lambda path: natural_order(path.name))
+    files = sorted(
+        _files_below(folder, {path.resolve() for path in skipped}),
+        key=lambda path: [
+            natural_order(part) for part in path.relative_to(folder).parts
+        ],
+    )
     unsupported = [p for p in files if p.suffix.lower() in _UNSUPPORTED]
     if unsupported:
-        raise InputError(
-            f"{_some(unsupported)}: {unsupported[0].suffix} is not supported; convert "
-            "the photos to JPEG (keeping EXIF), or move them away"
-        )
+        suffix = unsupported[0].suffix
+        what = f"{suffix} is not supported; convert the photos to JPEG (keeping EXIF)"
+        if suffix.lower() in _RAW:
+            what = f"{suffix} is a raw format; develop the photos to JPEG, all alike"
+        raise InputError(f"{_some(unsupported)}: {what}, or move them away")
     found = [p for p in files if p.suffix.lower() in SUFFIXES]
     if len(found) < 2:
-        below = [
-            p for p in folder.rglob("*") if p.parent != folder and p.name[0] != "."
-        ]
-        deeper = sum(path.suffix.lower() in SUFFIXES for path in below)
-        hint = f"; {deeper} photos lie in subfolders: move them up" if deeper else ""
         raise InputError(
             f"{folder}: expected at least 2 photos ({', '.join(SUFFIXES)}), got "
             f"{len(found)}; add photos (20 or more are better), or pass the file of a "
-            f"video{hint}"
+            "video"
         )
-    names = [dataset_name(path) for path in found]
-    duplicates = [p for p, name in zip(found, names) if names.count(name) > 1]
+    names = [dataset_name(path, folder) for path in found]
+    counts = Counter(names)
+    duplicates = [p for p, name in zip(found, names) if counts[name] > 1]
     if duplicates:
         raise InputError(
             f"{_some(duplicates)}: would have the same name in the dataset; rename one"
@@ -120,15 +132,38 @@ def find_photos(folder: Path) -> list[Path]:
     return found
 
 
-def dataset_name(path: Path) -> str:
-    """Return the name of a photograph in the dataset; other formats become .png.
+def _files_below(folder: Path, skipped: set[Path]) -> Iterator[Path]:
+    """Yield the visible files of a folder and of those below."""
+    for path in folder.iterdir():
+        if path.name.startswith("."):
+            continue
+        if not path.is_dir():
+            yield path
+        elif not (
+            path.name == "masks"
+            or (path / "sfm.json").exists()
+            or path.resolve() in skipped
+        ):
+            yield from _files_below(path, skipped)
+
+
+def dataset_name(path: Path, folder: Path) -> str:
+    """Return the name of a photograph in the dataset, relative to the source folder.
+
+    HEIC and AVIF become .jpg, other formats that the dataset does not keep .png.
 
     Raises:
       InputError: if the name is not UTF-8.
     """
-    kept = path.suffix.lower() in _KEPT
-    check_name(path)
-    return path.name if kept else path.with_suffix(".png").name
+    suffix = path.suffix.lower()
+    for part in (path, *path.parents):
+        if part == folder:
+            break
+        check_name(part)
+    inside = path.relative_to(folder)
+    if suffix not in _KEPT:
+        inside = inside.with_suffix(".jpg" if suffix in heif.SUFFIXES else ".png")
+    return inside.as_posix()
 
 
 def read_upright(path: Path, grey: bool = False) -> np.ndarray:
@@ -182,7 +217,11 @@ def _orientations(pixels: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def prepare_photos(
-    paths: Sequence[Path], masks: Path | None, work: WorkFolder, max_size: int
+    paths: Sequence[Path],
+    masks: Path | None,
+    work: WorkFolder,
+    max_size: int,
+    folder: Path | None = None,
 ) -> list[PreparedPhoto]:
     """Write photographs and masks into the working folder.
 
@@ -192,11 +231,13 @@ def prepare_photos(
     Args:
       masks: folder of masks, or None.
       max_size: upper limit of the longer side in px; 0 for none.
+      folder: that names in the dataset are relative to; None if all lie in one.
 
     Raises:
       InputError: if photographs cannot be read (all are named) or a mask does not fit.
     """
-    drawn = {} if masks is None else find_masks(masks, paths)
+    root = paths[0].parent if folder is None else folder
+    drawn = {} if masks is None else find_masks(masks, paths, root)
     made, bad = [], []
     for number, path in enumerate(paths):
         try:
@@ -210,7 +251,7 @@ def prepare_photos(
         if focal is not None:
             focal *= max(small.shape) / max(height, width)
         key = f"{camera} {width}x{height} {focal}"
-        photo = work.add(number, dataset_name(path), small, focal, key)
+        photo = work.add(number, dataset_name(path, root), small, focal, key)
         mask = None
         if path in drawn:
             mask = _read_mask(drawn[path], path.name, small.shape[:2], (height, width))
@@ -237,7 +278,8 @@ def add_masks(
     Raises:
       InputError: if there is no mask for any frame, or one does not fit.
     """
-    drawn, made = find_masks(masks, [Path(frame.name) for frame in frames]), []
+    drawn = find_masks(masks, [Path(frame.name) for frame in frames], Path())
+    made = []
     for frame in frames:
         path, record = drawn.get(Path(frame.name)), frame.record
         if path is not None:
@@ -257,8 +299,13 @@ def _complete_masks(made: Sequence[PreparedPhoto], work: WorkFolder) -> None:
         write_file(work.mask(record.file), encode_png(mask))
 
 
-def find_masks(folder: Path, photos: Sequence[Path]) -> dict[Path, Path]:
+def find_masks(folder: Path, photos: Sequence[Path], root: Path) -> dict[Path, Path]:
     """Return the mask of each photograph that has one, named as `find_mask` expects.
+
+    Args:
+      folder: of the masks.
+      photos: files, which need not exist.
+      root: folder that the names of photographs are relative to.
 
     Raises:
       InputError: if the folder does not exist or holds no mask for any photograph.
@@ -267,7 +314,7 @@ def find_masks(folder: Path, photos: Sequence[Path]) -> dict[Path, Path]:
         raise InputError(f"{folder}: no such folder of masks; check --masks")
     found, listing = {}, cache(files_by_lowered_suffix)
     for photo in photos:
-        mask = find_mask(folder, photo.name, listing)
+        mask = find_mask(folder, photo.relative_to(root).as_posix(), listing)
         if mask is not None and not (photo.exists() and mask.samefile(photo)):
             found[photo] = mask
     if not found:

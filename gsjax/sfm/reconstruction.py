@@ -124,6 +124,7 @@ class _Job(NamedTuple):
     """Values that every step of a reconstruction takes."""
 
     work: WorkFolder
+    output: Path
     seed: int
     progress: Progress
     seconds: dict[str, float]
@@ -172,7 +173,7 @@ def run_sfm(
     _check(source, settings)
     check_output(output, (source, settings.masks), overwrite)
     with staging_folder(output) as stage, quiet_and_seeded(settings.seed):
-        job = _Job(WorkFolder(stage), settings.seed, progress, {})
+        job = _Job(WorkFolder(stage), output, settings.seed, progress, {})
         with job.timed("photos"):
             photos = _collect(source, settings, job)
         matcher = settings.matcher
@@ -253,9 +254,12 @@ def _collect(source: Path, settings: SfmSettings, job: _Job) -> list[PreparedPho
     job.work.masks.mkdir()
     size = settings.max_size
     if source.is_dir():
-        paths = find_photos(source)
-        job.progress(f"reading {len(paths)} photos")
-        found = prepare_photos(paths, settings.masks, job.work, size)
+        skipped = [path for path in (settings.masks, job.output) if path is not None]
+        paths = find_photos(source, skipped)
+        folders = len({path.parent for path in paths})
+        where = f" of {folders} folders" if folders > 1 else ""
+        job.progress(f"reading {len(paths)} photos{where}")
+        found = prepare_photos(paths, settings.masks, job.work, size, source)
         masked = sum(photo.mask for photo in found)
         if masked or settings.masks is not None:
             job.progress(

@@ -17,12 +17,14 @@ from corner_room import (
     NAMES,
     WIDTH,
     corner_view,
+    exif,
     make_room,
     make_video,
     read,
     viewmat_at,
     write_photo,
 )
+from PIL import Image
 
 from gsjax import InputError
 from gsjax.cli.main import main
@@ -98,6 +100,31 @@ def test_dataset_is_valid_for_colmap_upright_and_reported(solved, room):
     assert 0 < report["mean_reprojection_error"] < 0.7
     assert report["mean_track_length"] > 2
     assert report["settings"]["matcher"] == "exhaustive"
+
+
+def test_heic_and_avif_in_folders_become_a_dataset(tmp_path):
+    """With their EXIF used, and none of it in what is written."""
+    heif = pytest.importorskip("pillow_heif", reason="needs gsjax[heic]")
+    heif.register_heif_opener()
+    places = ("a/0.heic", "a/1.avif", "b/deep/2.heic", "b/3.jpg", "4.avif")
+    block = exif(1, 32)[4:]
+    for i, place in enumerate(places):
+        path = tmp_path / "photos" / place
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".jpg":
+            write_photo(path, corner_view(i), 1, 32)
+        else:
+            Image.fromarray(corner_view(i)).save(path, quality=95, exif=block)
+    out = tmp_path / "out"
+    report = run_sfm(tmp_path / "photos", out)
+    names = [str(Path(place).with_suffix(".jpg")) for place in places]
+    assert sorted(report.registered) == sorted(names)
+    assert report.cameras == 1  # by the same camera and focal length
+    dataset = load_dataset(out)
+    assert sorted(view.name for view in dataset.views) == sorted(names)
+    for view in dataset.views:
+        assert b"Maker" not in view.image.read_bytes()
+        np.testing.assert_allclose(view.K[0, 0], FOCAL, rtol=0.03)
 
 
 def test_overwriting_repeats_bits_silently_and_keeps_other_files(

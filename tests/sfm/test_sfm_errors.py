@@ -1,5 +1,6 @@
 """Failures of structure from motion: exit code, one line, no file left behind."""
 
+import io
 import os
 import re
 import signal
@@ -14,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from corner_room import NAMES, make_room, write_blank
+from PIL import Image
 
 from gsjax.cli.main import main
 from gsjax.data.colmap import load_colmap
@@ -50,9 +52,17 @@ def two_photos(folder: Path) -> Path:
     return folder
 
 
+def encoded(form: str, mode: str) -> bytes:
+    stream = io.BytesIO()
+    Image.new(mode, (64, 48)).save(stream, form)
+    return stream.getvalue()
+
+
 NOISE = np.random.default_rng(0).integers(0, 256, (90, 90, 3), np.uint8)
 JPEG = cv2.imencode(".jpg", NOISE)[1].tobytes()
 PNG = images.encode_png(NOISE)
+CMYK = encoded("JPEG", "CMYK")
+HEIC = encoded("AVIF", "RGB").replace(b"avif", b"heic")
 TALL = images.encode_png(np.full((320, 240, 3), 255, np.uint8))
 DAMAGED = {
     "p/half.jpg": JPEG[: len(JPEG) // 2],
@@ -61,16 +71,18 @@ DAMAGED = {
     # A small file that declares 2.7 GB of pixels.
     "p/huge.png": PNG[:16] + struct.pack(">II", 30_000, 30_000) + PNG[24:],
 }
-DEEP = dict.fromkeys(("deep/a/0.jpg", "deep/a/1.jpg", "deep/b/c/0.jpg"), JPEG)
+HIDDEN = dict.fromkeys(("deep/a/0.jpg", "deep/.b/1.jpg", "deep/masks/0.jpg"), JPEG)
 TWINS = dict.fromkeys(("p/a.bmp", "p/a.tif"), b"")
 # Exit code, arguments, files besides the two photographs of folder p, part of the line.
 BAD = {
     "missing": (3, "none", {}, "no such folder"),
     "one photo": (3, "one", {"one/a.jpg": JPEG}, "at least 2 photos (.png, .jpg"),
-    "subfolders": (3, "deep", DEEP, "3 photos lie in subfolders: move them up"),
+    "hidden folders": (3, "deep", HIDDEN, "at least 2 photos (.png, .jpg"),
     "damaged": (3, "p", DAMAGED, "4 of 6 photos cannot be read; repair or remove th"),
     **{name: (3, "p", {name: data}, f"{name}: ") for name, data in DAMAGED.items()},
-    "heic": (3, "p", {"p/a.HEIC": b"x"}, ".HEIC is not supported; convert"),
+    "heic": (3, "p", {"p/a.HEIC": HEIC[:99]}, "damaged (box meta declares 235 bytes)"),
+    "raw": (3, "p", {"p/a.CR2": b"x"}, ".CR2 is a raw format; develop"),
+    "cmyk": (3, "p", {"p/a.jpg": CMYK}, "got CMYK, the inks of a printer; convert it"),
     "same name": (3, "p", TWINS, "the same name"),
     "image": (3, "p/0.jpg", {}, "single image"),
     "video": (3, "a.mp4", {"a.mp4": b"junk" * 99}, "video"),

@@ -11,7 +11,12 @@ from corner_room import HEIGHT, WIDTH, corner_view, read, write_blank, write_pho
 from gsjax import InputError
 from gsjax.sfm.engine import count_rows
 from gsjax.sfm.mapping import exif_camera, extract_features
-from gsjax.sfm.photos import WorkFolder, find_photos, prepare_photos
+from gsjax.sfm.photos import (
+    WorkFolder,
+    dataset_name,
+    find_photos,
+    prepare_photos,
+)
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is absent")
 
@@ -153,3 +158,20 @@ def test_photos_are_in_natural_order_and_named_in_utf_8(tmp_path):
     (tmp_path / os.fsdecode(b"caf\xe9.png")).write_bytes(b"")
     with pytest.raises(InputError, match=r"caf\\udce9.png.*UTF-8"):
         find_photos(tmp_path)
+
+
+def test_photos_of_folders_are_found_and_named_by_their_place(tmp_path):
+    names = ["2.jpg", "10.jpg", "left/1.heic", "left/deep/1.cr.tif", "right/1.AVIF"]
+    others = ["masks/2.png", ".trash/3.jpg", "old/images/2.jpg", "mine/2.png"]
+    for name in names + others:
+        (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "old" / "sfm.json").write_bytes(b"")
+    found = find_photos(tmp_path, [tmp_path / "mine"])
+    assert [p.relative_to(tmp_path).as_posix() for p in found] == names
+    assert [dataset_name(path, tmp_path) for path in found] == [
+        *names[:2],
+        "left/1.jpg",
+        "left/deep/1.cr.png",
+        "right/1.jpg",
+    ]
