@@ -76,6 +76,8 @@ class SfmCommand(Command):
             self.source, self.out, settings, overwrite=self.overwrite, progress=note
         )
         lines = {n: f"registered, {m} points" for n, m in report.registered.items()}
+        for folder, names in report.scenes.items():
+            lines |= dict.fromkeys(names, f"in {folder}")
         lines |= {n: f"not registered: {why}" for n, why in report.unregistered.items()}
         for name in sorted(lines):
             say(f"{name}  {lines[name]}")
@@ -85,6 +87,10 @@ class SfmCommand(Command):
             f"{report.mean_reprojection_error:.2f} px, track length "
             f"{report.mean_track_length:.1f} images"
         )
+        for line in report.told_scenes():
+            say(line)
+        if len(report.tried) > 1:
+            note(f"tried {'; '.join(report.tried)}")
         if report.times is not None:
             say(report.times)
         note(", ".join(f"{stage} {s:.1f} s" for stage, s in report.seconds.items()))

@@ -10,6 +10,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.distance import pdist, squareform
+
 from gsjax.data import heif
 from gsjax.runtime.files import read_bytes
 from gsjax.runtime.machine import usable_cores
@@ -27,7 +32,29 @@ _SMALL = 512  # px, longer side of a JPEG from which COLMAP reads the EXIF of a 
 _MAX_GUIDED_PAIRS, _MAX_GUIDED_PAIRS_PER_IMAGE = 60, 5
 # COLMAP starts with 30. 15 are still not chance: one in 4000 random matches lies within
 # the 12 px that count as an inlier.
-_MIN_INLIERS_EXTENDED = 15
+MIN_INLIERS_EXTENDED = 15
+_COLLAPSED = 1e-4  # median distance of cameras to the next, of the largest distance
+_LEAST_IMAGES = 3  # of a further model
+_GROUPED = 30  # inliers of a pair that tell that both images show one scene
+
+
+class MapperLimits(NamedTuple):
+    """Limits of incremental mapping, by default COLMAP's.
+
+    Attributes:
+      forward: share of the motion of the first pair that may be forward.
+      angle: degrees of triangulation that the first pair needs.
+      first_inliers: that the first pair needs.
+      inliers: that a further image needs.
+    """
+
+    forward: float = 0.95
+    angle: float = 16.0
+    first_inliers: int = 100
+    inliers: int = 30
+
+
+_LIMITS = MapperLimits()
 
 
 class ImageRecord(NamedTuple):
@@ -192,12 +219,14 @@ def map_incrementally(
     progress: Progress,
     *,
     start: Path | None = None,
+    limits: MapperLimits = _LIMITS,
 ) -> list[Any]:
     """Return the reconstructions of incremental mapping, most images first.
 
     Args:
       models: folder for COLMAP's output; created.
-      start: folder of a model to extend, with a lower minimum of inliers; or None.
+      start: folder of a model to extend; or None.
+      limits: of pairs and images.
     """
     pycolmap = colmap()
     options = pycolmap.IncrementalPipelineOptions()
@@ -206,8 +235,12 @@ def map_incrementally(
     options.num_threads = 1
     options.mapper.random_seed = seed
     options.triangulation.random_seed = seed
-    if start is not None:
-        options.mapper.abs_pose_min_num_inliers = _MIN_INLIERS_EXTENDED
+    options.min_model_size = _LEAST_IMAGES
+    options.multiple_models = start is None
+    options.mapper.init_max_forward_motion = limits.forward
+    options.mapper.init_min_tri_angle = limits.angle
+    options.mapper.init_min_num_inliers = limits.first_inliers
+    options.mapper.abs_pose_min_num_inliers = limits.inliers
     registered: list[None] = []  # one entry an image; callbacks have no arguments
 
     def work(token):
@@ -230,7 +263,11 @@ def map_incrementally(
     found = run_cancellable(work, status, progress)
     for model in found.values():
         deregister_implausible(model, options.mapper)
-    usable = [model for model in found.values() if model.num_reg_images() > 1]
+    usable = [
+        model
+        for model in found.values()
+        if model.num_reg_images() > 1 and not has_collapsed(model)
+    ]
     return sorted(usable, key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
 
 
@@ -248,6 +285,19 @@ def deregister_implausible(model: Any, limits: Any) -> None:
         if implausible or not image.num_points3D:
             model.deregister_frame(image.frame_id)
     model.tear_down()  # otherwise they stay in the model, without a pose
+
+
+def has_collapsed(model: Any) -> bool:
+    """Return whether most cameras of a model stand at one place, relative to the rest.
+
+    Photographs that hardly move apart, or with hardly a match, give such a model.
+    """
+    centres = np.array([image.projection_center() for image in model.images.values()])
+    if len(centres) < 4:
+        return False
+    apart = squareform(pdist(centres))
+    nearest = np.median(np.min(apart + np.diag(np.full(len(centres), np.inf)), 1))
+    return bool(nearest < _COLLAPSED * apart.max())
 
 
 def rematch_guided(
@@ -336,6 +386,41 @@ def registration_failures(
         return f"{matched[best]} matches at best, with {names[best]}: {why}"
 
     return {file: reason(file) for file in names if file not in registered}
+
+
+def match_groups(database: Path) -> list[set[str]]:
+    """Return the files of images that match one another, largest group first.
+
+    Images are in one group if a chain of pairs with enough inliers connects them.
+    """
+    with closing(colmap().Database.open(database)) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        pairs = [ends for count, ends in _verified_pairs(opened) if count >= _GROUPED]
+    order = {key: place for place, key in enumerate(names)}
+    ends = np.array([[order[a], order[b]] for a, b in pairs], int).reshape(-1, 2)
+    weights = np.ones(len(ends)), (ends[:, 0], ends[:, 1])
+    graph = coo_array(weights, shape=(len(names), len(names)))
+    _, labels = connected_components(graph, directed=False)
+    groups: dict[int, set[str]] = {}
+    for name, label in zip(names.values(), labels.tolist()):
+        groups.setdefault(label, set()).add(name)
+    return sorted((g for g in groups.values() if len(g) > 1), key=len, reverse=True)
+
+
+def set_camera_model(database: Path, model: str) -> None:
+    """Begin all cameras of a database anew with another model."""
+    pycolmap = colmap()
+    with closing(pycolmap.Database.open(database)) as opened:
+        for before in opened.read_all_cameras():
+            camera = pycolmap.Camera.create_from_model_name(
+                before.camera_id, model, before.mean_focal_length(), *_size_of(before)
+            )
+            camera.has_prior_focal_length = before.has_prior_focal_length
+            opened.update_camera(camera)
+
+
+def _size_of(camera: Any) -> tuple[int, int]:
+    return camera.width, camera.height
 
 
 def match_summary(database: Path) -> tuple[int, int]:

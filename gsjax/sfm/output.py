@@ -22,7 +22,8 @@ from gsjax.sfm.engine import colmap
 from gsjax.sfm.photos import PreparedPhoto, WorkFolder, read_upright
 
 # The last marks a dataset as written by this module.
-ENTRIES = ("images", "masks", "sparse", TIMES_FILE, "sfm.json")
+SCENES = "scenes"  # folder of further datasets
+ENTRIES = ("images", "masks", "sparse", TIMES_FILE, SCENES, "sfm.json")
 JPEG_QUALITY = 95
 _ROWS_PER_STEP = 256
 
@@ -48,7 +49,7 @@ def write_dataset(
     Args:
       model: pycolmap's reconstruction of the working files; changed in place to that of
         the images of the dataset.
-      dataset: the folder, which exists.
+      dataset: the folder.
       undistort: resample the photographs to ideal pinholes.
       moving: write the times of the frames, and no masks, which hide what moves.
     """

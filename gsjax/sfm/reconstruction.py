@@ -7,24 +7,28 @@ SIFT features, matching and incremental mapping by COLMAP (Schönberger and Frah
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from gsjax.data.video import sharpest_frames
 from gsjax.errors import InputError, SfmError
 from gsjax.runtime.files import write_json
+from gsjax.sfm.attempts import Mapped, attempts_of, map_with_attempts
 from gsjax.sfm.engine import Progress, colmap, quiet_and_seeded
 from gsjax.sfm.mapping import (
     CAMERA_MODELS,
+    MIN_INLIERS_EXTENDED,
+    MapperLimits,
     extract_features,
     map_incrementally,
     match_features,
+    match_groups,
     match_summary,
-    registration_failures,
     rematch_guided,
 )
 from gsjax.sfm.output import (
+    SCENES,
     check_output,
     install_dataset,
     staging_folder,
@@ -37,6 +41,7 @@ from gsjax.sfm.photos import (
     find_photos,
     prepare_photos,
 )
+from gsjax.sfm.report import SfmReport, advice, statistics, told_times
 
 EXHAUSTIVE_UP_TO = 60  # photos
 
@@ -74,50 +79,6 @@ class SfmSettings:
     seed: int = 0
     undistort: bool = False
     moving: bool = False
-
-
-@dataclass(frozen=True)
-class SfmReport:
-    """Outcome of structure from motion; stored in the dataset as sfm.json.
-
-    Attributes:
-      source, output: the photos or the video, and the dataset.
-      registered: image name → number of points seen in it, for images with a camera.
-      unregistered: image name → reason, for all others.
-      points: number of points in space.
-      mean_reprojection_error: px.
-      mean_track_length: mean number of images that see a point.
-      cameras: number of different intrinsics.
-      other_models: number of images in each smaller model, which is not written.
-      seconds: duration of each phase.
-      times: with ``moving``, the times of the frames, and how what moves was left out
-        of the matching; else None.
-      settings: the settings, with "auto" resolved in ``matcher``.
-    """
-
-    source: str
-    output: str
-    registered: dict[str, int]
-    unregistered: dict[str, str]
-    points: int
-    mean_reprojection_error: float
-    mean_track_length: float
-    cameras: int
-    other_models: list[int]
-    settings: dict[str, Any]
-    seconds: dict[str, float] = field(default_factory=dict)
-    times: str | None = None
-
-    @property
-    def problem(self) -> str | None:
-        """A message if fewer than half of the images are registered, else None."""
-        good, bad = len(self.registered), len(self.unregistered)
-        if good >= bad:
-            return None
-        return (
-            f"only {good} of {good + bad} images could be registered (they are in "
-            f"{self.output}); {_advice(self.settings['matcher'])}"
-        )
 
 
 class _Job(NamedTuple):
@@ -180,7 +141,8 @@ def run_sfm(
         if matcher == "auto":
             few = source.is_dir() and len(photos) <= EXHAUSTIVE_UP_TO
             matcher = "exhaustive" if few else "sequential"
-        models = _solve(photos, settings.camera_model, matcher, job)
+        mapped = _solve(photos, settings.camera_model, matcher, job)
+        models = {"": mapped.models[0], **_further_scenes(mapped.models)}
         masks = None if settings.masks is None else str(settings.masks)
         resolved = {**asdict(settings), "matcher": matcher, "masks": masks}
         report = SfmReport(
@@ -188,39 +150,28 @@ def run_sfm(
             output=str(output),
             settings=resolved,
             seconds=job.seconds,
-            times=_told_times(photos) if settings.moving else None,
-            **_statistics(models, photos, job.work),
+            times=told_times(photos) if settings.moving else None,
+            tried=mapped.tried,
+            **statistics(models, photos, job.work.database),
         )
         dataset = stage / "dataset"
         dataset.mkdir()
         with job.timed("dataset"):
             verb = "undistorting" if settings.undistort else "writing"
             progress(f"{verb} {len(report.registered)} images")
-            write_dataset(
-                models[0],
-                photos,
-                job.work,
-                dataset,
-                undistort=settings.undistort,
-                moving=settings.moving,
-            )
+            for place, model in models.items():
+                write_dataset(
+                    model,
+                    photos,
+                    job.work,
+                    dataset / place,
+                    undistort=settings.undistort,
+                    moving=settings.moving,
+                )
         facts = {**asdict(report), "pycolmap": colmap().__version__}
         write_json(dataset / "sfm.json", facts, indent=2)
         install_dataset(dataset, output, stage)
     return report
-
-
-def _told_times(photos: list[PreparedPhoto]) -> str:
-    """Return the times of frames, and what was left out of the matching, as a line."""
-    seconds = [photo.seconds or 0.0 for photo in photos]
-    masked = sum(photo.mask for photo in photos)
-    by = "geometric verification alone"
-    if masked:
-        by = f"the masks of {masked} of {len(photos)} frames and geometric verification"
-    return (
-        f"times of {len(photos)} frames, {min(seconds):.2f} to {max(seconds):.2f} s; "
-        f"what moves was left out by {by}"
-    )
 
 
 def _check(source: Path, settings: SfmSettings) -> None:
@@ -307,19 +258,10 @@ def _with_cameras(photos: list[PreparedPhoto], choice: str) -> list[PreparedPhot
     return [photo._replace(record=record) for photo, record in zip(photos, changed)]
 
 
-def _advice(matcher: str) -> str:
-    """Return what to try if cameras are not found."""
-    exhaustive = "" if matcher == "exhaustive" else "--matcher exhaustive or "
-    return (
-        "take sharp photos that overlap by two thirds or more, of a static scene with "
-        f"texture, or try {exhaustive}a larger --max-size"
-    )
-
-
 def _solve(
     photos: list[PreparedPhoto], camera_model: str, matcher: str, job: _Job
-) -> list[Any]:
-    """Return the reconstructed models, largest first.
+) -> Mapped:
+    """Return the reconstructed models, largest first, and what was tried.
 
     Raises:
       SfmError: if there is none.
@@ -337,55 +279,67 @@ def _solve(
         match_features(work.database, count, matcher, job.seed, job.progress)
     with job.timed("mapping"):
         job.progress("mapping")
-        models = map_incrementally(
-            work.database, work.photos, work.folder / "models", job.seed, job.progress
+        mapped = map_with_attempts(
+            attempts_of(count, matcher, camera_model),
+            work.database,
+            (work.photos, work.folder / "models"),
+            job.seed,
+            job.progress,
+            spent=sum(job.seconds.values()),
         )
-    if models and models[0].num_reg_images() < count:
+    models = mapped.models
+    placed = {image.name for model in models for image in model.images.values()}
+    lost = {record.file for record in records} - placed
+    if models and lost:
         with job.timed("second effort"):
-            files = {record.file for record in records}
-            models[0] = _extend(models[0], files, job)
+            mapped = mapped._replace(models=_extended(models, lost, job))
     if models:
-        return models
+        return mapped
     most, pairs = match_summary(work.database)
     raise SfmError(
         f"no cameras could be found for the {count} images; {pairs} pairs of them "
-        f"match, the best by {most} features; {_advice(matcher)}"
+        f"match, the best by {most} features; tried {'; '.join(mapped.tried)}; "
+        f"{advice(matcher)}"
     )
 
 
-def _extend(model: Any, files: set[str], job: _Job) -> Any:
-    """Return the model, extended by images that were not registered, if that works."""
+def _extended(models: list[Any], missing: set[str], job: _Job) -> list[Any]:
+    """Return the models, extended by images that are missing where that works."""
     work = job.work
-    missing = files - {image.name for image in model.images.values()}
     job.progress(f"trying again with {len(missing)} images that were not registered")
     pair_list = work.folder / "pairs"
     if not rematch_guided(work.database, missing, pair_list, job.seed, job.progress):
-        return model
-    start, models = work.folder / "start", work.folder / "extended"
-    start.mkdir()
-    model.write_binary(start)
-    found = map_incrementally(
-        work.database, work.photos, models, job.seed, job.progress, start=start
-    )
-    more = found and found[0].num_reg_images() > model.num_reg_images()
-    return found[0] if more else model
+        return models
+    groups, found = match_groups(work.database), []
+    for number, model in enumerate(models):
+        names = {image.name for image in model.images.values()}
+        if not any(names & group and missing & group for group in groups):
+            found.append(model)
+            continue
+        start = work.folder / f"start{number}"
+        start.mkdir()
+        model.write_binary(start)
+        longer = map_incrementally(
+            work.database,
+            work.photos,
+            work.folder / f"extended{number}",
+            job.seed,
+            job.progress,
+            start=start,
+            limits=MapperLimits(inliers=MIN_INLIERS_EXTENDED),
+        )
+        more = longer and longer[0].num_reg_images() > model.num_reg_images()
+        found.append(longer[0] if more else model)
+    return sorted(found, key=lambda model: -model.num_reg_images())
 
 
-def _statistics(
-    models: list[Any], photos: list[PreparedPhoto], work: WorkFolder
-) -> dict[str, Any]:
-    """Return the fields of `SfmReport` that describe the models."""
-    best, *others = models
-    seen = {image.name: image.num_points3D for image in best.images.values()}
-    names = {photo.record.file: photo.name for photo in photos}
-    lost = set(names) - set(seen)
-    why = registration_failures(work.database, names, set(seen)) if lost else {}
-    return {
-        "registered": {names[file]: int(seen[file]) for file in names if file in seen},
-        "unregistered": {names[file]: reason for file, reason in why.items()},
-        "points": best.num_points3D(),
-        "mean_reprojection_error": best.compute_mean_reprojection_error(),
-        "mean_track_length": best.compute_mean_track_length(),
-        "cameras": best.num_cameras(),
-        "other_models": [model.num_reg_images() for model in others],
-    }
+def _further_scenes(models: list[Any]) -> dict[str, Any]:
+    """Return the models that show other images than the larger ones, by folder."""
+    scenes: dict[str, Any] = {}
+    placed = {image.name for image in models[0].images.values()}
+    for model in models[1:]:
+        files = {image.name for image in model.images.values()}
+        if len(files - placed) > len(files) / 2:
+            scenes[f"{SCENES}/{len(scenes) + 2}"] = model
+            placed |= files
+    return scenes
