@@ -5,14 +5,12 @@ image (ISO/IEC 23008-12, `irot` and `imir`). A decoder of HEIC applies it, OpenC
 AVIF does not.
 """
 
-import io
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image
 
 from gsjax.errors import InputError, MissingExtraError
 
@@ -171,22 +169,3 @@ def decode_heic(path: Path, data: bytes) -> np.ndarray:
     if pixels.ndim == 3 and pixels.shape[2] >= 3:
         pixels = pixels[..., [2, 1, 0, *range(3, pixels.shape[2])]]
     return np.ascontiguousarray(pixels)
-
-
-def exif_of(data: bytes) -> bytes:
-    """Return the EXIF block of a HEIC or AVIF file; empty if there is none.
-
-    Raises:
-      MissingExtraError: if pillow-heif is absent and the file is a HEIC.
-    """
-    if kind_of(data[:64]) == "heic":
-        return opener().open_heif(data).info.get("exif") or b""
-    with Image.open(io.BytesIO(data)) as image:
-        return image.info.get("exif") or b""
-
-
-def small_jpeg(exif: bytes, size: tuple[int, int]) -> bytes:
-    """Return a grey JPEG of width and height ``size`` with an EXIF block."""
-    stream = io.BytesIO()
-    Image.new("L", size).save(stream, "JPEG", exif=exif)
-    return stream.getvalue()

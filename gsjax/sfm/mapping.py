@@ -16,7 +16,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import pdist, squareform
 
 from gsjax.data import heif
-from gsjax.runtime.files import read_bytes
+from gsjax.data.exif import blank_jpeg, exif_of
+from gsjax.data.image_header import image_size
 from gsjax.runtime.machine import usable_cores
 from gsjax.sfm.engine import Progress, colmap, count_rows, run_cancellable
 
@@ -28,7 +29,8 @@ CAMERA_MODELS = (
     *("THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION"),
 )
 _FEW_FEATURES = 100
-_SMALL = 512  # px, longer side of a JPEG from which COLMAP reads the EXIF of a HEIC
+_SMALL = 512  # px, longer side of the JPEG from which COLMAP reads EXIF
+_WITH_EXIF = (".jpg", ".jpeg", *heif.SUFFIXES)
 _MAX_GUIDED_PAIRS, _MAX_GUIDED_PAIRS_PER_IMAGE = 60, 5
 # COLMAP starts with 30. 15 are still not chance: one in 4000 random matches lies within
 # the 12 px that count as an inlier.
@@ -80,11 +82,25 @@ def exif_camera(path: Path) -> tuple[str, float | None]:
 
     The focal length is side × (mm / sensor mm); the sensor size comes from EXIF or from
     COLMAP's table of cameras. A missing name is ""; a focal length that is missing or
-    outside COLMAP's limits is None. For HEIC and AVIF, which COLMAP does not read, the
-    focal length is scaled from that of a small JPEG with the same EXIF.
+    outside COLMAP's limits is None. COLMAP decodes what it reads, so it gets a small
+    JPEG with the same EXIF in place of a photograph.
     """
-    if path.suffix.lower() in heif.SUFFIXES:
-        return _exif_camera_heif(path)
+    if path.suffix.lower() not in _WITH_EXIF:
+        return _exif_camera(path)
+    width, height = image_size(path)
+    scale = max(1, max(width, height) / _SMALL)
+    size = max(1, round(width / scale)), max(1, round(height / scale))
+    exif = exif_of(path)
+    if not exif:
+        return "", None
+    with TemporaryDirectory() as folder:
+        small = Path(folder) / "small.jpg"
+        small.write_bytes(blank_jpeg(size, exif))
+        name, focal = _exif_camera(small)
+    return name, None if focal is None else focal * scale
+
+
+def _exif_camera(path: Path) -> tuple[str, float | None]:
     bitmap = colmap().Bitmap.read(str(path), False)
     if bitmap is None:
         return "", None
@@ -94,18 +110,6 @@ def exif_camera(path: Path) -> tuple[str, float | None]:
     side, limits = max(bitmap.width, bitmap.height), colmap().IncrementalMapperOptions()
     least, most = limits.min_focal_length_ratio, limits.max_focal_length_ratio
     return name, focal if least * side < focal < most * side else None
-
-
-def _exif_camera_heif(path: Path) -> tuple[str, float | None]:
-    data = read_bytes(path, "a photograph")
-    width, height = heif.turns_of(data).upright
-    scale = max(width, height) / _SMALL
-    size = max(1, round(width / scale)), max(1, round(height / scale))
-    with TemporaryDirectory() as folder:
-        small = Path(folder) / "small.jpg"
-        small.write_bytes(heif.small_jpeg(heif.exif_of(data), size))
-        name, focal = exif_camera(small)
-    return name, None if focal is None else focal * scale
 
 
 def extract_features(
@@ -237,6 +241,7 @@ def map_incrementally(
     options.triangulation.random_seed = seed
     options.min_model_size = _LEAST_IMAGES
     options.multiple_models = start is None
+    options.max_model_overlap = _LEAST_IMAGES
     options.mapper.init_max_forward_motion = limits.forward
     options.mapper.init_min_tri_angle = limits.angle
     options.mapper.init_min_num_inliers = limits.first_inliers
