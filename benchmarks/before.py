@@ -63,6 +63,8 @@ def main(commit: str, dataset: Path, held_out: list[str]) -> None:
     options += ["--preset", "fast", "--eval-every", "25"]
     if held_out:
         options += ["--test-images", *held_out]
+    else:
+        options += ["--test-every", "8"]
     rows, curves = [], {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

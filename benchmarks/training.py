@@ -41,6 +41,8 @@ def train(
     options = ["--strategy", strategy, "--eval-every", str(EVERY), *other]
     if held_out:
         options += ["--test-images", *held_out]
+    else:
+        options += ["--test-every", "8"]
     measure.run_cold([*program, *options])
 
 

@@ -30,7 +30,7 @@ class DemoCommand(HeavyCommand):
     size: Size = (256, 192)
     """Size of the photographs."""
     photos: Annotated[int | None, integer(2, 1000)] = None
-    """Number of photographs, of which every 8th is held out for evaluation; default:
+    """Number of photographs, of which an eighth is held out for evaluation; default:
     40. With --moving, those of the camera that travels; default: 32, or 96 if
     --monocular."""
     moving: bool = False

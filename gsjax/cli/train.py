@@ -114,7 +114,8 @@ class TrainCommand(HeavyCommand):
     """Skip photographs that the dataset lists but that do not exist."""
     test_every: Annotated[int | None, integer(0)] = None
     """Hold out every Nth view for evaluation, 0 for none; default: the test views that
-    the dataset declares, or else every 8th."""
+    the dataset declares, or else an eighth, spread over the capture and away from its
+    ends."""
     test_images: tuple[str, ...] | None = None
     """Hold out these views instead."""
     checkpoint_every: Annotated[int | None, integer(0)] = None

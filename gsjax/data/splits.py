@@ -4,6 +4,7 @@ import difflib
 from collections.abc import Sequence
 from pathlib import PurePosixPath
 
+from gsjax.data.image_files import natural_order
 from gsjax.data.types import View, unexpected
 from gsjax.errors import InputError
 from gsjax.runtime.settings import as_int
@@ -17,13 +18,14 @@ def split_views(
     """Return the indices of the training views and of the test views.
 
     The test views are, in order of precedence: the given names; every ``every``-th view
-    in the order of names, the first included; the dataset's own test views, if it names
-    any; every 8th view, as is usual in the literature.
+    in the order of names, the first included, as is usual in the literature with 8; the
+    dataset's own test views, if it names any; one of 8 views, spread evenly and
+    away from the ends of the order, which no other photograph surrounds.
 
     Args:
       views: all views.
-      every: distance of test views in the order of names; 0 for none. None leaves it
-        to the dataset, else 8.
+      every: distance of test views in the order of names; 0 for none. None leaves the
+        choice to the dataset, else to the order.
       test_names: name or names of test views; the part after the last "/" suffices if
         it is unique.
 
@@ -42,10 +44,7 @@ def split_views(
     elif every is None and any(view.split == "test" for view in views):
         test = {index for index, view in enumerate(views) if view.split == "test"}
     else:
-        every = _EVERY if every is None else every
-        order = sorted(range(len(views)), key=lambda index: views[index].name)
-        # A single view is a training view.
-        test = set(order[::every]) if every and len(views) > 1 else set()
+        test = set(_inner(views) if every is None else _at_distance(views, every))
     train = [index for index in range(len(views)) if index not in test]
     if not train:
         raise InputError(
@@ -53,6 +52,21 @@ def split_views(
             "fewer, or choose a larger distance between them (--test-every)"
         )
     return train, sorted(test)
+
+
+def _at_distance(views: Sequence[View], every: int) -> list[int]:
+    """Return the first and every ``every``-th after it; none for 0, or of one view."""
+    order = sorted(range(len(views)), key=lambda index: views[index].name)
+    return order[::every] if every and len(views) > 1 else []
+
+
+def _inner(views: Sequence[View]) -> list[int]:
+    """Return one of 8, in the middles of parts of equal length."""
+    order = sorted(
+        range(len(views)), key=lambda index: natural_order(views[index].name)
+    )
+    count = -(-len(order) // _EVERY) if len(order) > 1 else 0
+    return [order[(2 * i + 1) * len(order) // (2 * count)] for i in range(count)]
 
 
 def _index_of(views: Sequence[View], name: str) -> int:

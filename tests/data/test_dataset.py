@@ -410,17 +410,19 @@ FOLDERS = views_of(["a/1.png", "a/2.png", "b/1.png", "1.png"])
 @pytest.mark.parametrize(
     ("views", "options", "test"),
     [
-        (views_of(NAMES), {}, [0, 8, 16]),
+        (views_of(NAMES), {}, [3, 10, 16]),
+        (views_of(NAMES), {"every": 8}, [0, 8, 16]),
         (views_of(NAMES), {"every": 0}, []),
-        (views_of(NAMES[::-1]), {}, [3, 11, 19]),  # in the order of names
+        (views_of(NAMES[::-1]), {}, [3, 9, 16]),  # in the order of names
         (views_of(NAMES[:1]), {}, []),
-        (views_of(NAMES[:2]), {}, [0]),
+        (views_of(NAMES[:2]), {}, [1]),
+        (views_of(NAMES[:8]), {}, [4]),  # not at an end
         (SPLIT, {}, [1, 3]),
         (SPLIT, {"every": 3}, [0, 3]),
         (SPLIT, {"every": 0}, []),
         (SPLIT, {"test_names": [NAMES[0]]}, [0]),
         # A dataset without test views, as one without any split.
-        (views_of(NAMES, ["train"] * 20), {}, [0, 8, 16]),
+        (views_of(NAMES, ["train"] * 20), {}, [3, 10, 16]),
         (views_of(NAMES, ["train"] * 19 + [None]), {"every": 5}, [0, 5, 10, 15]),
         (views_of(NAMES), {"test_names": NAMES[5:7]}, [5, 6]),
         (views_of(NAMES), {"test_names": NAMES[5]}, [5]),  # not its letters
