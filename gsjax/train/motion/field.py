@@ -20,13 +20,15 @@ from gsjax.runtime.loops import cumulative_sum
 from gsjax.train.models import Model, ModelParams, Refresh, SceneParams, ViewInfo
 from gsjax.train.motion.interpolation import weighted_rows
 from gsjax.train.motion.settings import FieldSettings
-from gsjax.train.motion.stillness import refreshed
+from gsjax.train.motion.stillness import Limits, refreshed
 from gsjax.train.optimiser import scale_by_rate
 
 Array = jax.Array
 _PLANES = 0.1, 0.5  # range of the initial features of space
 _REACH = 0.25  # unit of the changes of a mean, in sides of the box
 _FIRST = 0.08  # share of the time that the first views are drawn from
+# A field that serves its neighbours also shakes what is still, by up to these.
+_STILL = Limits(shift=1.0, change=1 / 16)
 _BLOCK = 4096  # slots decoded together on a CPU
 _AXES = ((0, 1), (0, 2), (1, 2))
 # Changes of mean, quaternion, log scales, opacity and colour.
@@ -246,7 +248,8 @@ def field_model(settings: FieldSettings, devices: int = 1) -> Model:
         return settings.smoothness * across + settings.time_smoothness * bend
 
     def update(params: SceneParams, cameras: Camera, fraction: Array):
-        moving = refreshed(moved, settings.freeze, params, cameras, fraction)
+        found = (moved, settings.freeze, params, cameras, fraction)
+        moving = refreshed(*found, limits=_STILL)
         active = params.gaussians.active
         rest = lax.cond(
             fraction >= settings.freeze,

@@ -5,6 +5,7 @@ Axis legend: N Gaussians (capacity), V cameras.
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +21,21 @@ Array = jax.Array
 
 _TIMES = 9
 _CAMERAS = 16  # evenly among those given; more would hardly be finer
-_LEAST_SHIFT = 0.25  # px in the photograph that shows the Gaussian largest
-_LEAST_CHANGE = 1 / 64  # of opacity and colour
+
+
+class Limits(NamedTuple):
+    """Changes above which a Gaussian moves.
+
+    Attributes:
+      shift: in px of the photograph that samples the Gaussian most finely.
+      change: of opacity and colour.
+    """
+
+    shift: float = 0.25
+    change: float = 1 / 64
+
+
+_LIMITS = Limits()
 
 
 def refreshed(
@@ -30,6 +44,7 @@ def refreshed(
     params: SceneParams,
     cameras: Camera,
     fraction: Array,
+    limits: Limits = _LIMITS,
 ) -> Array:
     """Return the buffer ``moving`` [N]: 1, and from a share of the run on 0 if still.
 
@@ -40,6 +55,7 @@ def refreshed(
       params: N slots, with a buffer ``moving``.
       cameras: batch of V cameras.
       fraction: completed share of the run.
+      limits: of what counts as still.
     """
     buffers = params.model.buffers
     everything = jnp.ones_like(buffers["moving"])
@@ -47,25 +63,29 @@ def refreshed(
     def find() -> Array:
         free = params.model._replace(buffers={**buffers, "moving": everything})
         loose = params._replace(model=free)
-        found = find_moving(lambda t: at(loose, t), params.gaussians, cameras)
+        found = find_moving(lambda t: at(loose, t), params.gaussians, cameras, limits)
         return found.astype(everything.dtype)
 
     return jax.lax.cond(fraction >= freeze, find, lambda: everything)
 
 
 def find_moving(
-    at: Callable[[Array], Gaussians], still: Gaussians, cameras: Camera
+    at: Callable[[Array], Gaussians],
+    still: Gaussians,
+    cameras: Camera,
+    limits: Limits = _LIMITS,
 ) -> Array:
     """Return [N] bool: the Gaussians that visibly change over time.
 
-    A Gaussian changes if between any of 9 times its mean or an end of an axis moves by
-    a quarter of a pixel of the photograph that samples it most finely, of some 16, or
-    its opacity or colour by 1/64.
+    A Gaussian changes if between the first and any other of 9 times its mean or an end
+    of an axis moves, or its opacity or colour changes, by more than the limits. Its
+    pixel is that of the photograph that samples it most finely, of some 16.
 
     Args:
       at: time [] → Gaussians, N slots.
       still: N slots, whose places tell which cameras see them.
       cameras: batch of V cameras.
+      limits: of what counts as still.
     """
     step = -(-cameras.viewmat.shape[0] // _CAMERAS)
     some = jax.tree.map(lambda a: a[::step], cameras)
@@ -83,7 +103,7 @@ def find_moving(
         moved = shift + wider + 2 * turn * size
         shade = C0 * jnp.abs(now.params.sh[:, 0] - first.params.sh[:, 0])
         change = jnp.abs(a["opacities"] - b["opacities"]) + jnp.max(shade, 1)
-        return (moved > _LEAST_SHIFT * pixel) | (change > _LEAST_CHANGE)
+        return (moved > limits.shift * pixel) | (change > limits.change)
 
     times = jnp.asarray(np.linspace(0, 1, _TIMES)[1:], still.params.means.dtype)
     return jnp.any(jax.lax.map(differs, times), 0)
