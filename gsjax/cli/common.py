@@ -71,6 +71,8 @@ def say_result(result) -> None:
     if (summary := result.summary) is not None:
         quality = f"PSNR {decibels(summary.psnr)}, SSIM {summary.ssim:.4f}"
         line += f"; {summary.views} held-out views: {quality}"
+        if result.training_psnr is not None:
+            line += f"; training views: PSNR {decibels(result.training_psnr)}"
     say(line)
 
 

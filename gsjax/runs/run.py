@@ -45,6 +45,8 @@ class RunResult(NamedTuple):
       gaussians: number of active Gaussians.
       summary: metrics of the held-out views; None if there are none, or if the run was
         interrupted.
+      training_psnr: of some training views, in dB; None without a summary. Where it is
+        far above that of the held-out views, there are too few photographs.
     """
 
     files: RunFiles
@@ -53,6 +55,7 @@ class RunResult(NamedTuple):
     seconds: float
     gaussians: int
     summary: Summary | None
+    training_psnr: float | None = None
 
 
 # Receives the training data, and returns a hook to call after each step.
@@ -249,8 +252,9 @@ def _fit_and_save(
         session.save_result(result.state)
         finished = int(result.state.step) >= config.steps and not hooks.stop()
     summary = session.evaluate(result, photos) if finished else None
+    training = None if summary is None else session.training_psnr(result, photos)
     session.measured.write()
     metrics, held_out = (read_metrics(p) for p in (files.metrics, files.held_out))
     plot_curves(files.curves, metrics, len(photos), held_out)
     step, seconds = int(result.state.step), session.seconds(result.progress)
-    return RunResult(files, finished, step, seconds, gaussians, summary)
+    return RunResult(files, finished, step, seconds, gaussians, summary, training)

@@ -32,6 +32,8 @@ from gsjax.train.loop import FitResult, Hooks, Progress, subset
 from gsjax.train.motion.scene import MovingScene
 from gsjax.train.state import TrainState, shown_gaussians, shown_scene
 
+_TRAINING = 16  # training views that are measured at the end
+
 
 class ResumePoint(NamedTuple):
     """The point of a run at which a session starts: step 0 or the last checkpoint.
@@ -148,6 +150,16 @@ class Session:
         if config.every_eval:
             self.log_held_out(result.state, summary, self.seconds(result.progress))
         return summary
+
+    def training_psnr(self, result: FitResult, photos: list[Photo]) -> float:
+        """Return the mean PSNR of some training views, evenly chosen, in dB."""
+        cameras, train = self.cameras(result.state), self.split.train
+        few = np.unique(np.linspace(0, len(train) - 1, _TRAINING).astype(int))
+        dataset = subset(cameras, [train[i] for i in few])
+        given = [self.dataset.views[i] for i in few]
+        some = refine_photos([photos[i] for i in few], given, dataset.views)
+        scene = shown_scene(result.state, self.config)
+        return summarise(evaluate_views(scene, dataset, some, self.config)).psnr
 
     @contextmanager
     def hooks(self) -> Iterator[Hooks]:

@@ -110,6 +110,7 @@ def test_demo_learns_and_its_outputs_exist(printed, demo):
     splat, preview, curves, turntable = (folder / path for path in paths)
     assert all(path.exists() for path in (splat, preview, curves))
     assert "2 held-out views: PSNR " in result
+    assert re.search(r"; training views: PSNR \d+\.\d\d dB$", result)
     quality = json.loads((demo / "run" / "eval.json").read_text())
     assert quality["psnr"] > 17
     movie = read_movie(turntable)
