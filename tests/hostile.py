@@ -141,7 +141,7 @@ HOSTILE: dict[str, Callable[[], Hostile]] = {
     "ten thousand km away": _far,
     "all behind the cameras": lambda: _with_points(np.full((5000, 3), (0, -60, 0.1))),
     "cameras in the cloud": _inside,
-    "a photograph masked": lambda: replace(harmless(), masked=(1,)),
+    "a photograph masked": lambda: replace(harmless(), masked=(0,)),
     "all masked": lambda: replace(harmless(), masked=(0, 1, 2)),
     "focal lengths": _lenses,
     "one pixel wide": _slivers,

@@ -195,12 +195,14 @@ def test_importing_is_light():
 def test_imports_are_declared():
     """Dependencies of dependencies do not count."""
     packages = {"cv2": "opencv-contrib-python-headless"}
+    packages |= {"PIL": "pillow", "pillow_heif": "pillow-heif"}
     # Each comes with a dependency, and is used together with that alone: viser brings
     # `rich` and `msgspec`.
     brought = {"IPython", "msgspec", "rich"}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    lines = [*project["dependencies"], *extras["viewer"], *extras["movies"]]
+    lines = [*project["dependencies"]]
+    lines += [*extras["viewer"], *extras["movies"], *extras["heic"]]
     declared = {re.split("[^A-Za-z0-9_-]", line)[0] for line in lines}
     found = {str(node.module).split(".")[0] for _, node in nodes(ast.ImportFrom)}
     for _, node in nodes(ast.Import):

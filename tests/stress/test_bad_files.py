@@ -191,7 +191,7 @@ def test_the_command_line_reports_in_one_line(folder, file, capfd, monkeypatch):
     """The first and the last bad file of each format; the message is the library's."""
     monkeypatch.chdir(folder)
     late = file == "photo.png"  # read after everything else
-    path = Path("images/view_01.png" if late else file)
+    path = Path("images/view_00.png" if late else file)
     bad = [bad for bad in BAD.values() if bad.file == file]
     for _, change, expected in bad[:1] + bad[1:][-1:]:
         with replaced(path, change(Path(file).read_bytes())):
