@@ -29,7 +29,7 @@ pytestmark = [pytest.mark.long, pytest.mark.usefixtures("float32", "shared_progr
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 WIDTH, HEIGHT, PHOTOS, STEPS = 64, 48, 9, 20
-HELD_OUT = ["photo_000", "photo_008"]
+HELD_OUT = ["photo_002", "photo_006"]
 # Options appended to the README's commands.
 SMALLER = {
     "demo": f"--photos {PHOTOS} --size {WIDTH}x{HEIGHT} --steps {STEPS}".split(),
